@@ -1,0 +1,79 @@
+"""Typed errors with stable codes: what is wrong, where, and what to do about it.
+
+Compiled code cannot raise; it returns status codes, and the host raises once per call.
+A code is never reused for another meaning.
+"""
+
+import difflib
+import warnings
+from collections.abc import Iterable
+
+
+class Sim2GPError(Exception):
+    """Root of every error that sim2gp raises on purpose; ``code`` is stable."""
+
+    def __init__(
+        self,
+        code: str,
+        what: str,
+        *,
+        where: str = "",
+        got: object = None,
+        expected: str = "",
+        fix: str = "",
+    ) -> None:
+        self.code, self.what, self.where = code, what, where
+        self.got, self.expected, self.fix = got, expected, fix
+        super().__init__(str(self))
+
+    def __str__(self) -> str:
+        text = f"{self.code} {self.what}"
+        if self.where:
+            text += f" in {self.where}"
+        details = []
+        if self.got is not None:
+            details.append(f"got {self.got}")
+        if self.expected:
+            details.append(f"expected {self.expected}")
+        if details:
+            text += ": " + ", ".join(details)
+        if self.fix:
+            text += f". Fix: {self.fix}"
+        return " ".join(f"{text.rstrip('.')}.".split())
+
+
+class InputError(Sim2GPError):
+    """The user's input is at fault; the command line ends with exit code 2."""
+
+
+class NotConverged(Sim2GPError):
+    """E201: the MAP was not reached, so no posterior is formed around it."""
+
+
+class DeadParameters(Sim2GPError):
+    """E146: the data do not depend on a parameter at all (zero Jacobian column)."""
+
+
+class NotPositiveDefinite(Sim2GPError):
+    """E202: a matrix that must be a covariance is not; names rank and parameters."""
+
+
+class NotFinite(Sim2GPError):
+    """E203: a simulation or a fit produced a number that is not finite."""
+
+
+class Sim2GPWarning(UserWarning):
+    """A typed warning; its text starts with its code (W110 and so on)."""
+
+
+def warn(code: str, text: str) -> None:
+    """Emit a `Sim2GPWarning` once at the caller's line."""
+    warnings.warn(f"{code} {text}", Sim2GPWarning, stacklevel=3)
+
+
+def nearest(name: str, names: Iterable[str]) -> str | None:
+    """The known name that a misspelt one most likely meant, or None."""
+    names = list(names)
+    lower = {n.lower(): n for n in names}
+    found = difflib.get_close_matches(name.lower(), list(lower), n=1, cutoff=0.5)
+    return lower[found[0]] if found else None

@@ -1,0 +1,78 @@
+"""Transitions ``(s, a, s')`` at a fixed capacity, with a mask: the replay data.
+
+Compiled fits see the capacity, not the count; it doubles when it is full, so a run of
+any length compiles a fit at most logarithmically often.
+"""
+
+import logging
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+logger = logging.getLogger(__name__)
+
+
+class Transitions(eqx.Module):
+    """Rows of ``(state, action, next_state)``; rows with a false mask do not exist."""
+
+    state: Float[Array | np.ndarray, "capacity n"]
+    action: Float[Array | np.ndarray, "capacity m"]
+    next_state: Float[Array | np.ndarray, "capacity n"]
+    mask: Bool[Array | np.ndarray, " capacity"]
+
+    @classmethod
+    def empty(cls, capacity: int, n: int, m: int) -> "Transitions":
+        """No data yet; room for ``capacity`` transitions."""
+        state = np.zeros((max(capacity, 1), n))
+        action = np.zeros((max(capacity, 1), m))
+        return cls(state, action, state, np.zeros(max(capacity, 1), bool))
+
+    @classmethod
+    def of(
+        cls,
+        state: Float[Array | np.ndarray, "N n"],
+        action: Float[Array | np.ndarray, "N m"],
+        next_state: Float[Array | np.ndarray, "N n"],
+    ) -> "Transitions":
+        """Exactly these transitions, at a capacity of their number."""
+        n, m = np.shape(state)[1], np.shape(action)[1]
+        empty = cls.empty(len(state), n, m)
+        return empty.extend(state, action, next_state)
+
+    @property
+    def count(self) -> int:
+        """Number of transitions held (host-side)."""
+        return int(np.sum(np.asarray(self.mask)))
+
+    def extend(
+        self,
+        state: Float[Array | np.ndarray, "N n"],
+        action: Float[Array | np.ndarray, "N m"],
+        next_state: Float[Array | np.ndarray, "N n"],
+    ) -> "Transitions":
+        """These transitions and more; the capacity doubles as often as needed."""
+        count, new = self.count, len(state)
+        capacity = len(self.mask)
+        while capacity < count + new:
+            capacity *= 2
+        if capacity != len(self.mask):
+            logger.info("transitions: capacity %d -> %d", len(self.mask), capacity)
+
+        def put(old: Array | np.ndarray, add: Array | np.ndarray) -> np.ndarray:
+            out = np.zeros((capacity, *np.shape(old)[1:]), np.float64)
+            out[:count] = np.asarray(old)[:count]
+            out[count : count + new] = np.asarray(add)
+            return out
+
+        return Transitions(
+            put(self.state, state),
+            put(self.action, action),
+            put(self.next_state, next_state),
+            np.arange(capacity) < count + new,
+        )
+
+    def delta(self) -> Float[Array, "capacity n"]:
+        """The regression target ``y = s' - s``."""
+        return jnp.asarray(self.next_state) - jnp.asarray(self.state)

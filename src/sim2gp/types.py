@@ -1,0 +1,48 @@
+"""The shapes everything else is written in: one state, one action, one function.
+
+A dynamics model is a function of one point, ``s' = f(s, a)``; batches and horizons
+are made at the edge by ``vmap`` and ``scan``. Inference runs in float64, planning in
+float32; `in_float64` is the one door between them.
+"""
+
+from collections.abc import Callable
+from functools import wraps
+from typing import ParamSpec, TypeVar
+
+import equinox as eqx
+import jax
+from jaxtyping import Array, Float, PRNGKeyArray
+
+State = Float[Array, " n"]
+Action = Float[Array, " m"]
+Scalar = Float[Array, ""]
+Key = PRNGKeyArray
+
+#: ``s' = f(s, a)``: one step of the world, for one point; always a pytree.
+Dynamics = Callable[[Array, Array], Array]
+#: ``r(s, a, s')``: the reward of one step.
+Reward = Callable[[Array, Array, Array], Array]
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+
+
+class Box(eqx.Module):
+    """The set of actions ``low <= a <= high``, in the units of the channels."""
+
+    low: Float[Array, " m"]
+    high: Float[Array, " m"]
+
+
+def in_float64(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Run a host-side function with float64 switched on, and only inside it.
+
+    JAX's switch is global; scoping it keeps the user's own float32 code as it was.
+    """
+
+    @wraps(function)
+    def scoped(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        with jax.enable_x64(True):
+            return function(*args, **kwargs)
+
+    return scoped
