@@ -1,0 +1,75 @@
+# Two commands, each with nothing before it:
+#
+#   make demo     installs sim2gp into .venv and learns to swing up a pendulum
+#   make test     adds the test tools; lint, types, tests (at most 20 minutes, 2 cores)
+#
+# uv is used when it is on the PATH, else the standard library's venv and pip. Another
+# interpreter: make test PYTHON=python3.13. More arguments: make demo ARGS="--seed 1".
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+UV := $(shell command -v uv 2>/dev/null)
+ARGS ?=
+
+ifeq ($(UV),)
+  MAKE_VENV := $(PYTHON) -m venv $(VENV)
+  INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+else
+  MAKE_VENV := $(UV) venv --quiet --allow-existing --python $(PYTHON) $(VENV)
+  INSTALL := $(UV) pip install --quiet --python $(BIN)/python
+endif
+
+.PHONY: demo test lint types unit nightly figures format constraints clean help
+.DEFAULT_GOAL := help
+
+help:
+	@sed -n '1,8s/^# \{0,1\}//p' Makefile
+
+demo: $(VENV)/.core
+	$(BIN)/sim2gp demo $(ARGS)
+
+test: lint types unit
+
+lint: $(VENV)/.test
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+
+types: $(VENV)/.test
+	$(BIN)/mypy
+
+unit: $(VENV)/.test
+	$(BIN)/python -m pytest -m "not nightly" $(ARGS)
+
+nightly: $(VENV)/.test
+	$(BIN)/python -m pytest -m nightly $(ARGS)
+
+# Redraws the committed figures of the paper.
+figures: $(VENV)/.core
+	$(BIN)/sim2gp reproduce fig1 --out results/fig1 $(ARGS)
+
+format: $(VENV)/.test
+	$(BIN)/ruff check --fix
+	$(BIN)/ruff format
+
+# Needs uv. One universal file: pinned versions, no hosts, no hashes.
+constraints:
+	uv pip compile --quiet --universal --upgrade --python-version 3.11 --no-header \
+	  --no-annotate --all-extras pyproject.toml --output-file constraints.txt
+	grep -v '^sim2gp\b' constraints.txt > constraints.tmp && mv constraints.tmp constraints.txt
+
+clean:
+	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "sim2gp needs Python 3.11 or newer; try: make $(MAKECMDGOALS) PYTHON=python3.11"; exit 1; }
+	$(MAKE_VENV)
+
+$(VENV)/.core: pyproject.toml constraints.txt | $(BIN)/python
+	$(INSTALL) -c constraints.txt -e .
+	@touch $@
+
+$(VENV)/.test: $(VENV)/.core
+	$(INSTALL) -c constraints.txt -e ".[test]"
+	@touch $@

@@ -1,0 +1,45 @@
+"""What every test runs under: strict promotion, fresh keys, repeatable examples.
+
+float64 is never switched on here: the library scopes it, and the tests must see what a
+user sees. Shapes and types are checked by jaxtyping and beartype (pyproject.toml).
+"""
+
+import itertools
+import os
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import hypothesis
+import jax
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+# A compile inside an example is slow once; a flaky example is slow for ever.
+hypothesis.settings.register_profile("unit", deadline=None, derandomize=True)
+hypothesis.settings.register_profile("nightly", deadline=None, max_examples=2000)
+hypothesis.settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "unit"))
+
+
+@pytest.fixture
+def getkey(request: pytest.FixtureRequest) -> Callable[[], jax.Array]:
+    """A function that returns a new key at each call: (the test's name, a counter)."""
+    root = jax.random.key(zlib.crc32(request.node.nodeid.encode()))
+    counter = itertools.count()
+    return lambda: jax.random.fold_in(root, next(counter))
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The folder of real recordings beside the checkout; skips where there is none."""
+    folder = Path(os.environ.get("SIM2GP_DATA", ROOT.parent / "shared" / "data"))
+    if not folder.is_dir():
+        pytest.skip(
+            f"no recordings at {folder} (the project ships none; set SIM2GP_DATA to "
+            "the folder that holds double_pendulum/ and qube/)"
+        )
+    return folder
