@@ -1,0 +1,220 @@
+"""The MAP and its Laplace posterior in whitened coordinates, square roots throughout.
+
+With ``tt = mu0 + L0 z`` and residuals ``r`` divided by their noise, the negative log
+posterior is a sum of squares,
+
+    L(z) = 1/2 ||r(z)||^2 + 1/2 ||z||^2,          J = dr/dz.
+
+All that Levenberg-Marquardt, the posterior, and the evidence need of the data is the
+triangular factor ``R`` of ``[J r]`` (`factor`): it has ``p + 1`` rows however many rows
+the data have, it stacks (streaming, windows, prior), and
+
+    [J r; I z] = Q [R c; 0 rho],     Sigma_z = R^-1 R^-T,     ||r||^2 = ||c||^2 + rho^2.
+
+No normal equations, no explicit inverse, no jitter: at a condition number of 1e4 normal
+equations already miss the posterior mean by 5e-10 sd, the QR form by 3e-14.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int
+from jax.scipy.linalg import solve_triangular
+
+from sim2gp.errors import DeadParameters, NotConverged, NotFinite
+from sim2gp.gaussian import Gaussian
+from sim2gp.types import Scalar
+
+#: Triangular factor of ``[J r]``, shape (p + 1, p + 1), diagonal non-negative.
+Factor = Float[Array, "p1 p1"]
+
+CONVERGED, STALLED, NOT_FINITE = 0, 1, 2
+GRADIENT_TOLERANCE = 1e-8
+RANK_TOLERANCE = 1e-8  # singular values below this share of the largest count as zero
+
+
+def factor(J: Float[Array, "N p"], r: Float[Array, " N"]) -> Factor:
+    """Triangular factor of ``[J r]``: the data's square-root information."""
+    return triangular(jnp.concatenate([J, r[:, None]], axis=1))
+
+
+def triangular(rows: Float[Array, "N k"]) -> Float[Array, "k k"]:
+    """``R`` of the QR decomposition, square, with non-negative diagonal."""
+    N, k = rows.shape
+    if N < k:
+        rows = jnp.concatenate([rows, jnp.zeros((k - N, k), rows.dtype)])
+    R = jnp.linalg.qr(rows, mode="r")
+    return jnp.where(jnp.diag(R) < 0.0, -1.0, 1.0)[:, None] * R
+
+
+def stack(*factors: Float[Array, "N k"]) -> Float[Array, "k k"]:
+    """The factor of several blocks of rows at once."""
+    return triangular(jnp.concatenate(factors))
+
+
+def with_prior(data: Factor, z: Float[Array, " p"]) -> Factor:
+    """Add the prior's rows ``[I z]`` to the data's factor."""
+    prior = jnp.concatenate([jnp.eye(z.size, dtype=z.dtype), z[:, None]], axis=1)
+    return stack(data, prior)
+
+
+def gauss_newton_step(full: Factor) -> Float[Array, " p"]:
+    """The undamped step ``-R^-1 c`` towards the linearised MAP."""
+    return -solve_triangular(full[:-1, :-1], full[:-1, -1])
+
+
+class Fit(eqx.Module):
+    """A MAP in whitened coordinates, with everything that follows from its factor."""
+
+    z: Float[Array, " p"]
+    data: Factor  # of the data alone, at z
+    full: Factor  # of data and prior, at z
+    cost: Scalar
+    gradient: Scalar  # ||g_z||_inf / (1 + cost)
+    status: Int[Array, ""]
+    steps: Int[Array, ""]
+    dead: Bool[Array, " p"]  # parameters that the data do not depend on at all
+    start_costs: Float[Array, " starts"]
+
+    @property
+    def R(self) -> Float[Array, "p p"]:
+        """Factor of the posterior precision: ``R^T R = Sigma_z^-1``."""
+        return self.full[:-1, :-1]
+
+    def posterior(self, prior: Gaussian) -> Gaussian:
+        """``N(tt*, Sigma_q)`` by a triangular solve: scale ``L0 R^-1``."""
+        return Gaussian(
+            prior.mean + prior.scale @ self.z,
+            solve_triangular(self.R, prior.scale.T, trans="T").T,
+        )
+
+    def log_occam(self) -> Scalar:
+        """``-1/2 ||z||^2 - 1/2 logdet(S0 Sq^-1)``: the evidence's price of learning."""
+        return -0.5 * self.z @ self.z - jnp.sum(jnp.log(jnp.diag(self.R)))
+
+    def raise_unless_converged(self, names: tuple[str, ...], where: str) -> None:
+        """Raise a typed error on the host, naming what to look at."""
+        status = int(self.status)
+        if status == NOT_FINITE:
+            raise NotFinite(
+                "E203",
+                "the simulation is not finite at any start of the fit",
+                where=where,
+                fix="narrow the priors, or shorten the step",
+            )
+        dead = [name for name, d in zip(names, self.dead.tolist(), strict=True) if d]
+        if len(dead) == len(names) and bool(jnp.any(self.data[:, -1] != 0.0)):
+            raise DeadParameters(
+                "E146",
+                "no parameter reaches the data",
+                where=where,
+                got=f"zero sensitivity to {', '.join(dead)}",
+                fix="check the columns, the excitation and what is fixed",
+            )
+        if status == STALLED:
+            raise NotConverged(
+                "E201",
+                "the MAP did not converge",
+                where=where,
+                got=f"scaled gradient {float(self.gradient):.1e} "
+                f"after {int(self.steps)} steps",
+                expected=f"at most {GRADIENT_TOLERANCE:.0e}",
+                fix="check units and bounds, or add starts",
+            )
+
+
+def minimise(
+    factor_of: Callable[[Float[Array, " p"]], Factor],
+    starts: Float[Array, "starts p"],
+    *,
+    max_steps: int = 100,
+    tolerance: float = 1e-10,
+) -> Fit:
+    """The best of several Levenberg-Marquardt runs, finished by undamped QR steps.
+
+    ``factor_of(z)`` is the factor of the whitened data residual and its Jacobian.
+    """
+
+    def full_of(z: Array) -> Factor:
+        return with_prior(factor_of(z), z)
+
+    # The factor's last column has the residual's norm and its first columns the
+    # residual's Gauss-Newton matrix, so LM on this small problem *is* LM on the data.
+    @jax.custom_jvp
+    def compressed(z: Array) -> Array:
+        return full_of(z)[:, -1]
+
+    @compressed.defjvp
+    def compressed_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+        full = full_of(primals[0])
+        return full[:, -1], full[:, :-1] @ tangents[0]
+
+    solver = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
+
+    def descend(z0: Array) -> tuple[Array, Array, Array]:
+        solution = optx.least_squares(
+            lambda z, _: compressed(z), solver, z0, max_steps=max_steps, throw=False
+        )
+        residual = compressed(solution.value)
+        return solution.value, 0.5 * residual @ residual, solution.stats["num_steps"]
+
+    z, costs, steps = jax.vmap(descend)(starts)
+    costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
+    best = jnp.argmin(costs)  # a NaN would win an argmin; it is +inf here
+    return polish(factor_of, z[best], steps[best], costs)
+
+
+def polish(
+    factor_of: Callable[[Float[Array, " p"]], Factor],
+    z: Float[Array, " p"],
+    steps: Int[Array, ""],
+    start_costs: Float[Array, " starts"],
+    *,
+    rounds: int = 2,
+) -> Fit:
+    """Undamped QR steps, kept while they do not raise the cost; then the verdict."""
+
+    def improve(carry: tuple[Array, Factor], _: None) -> tuple[tuple, None]:
+        z, data = carry
+        full = with_prior(data, z)
+        z_new = z + gauss_newton_step(full)
+        data_new = factor_of(z_new)
+        cost, cost_new = _cost(full), _cost(with_prior(data_new, z_new))
+        # Rounding in the cost must not refuse the last, gradient-only digits.
+        keep = cost_new <= cost * (1.0 + 1e-9) + 1e-12
+        return jax.tree.map(
+            lambda new, old: jnp.where(keep, new, old), (z_new, data_new), (z, data)
+        ), None
+
+    (z, data), _ = jax.lax.scan(improve, (z, factor_of(z)), None, length=rounds)
+    full = with_prior(data, z)
+    cost = _cost(full)
+    gradient = jnp.max(jnp.abs(full[:-1, :-1].T @ full[:-1, -1])) / (1.0 + cost)
+    finite = jnp.isfinite(cost) & jnp.all(jnp.isfinite(full))
+    status = jnp.where(gradient <= GRADIENT_TOLERANCE, CONVERGED, STALLED)
+    return Fit(
+        z=z,
+        data=data,
+        full=full,
+        cost=cost,
+        gradient=gradient,
+        status=jnp.where(finite, status, NOT_FINITE),
+        steps=steps,
+        dead=jnp.all(data[:, :-1] == 0.0, axis=0),
+        start_costs=start_costs,
+    )
+
+
+def linear_fit(J: Float[Array, "N p"], r: Float[Array, " N"]) -> Fit:
+    """The exact conjugate posterior of ``r(z) = r + J z``: one QR, then refinement."""
+    zeros = jnp.zeros(J.shape[1], J.dtype)
+    return polish(
+        lambda z: factor(J, r + J @ z), zeros, jnp.zeros((), int), jnp.zeros(1)
+    )
+
+
+def _cost(full: Factor) -> Scalar:
+    return 0.5 * full[:, -1] @ full[:, -1]
