@@ -1,0 +1,296 @@
+"""What every machine has in common: channels, constants, an ODE, and one step.
+
+A system is physics only: no reward, no noise, no reset, no clipping. It is written for
+one point; batches are made at the edge by ``vmap``. The step over one period ``dt`` is
+
+    s' = RK4 over ceil(dt / max_substep) equal substeps of  ds/dt = ode(s, u),
+
+with the action held (zero-order hold). A delayed input enters a substep of length ``h``
+by its mean, ``(U(t + h - tau) - U(t - tau)) / h`` with ``U`` the integral of the held
+input; so the delay ``tau`` has a gradient, which a shift by whole samples has not.
+"""
+
+import abc
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from equinox import AbstractVar
+from jaxtyping import Array, Float
+
+from sim2gp.errors import InputError, nearest
+from sim2gp.parameters import Parameters, parameters_of, unknown_parameter
+from sim2gp.types import Action, Scalar, State
+
+R = TypeVar("R")
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One state or input: its name, unit, whether it is an angle, and its limits.
+
+    The limits are the machine's, in the channel's unit; a system never enforces them.
+    """
+
+    name: str
+    unit: str
+    angle: bool = False
+    low: float = -math.inf
+    high: float = math.inf
+
+
+class AbstractSystem(eqx.Module):
+    """A machine: ``ds/dt = ode(params, s, a)`` and its one-step map ``step``.
+
+    ``states`` name what `step` carries: the physical states that `ode` integrates,
+    then, newest first, ``history`` past actions (none but for delayed inputs).
+    All fields are static: a system is not data, its ``params`` are.
+    """
+
+    parameters: AbstractVar[Parameters]
+
+    @property
+    @abc.abstractmethod
+    def states(self) -> tuple[Channel, ...]:
+        """Channels of the state that `step` carries."""
+
+    @property
+    @abc.abstractmethod
+    def actions(self) -> tuple[Channel, ...]:
+        """Channels of the input."""
+
+    @property
+    @abc.abstractmethod
+    def max_substep(self) -> float:
+        """Longest RK4 substep inside `step`, in seconds."""
+
+    @property
+    @abc.abstractmethod
+    def history(self) -> int:
+        """Number of past actions carried in the state."""
+
+    @property
+    @abc.abstractmethod
+    def longest_delay(self) -> float:
+        """Largest delay that any input can have, in seconds."""
+
+    @abc.abstractmethod
+    def record(self, values: Mapping[str, Scalar]) -> Any:
+        """This system's constants, picked by name out of ``values``."""
+
+    @abc.abstractmethod
+    def ode(self, params: Any, s: State, a: Action) -> State:
+        """Time derivative of the physical state under a constant input, per second."""
+
+    @abc.abstractmethod
+    def delays(self, params: Any) -> Float[Array, " m"]:
+        """Delay of each input in seconds."""
+
+    @property
+    def physical_states(self) -> tuple[Channel, ...]:
+        """The states that `ode` integrates, without the carried past actions."""
+        return self.states[: len(self.states) - self.history * len(self.actions)]
+
+    def nominal(self) -> Any:
+        """The record of published constants; a prior median where there is none."""
+        values = self.parameters.nominal()
+        return self.record({name: jnp.asarray(v, float) for name, v in values.items()})
+
+    def step(self, params: Any, s: State, a: Action, dt: float) -> State:
+        """State ``dt`` seconds later, with the input held.
+
+        Raises `InputError` E113 where the carried history is shorter than the delay.
+        """
+        count = max(1, math.ceil(dt / self.max_substep - 1e-9))
+        h = dt / count
+
+        def substep(x: State, u: Action) -> State:
+            return rk4(lambda y, w: self.ode(params, y, w), x, u, h)
+
+        if not self.history and not self.longest_delay:
+            return _integrate(substep, s, a, count)
+        m = len(self.actions)
+        if self.history * dt < self.longest_delay - 1e-9:
+            raise InputError(
+                "E113",
+                "delay longer than the carried history",
+                got=f"{self.history} past actions of {dt:g} s",
+                expected=f"at least {self.longest_delay:g} s",
+                fix="bound the delay and give Actuated(..., delay_max=, period=)",
+            )
+        n = s.size - self.history * m
+        held = jnp.concatenate([a[None], s[n:].reshape(self.history, m)])
+        inputs = delayed_means(held, dt, self.delays(params), count)
+        x = _integrate(substep, s[:n], inputs, count)
+        return jnp.concatenate([x, held[:-1].reshape(-1)])
+
+    def bind(self, params: Any, dt: float) -> "Bound":
+        """The step as a `Dynamics`, a pytree: ``(s, a) -> s'``."""
+        return Bound(self, params, dt)
+
+    def transition(
+        self, tt: Float[Array, " p"], s: State, a: Action, dt: float
+    ) -> State:
+        """The step as a function of the virtual parameters, for inference."""
+        return self.step(self.record(self.parameters.values(tt)), s, a, dt)
+
+
+class Bound(eqx.Module):
+    """A system with its constants: ``s' = f(s, a)``, ready for `jit` and `vmap`."""
+
+    system: AbstractSystem
+    params: Any
+    dt: float = eqx.field(static=True)
+
+    def __call__(self, s: State, a: Action) -> State:
+        return self.system.step(self.params, s, a, self.dt)
+
+
+class AbstractMechanism(AbstractSystem):
+    """Two joints ``q``: ``M(q) dv/dt = forces(q, v, a)``, solved in closed form.
+
+    States are ``(q1, q2, v1, v2)``. A locked joint keeps its place: its velocity counts
+    as zero whatever the state says.
+    """
+
+    locked: AbstractVar[tuple[bool, bool]]
+
+    @abc.abstractmethod
+    def mass_matrix(self, params: Any, q: Float[Array, " 2"]) -> Float[Array, "2 2"]:
+        """Joint-space inertia ``M(q)``, symmetric."""
+
+    @abc.abstractmethod
+    def forces(
+        self, params: Any, q: Float[Array, " 2"], v: Float[Array, " 2"], a: Action
+    ) -> Float[Array, " 2"]:
+        """Inputs, gyroscopic terms, gravity and friction: all but ``M dv/dt``."""
+
+    def delays(self, params: Any) -> Float[Array, " m"]:
+        """No input is delayed."""
+        return jnp.zeros(len(self.actions), jax.tree.leaves(params)[0].dtype)
+
+    def ode(self, params: Any, s: State, a: Action) -> State:
+        """``(v, M^-1 forces)``."""
+        q, v = s[:2], s[2:]
+        if any(self.locked):
+            v = jnp.stack([v[i] * (0.0 if self.locked[i] else 1.0) for i in range(2)])
+        M = self.mass_matrix(params, q)
+        f = self.forces(params, q, v, a)
+        return jnp.concatenate([v, solve_two(M, f, self.locked)])
+
+    def joint(self, name: str) -> int:
+        """Index of a joint by the name of its position channel (E103 if unknown)."""
+        return index_of(name, self.states[:2])
+
+
+def solve_two(
+    M: Float[Array, "2 2"], f: Float[Array, " 2"], locked: tuple[bool, bool]
+) -> Float[Array, " 2"]:
+    """``M^-1 f`` for two joints; a locked joint does not accelerate."""
+    a, b, c = M[0, 0], M[0, 1], M[1, 1]
+    zero = jnp.zeros_like(a)
+    if all(locked):
+        return jnp.stack([zero, zero])
+    if locked[0]:
+        return jnp.stack([zero, f[1] / c])
+    if locked[1]:
+        return jnp.stack([f[0] / a, zero])
+    det = a * c - b * b
+    return jnp.stack([c * f[0] - b * f[1], a * f[1] - b * f[0]]) / det
+
+
+def symmetric(a: Scalar, b: Scalar, c: Scalar) -> Float[Array, "2 2"]:
+    """The matrix ``[[a, b], [b, c]]``."""
+    return jnp.stack([jnp.stack([a, b]), jnp.stack([b, c])])
+
+
+def rk4(
+    f: Callable[[State, Action], State], s: State, u: Action, h: float | Scalar
+) -> State:
+    """One classical Runge-Kutta step of length ``h`` seconds under a constant input."""
+    k1 = f(s, u)
+    k2 = f(s + 0.5 * h * k1, u)
+    k3 = f(s + 0.5 * h * k2, u)
+    k4 = f(s + h * k3, u)
+    return s + (h / 6.0) * (k1 + 2.0 * (k2 + k3) + k4)
+
+
+def delayed_means(
+    held: Float[Array, "past m"], dt: float, delay: Float[Array, " m"], count: int
+) -> Float[Array, "count m"]:
+    """Mean delayed input over each of ``count`` substeps of one period ``dt``.
+
+    ``held`` are the held inputs, newest first: row ``k`` acts on
+    ``[-k dt, (1 - k) dt)``. On a knot the derivative with respect to the delay is the
+    one from the right (a longer delay), so that it never vanishes by accident.
+    """
+    h = dt / count
+    t = jnp.arange(count + 1, dtype=held.dtype)[:, None] * h - delay[None]
+
+    def area(k: int) -> Float[Array, "times m"]:
+        z = t + k * dt
+        return jnp.where(z <= 0.0, 0.0, jnp.where(z > dt, dt, z)) * held[k][None]
+
+    integral = sum(area(k) for k in range(len(held)))
+    return jnp.diff(jnp.asarray(integral), axis=0) / h
+
+
+def record_from(record: type[R], values: Mapping[str, Scalar]) -> R:
+    """A record filled by name out of ``values``."""
+    names = [field.name for field in dataclasses.fields(record)]  # type: ignore[arg-type]
+    return record(**{name: values[name] for name in names})
+
+
+def table_for(record: type, parameters: Parameters | None) -> Parameters:
+    """The record's own table, or the one given, whose names must be the same (E145)."""
+    own = parameters_of(record)
+    if parameters is None:
+        return own
+    given = {*parameters.names, *(name for name, _ in parameters.fixed)}
+    for name in sorted(given - set(own.names)):
+        raise unknown_parameter(name, own.names)
+    for name in own.names:
+        if name not in given:
+            raise InputError(
+                "E145", "missing parameter", where=record.__name__, expected=name
+            )
+    return parameters
+
+
+def index_of(name: str, channels: tuple[Channel, ...]) -> int:
+    """Position of a channel by name; `InputError` E103 names the nearest one."""
+    names = [channel.name for channel in channels]
+    if name not in names:
+        close = nearest(name, names)
+        raise InputError(
+            "E103",
+            "unknown channel",
+            got=name,
+            expected=f"one of {', '.join(names)}",
+            fix=f"did you mean {close}?" if close else "",
+        )
+    return names.index(name)
+
+
+def _integrate(
+    substep: Callable[[State, Action], State],
+    x: State,
+    inputs: Float[Array, "*count m"],
+    count: int,
+) -> State:
+    """All substeps of one period; ``inputs`` is one input, or one for each substep."""
+    each = inputs.ndim == 2
+    if count <= 2:  # a scan of two steps costs more than it saves
+        for i in range(count):
+            x = substep(x, inputs[i] if each else inputs)
+        return x
+
+    def body(x: State, u: Action | None) -> tuple[State, None]:
+        return substep(x, inputs if u is None else u), None
+
+    return jax.lax.scan(body, x, inputs if each else None, length=count)[0]
