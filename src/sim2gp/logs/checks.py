@@ -1,0 +1,295 @@
+"""Is this recording what it claims to be? Each check raises, or returns notes.
+
+Errors (E1xx) are faults no fit can survive; notes (W1xx) are facts the reader of a
+result should know. Nothing is repaired silently. Position and velocity of a joint are
+compared through displacements: over k rows, ``q_{i+k} - q_i`` against the integral of
+dq, whose slope is 1 for a healthy pair, -1 for a flipped sign, 57.3 for degrees.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from sim2gp.errors import InputError
+from sim2gp.logs.log import ChannelLike, Log, Note
+
+Values = Float[np.ndarray, " N"]
+Mask = Bool[np.ndarray, " N"]
+Lines = Int[np.ndarray, " N"]
+
+GAP = 5.0  # periods without a row that end an episode
+JITTER = 0.10  # relative spread of the period that is worth stating
+DAY = 86400.0
+SENTINELS = (-999.0, -9999.0, 9999.0, -99999.0, 99999.0, 1e30, -1e30)
+SENTINELS += (32767.0, -32768.0, 65535.0, 2147483647.0, 4294967295.0)
+_FACTORS = {  # slope of displacement on integrated velocity -> what it betrays
+    180 / np.pi: "the position is in degrees or the velocity in rad/s of another kind",
+    np.pi / 180: "the velocity is in degrees per second",
+    1 / (2 * np.pi): "the position is in turns",
+    2 * np.pi: "the velocity is in turns per second",
+    1e3: "the position is in thousandths (mm for m), or time in thousands of s",
+    1e-3: "the velocity is in thousandths, or time is in ms",
+    1e-6: "time is in us",
+}
+
+
+def finite(
+    columns: Mapping[str, Values], lines: Lines, source: str, skip: Mask
+) -> None:
+    """No NaN or infinity in a used column outside the skipped rows (E101)."""
+    bad = {name: ~np.isfinite(v) & ~skip for name, v in columns.items()}
+    count = sum(int(b.sum()) for b in bad.values())
+    if count == 0:
+        return
+    rows = lines[np.logical_or.reduce(list(bad.values()))]
+    name = next(name for name, b in bad.items() if b.any())
+    first = int(np.flatnonzero(bad[name])[0])
+    value = columns[name][first]
+    some = ", ".join(str(r) for r in rows[:5]) + (", ..." if len(rows) > 5 else "")
+    raise InputError(
+        "E101",
+        "value that is not finite",
+        where=f"{source}:line {lines[first]}, column {name}",
+        got=f"{value:g} ({count} such on {len(rows)} lines: {some})",
+        expected="finite numbers",
+        fix="mend the rows, exclude their times, or set drop_nonfinite = true",
+    )
+
+
+def stamps(time: Values, lines: Lines, source: str) -> None:
+    """Time goes forward at every row (E108, E109, E112)."""
+    steps = np.diff(time)
+    forward = steps[steps > 0]
+    period = float(np.median(forward)) if forward.size else 0.0
+    bad = np.flatnonzero(steps <= 0)
+    jumps = np.flatnonzero(steps > DAY)
+    if bad.size == 0 and jumps.size == 0:
+        return
+    i = int(bad[0]) if bad.size else int(jumps[0])
+    where = f"{source}:line {lines[i + 1]}"
+    got = f"{time[i + 1]:.9g} s after {time[i]:.9g} s"
+    lost = float(np.spacing(np.float32(np.max(np.abs(time)))))
+    single = bool(np.all(time.astype(np.float32).astype(np.float64) == time))
+    if bad.size and np.max(np.abs(time)) > 1e5 and single and lost > 0.5 * period:
+        raise InputError(
+            "E112",
+            "time stamps lost their resolution in float32",
+            where=where,
+            got=f"{got}, resolved to {lost:.3g} s",
+            expected="stamps finer than the period",
+            fix="write seconds since the start, or float64 stamps",
+        )
+    stays = i + 2 < len(time) and time[i + 2] <= time[i]
+    back = bad.size and -steps[i] > GAP * period and stays
+    if not bad.size or back:
+        raise InputError(
+            "E109",
+            "clock jump",
+            where=where,
+            got=f"{got}, a jump of {steps[i]:.9g} s",
+            expected="one clock for the whole file",
+            fix="split the file there",
+        )
+    same = steps[i] == 0
+    raise InputError(
+        "E108",
+        "duplicate time stamp" if same else "time does not increase",
+        where=where,
+        got=f"{got} ({bad.size} such rows)",
+        expected="increasing time",
+        fix="keep the first row of each stamp" if same else "sort or split the file",
+    )
+
+
+def rate(time: Values, source: str) -> list[Note]:
+    """A period that is no control period is a unit (E107); jitter is stated (W110)."""
+    steps = np.diff(time)
+    period = float(np.median(steps))
+    if period >= 0.5:
+        raise InputError(
+            "E107",
+            "time in another unit",
+            where=source,
+            got=f"a median period of {period:g} s",
+            expected="less than 0.5 s",
+            fix=f'say time = {{column = "...", unit = "{_guess(period)}"}}',
+        )
+    steady = steps[steps <= GAP * period]
+    spread = float(np.max(np.abs(steady - period))) / period
+    if spread <= JITTER:
+        return []
+    low, high = float(np.min(steady)), float(np.max(steady))
+    text = (
+        f"period varies in {source}: {1e3 * low:.3g}, {1e3 * period:.3g}, "
+        f"{1e3 * high:.3g} ms (minimum, median, maximum); the time column is used"
+    )
+    return [Note("W110", text)]
+
+
+def _guess(period: float) -> str:
+    return "ms" if period < 500 else "us" if period < 5e5 else "ns"
+
+
+def period_matches(log: Log, dt: float) -> None:
+    """For likelihoods of one fixed period only: the log has that period (E113)."""
+    if abs(log.period - dt) > 1e-3 * dt:
+        raise InputError(
+            "E113",
+            "period differs from the model's step",
+            where=log.source,
+            got=f"{log.period:g} s",
+            expected=f"{dt:g} s",
+            fix="use a likelihood over windows (window > 0), or that period",
+        )
+
+
+def sentinels(
+    values: Values, name: str, lines: Lines, source: str
+) -> tuple[Mask, list[Note]]:
+    """Samples that mean "no value" (-9999, 65535, ...): masked, above 1 % an error."""
+    bad = np.zeros(len(values), dtype=bool)
+    for mark in SENTINELS:
+        here = values == mark
+        if here.sum() < 2:
+            continue
+        others = np.abs(values[~here])
+        if not others.size or abs(mark) > 10 * np.max(others, initial=1e-9):
+            bad |= here
+    if not bad.any():
+        return bad, []
+    first = int(np.flatnonzero(bad)[0])
+    share = float(np.mean(bad))
+    where = f"{source}:line {lines[first]}, column {name}"
+    if share > 0.01:
+        raise InputError(
+            "E102",
+            "sentinel instead of a measurement",
+            where=where,
+            got=f"{values[first]:g} in {100 * share:.1f} % of the rows",
+            expected="measurements in at least 99 % of the rows",
+            fix="exclude those times or record again",
+        )
+    text = f"{values[first]:g} means no value at {where}: {bad.sum()} samples masked"
+    return bad, [Note("W102", text)]
+
+
+def counter_wraps(values: Values, name: str, source: str) -> list[Note]:
+    """Integer counts that jump by a power of two: an encoder that overflowed (W122)."""
+    if len(values) < 3 or not np.all(values == np.round(values)):
+        return []
+    jumps = np.abs(np.diff(values))
+    for bits in (8, 10, 12, 14, 16, 24, 32):
+        hit = np.abs(jumps - 2.0**bits) < 0.02 * 2.0**bits
+        if hit.any() and np.median(jumps) < 0.02 * 2.0**bits:
+            text = f"column {name} of {source} jumps by 2^{bits} {int(hit.sum())} times"
+            return [Note("W122", f"{text}: an encoder that overflows?")]
+    return []
+
+
+def in_reach(values: Values, channel: ChannelLike, source: str) -> None:
+    """A joint with limits is not measured twenty times beyond them (E107)."""
+    bound = max(abs(channel.low), abs(channel.high))
+    if not np.isfinite(bound) or len(values) == 0:
+        return
+    worst = float(np.max(np.abs(values)))
+    if worst > 20 * bound:
+        raise InputError(
+            "E107",
+            f"{channel.name} in another unit",
+            where=source,
+            got=f"{worst:g} {channel.unit}",
+            expected=f"at most {bound:g} {channel.unit}",
+            fix="state the unit of the column",
+        )
+
+
+def _fit(time: Values, q: Values, dq: Values) -> tuple[float, float] | None:
+    """Slope and correlation of displacements on integrated velocities, or None."""
+    k = max(3, round(0.1 / float(np.median(np.diff(time)))))
+    k = min(k, len(time) // 10)
+    if k < 3:
+        return None
+    area = np.concatenate([[0.0], np.cumsum(0.5 * (dq[1:] + dq[:-1]) * np.diff(time))])
+    dQ, dA = q[k::k] - q[:-k:k], area[k::k] - area[:-k:k]
+    moves = np.abs(np.diff(q))
+    quantum = np.min(moves[moves > 0], initial=np.inf)
+    if not np.sqrt(np.mean(dQ**2)) > 20 * quantum:
+        return None  # hardly moves: quantisation would decide
+    power = float(np.sum(dA**2) * np.sum(dQ**2))
+    if power == 0.0:
+        return 0.0, 0.0
+    return float(np.sum(dQ * dA) / np.sum(dA**2)), float(np.sum(dQ * dA) / power**0.5)
+
+
+def velocity_agrees(
+    time: Values, q: Values, dq: Values, name: str, source: str
+) -> None:
+    """The velocity column is the rate of the position column (E106, E107)."""
+    found = _fit(time, q, dq)
+    if found is None:
+        return
+    slope, correlation = found
+    if correlation > 0.8 and 2 / 3 < slope < 1.5 or 0.5 < correlation <= 0.8:
+        return
+    got = f"slope {slope:.3g}, correlation {correlation:.2f}"
+    where = f"{source}: {name} and {name}.velocity"
+    expected = f"{name}.velocity to be the rate of {name} (slope 1)"
+    swapped = _fit(time, dq, q)
+    if swapped and swapped[1] > 0.9 and 2 / 3 < swapped[0] < 1.5:
+        what, fix = "columns swapped", "exchange the two columns"
+        raise InputError("E106", what, where=where, got=got, expected=expected, fix=fix)
+    if correlation > 0.8:
+        for ratio, meaning in _FACTORS.items():
+            if abs(slope / ratio - 1) < 0.15:
+                raise InputError(
+                    "E107",
+                    "wrong unit",
+                    where=where,
+                    got=got,
+                    expected=expected,
+                    fix=f"state the unit: it looks as if {meaning}",
+                )
+    fix = "set sign = -1 on one of them" if correlation < -0.8 else "check the columns"
+    raise InputError(
+        "E106",
+        "position and velocity disagree",
+        where=where,
+        got=got,
+        expected=expected,
+        fix=fix,
+    )
+
+
+def excitation(
+    channels: Mapping[str, Values], inputs: Mapping[str, Values], source: str
+) -> list[Note]:
+    """Columns that never change teach nothing (W117)."""
+    notes = []
+    still = [name for name, v in channels.items() if np.ptp(v) == 0]
+    if still and len(still) == len(channels):
+        text = f"nothing moves in {source}: its parameters keep their prior"
+        return [Note("W117", text)]
+    flat = [name for name, v in inputs.items() if np.ptp(v) == 0]
+    for names, word in ((still, "channel"), (flat, "input")):
+        if names:
+            listed = ", ".join(names)
+            notes.append(Note("W117", f"constant {word} {listed} in {source}"))
+    return notes
+
+
+def shared_rows(train: Sequence[Log], test: Sequence[Log]) -> list[Note]:
+    """Rows that stand in both sets: a test on them proves nothing (W128)."""
+
+    def rows(log: Log) -> set[bytes]:
+        parts = [log.time, *log.channels.values(), *log.inputs.values()]
+        return {row.tobytes() for row in np.stack(parts, axis=1)}
+
+    known = set().union(*(rows(log) for log in train)) if train else set()
+    notes = []
+    for log in test:
+        count = len(rows(log) & known)
+        if count:
+            text = f"{count} rows of {log.source} were also fitted to"
+            notes.append(Note("W128", text))
+    return notes

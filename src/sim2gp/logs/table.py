@@ -1,0 +1,358 @@
+"""Text to numbers: one CSV file becomes a table of float64 columns, or one clear error.
+
+The first line names the columns, the rest are rows of numbers separated by commas.
+Spaces around names and a byte-order mark are accepted. Only the columns that are asked
+for are parsed, by numpy; a fault is then looked for cell by cell, to name its line.
+Lines are counted as an editor counts them: the header is line 1.
+"""
+
+import csv
+import os
+import re
+import stat
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from sim2gp.errors import InputError, nearest
+
+MAX_BYTES = 2 * 1024**3  # of one text file; the numbers need about as much again
+_COMPRESSED = (b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"PK\x03\x04", b"\x28\xb5\x2f\xfd")
+_BINARY = (b"PAR1", b"\x89HDF", b"\x93NUMPY", b"\x89MCAP", b"SQLite format 3")
+_DATE = re.compile(
+    r"\d{4}-\d\d-\d\d|\d{1,2}:\d\d(:\d\d)?|\d{1,2}[/.]\d{1,2}[/.]\d{2,4}"
+)
+
+
+@dataclass(frozen=True)
+class Table:
+    """The numbers of one file: ``columns[name]`` (N,), and the line of each row."""
+
+    source: str
+    header: tuple[str, ...]
+    columns: dict[str, Float[np.ndarray, " N"]]
+    lines: Int[np.ndarray, " N"]
+
+
+def shown(path: Path) -> str:
+    """A path as the user would write it: relative when it lies below the folder."""
+    try:
+        return str(path.relative_to(Path.cwd()))
+    except ValueError:
+        return str(path)
+
+
+def read_bytes(path: Path, limit: int = MAX_BYTES) -> bytes:
+    """The content of a regular file; refuses folders, devices and pipes unread (E130)."""
+    where = shown(path)
+    if "\x00" in str(path):
+        raise InputError(
+            "E131",
+            "NUL in a path",
+            where=repr(where),
+            got="a NUL character",
+            expected="a plain path",
+            fix="remove the character",
+        )
+    try:
+        before = os.stat(path)
+        if not stat.S_ISREG(before.st_mode):
+            raise _not_a_file(where, before.st_mode)
+        if before.st_size > limit:
+            raise InputError(
+                "E126",
+                "file too large",
+                where=where,
+                got=f"{before.st_size} bytes",
+                expected=f"at most {limit} bytes",
+                fix="split the file",
+            )
+        content = path.read_bytes()
+        after = os.stat(path)
+    except OSError as error:
+        raise _unreadable(path, error) from error
+    if (before.st_size, before.st_mtime_ns) != (after.st_size, after.st_mtime_ns):
+        raise InputError(
+            "E129",
+            "file changed while it was read",
+            where=where,
+            got=f"{before.st_size} then {after.st_size} bytes",
+            expected="a finished recording",
+            fix="wait until the recording has ended",
+        )
+    return content
+
+
+def _not_a_file(where: str, mode: int) -> InputError:
+    kinds = {
+        stat.S_IFDIR: "a folder",
+        stat.S_IFIFO: "a pipe",
+        stat.S_IFSOCK: "a socket",
+        stat.S_IFCHR: "a device",
+        stat.S_IFBLK: "a device",
+    }
+    return InputError(
+        "E130",
+        "not a file",
+        where=where,
+        got=kinds.get(stat.S_IFMT(mode), "something else"),
+        expected="a regular file",
+        fix="name the file itself",
+    )
+
+
+def _unreadable(path: Path, error: OSError) -> InputError:
+    folder = path.parent
+    hint = "check the path"
+    if isinstance(error, FileNotFoundError):
+        if path.is_symlink():
+            hint = f"the link points to {os.readlink(path)}, which is not there"
+        elif folder.is_dir():
+            names = [entry.name for entry in folder.iterdir()]
+            close = nearest(path.name, names)
+            hint = f"did you mean {close}" if close else hint
+    elif isinstance(error, PermissionError):
+        hint = "give yourself the right to read it"
+    return InputError(
+        "E130",
+        "file cannot be read",
+        where=shown(path),
+        got=(error.strerror or str(error)).lower(),
+        expected="a readable file",
+        fix=hint,
+    )
+
+
+def decode(content: bytes, where: str) -> str:
+    """Bytes to text: UTF-8 with or without a byte-order mark, no NUL bytes (E120)."""
+    if content.startswith(_COMPRESSED):
+        raise InputError(
+            "E126",
+            "compressed file",
+            where=where,
+            got=f"first bytes {content[:2].hex()}",
+            expected="plain text",
+            fix="unpack the file first",
+        )
+    nul = content.find(b"\x00")
+    binary = content.startswith(_BINARY)
+    if nul < 0 and not binary:
+        try:
+            return content.decode("utf-8-sig")
+        except UnicodeDecodeError as error:
+            nul = error.start
+    offset = 0 if binary else nul
+    raise InputError(
+        "E120",
+        "not UTF-8 text",
+        where=f"{where}:byte {offset}",
+        got=f"byte 0x{content[offset]:02x}",
+        expected="text in UTF-8",
+        fix="save the file as UTF-8 text",
+    )
+
+
+def read_table(path: Path, wanted: Sequence[str], time: str | None = None) -> Table:
+    """Read the wanted columns of a CSV file as float64; empty cells become NaN."""
+    where = shown(path)
+    text = decode(read_bytes(path), where)
+    lines = text.splitlines()
+    filled = [i for i, line in enumerate(lines) if line and not line.isspace()]
+    if not filled:
+        raise InputError(
+            "E115",
+            "empty file",
+            where=where,
+            got="no text",
+            expected="a header and at least two rows",
+            fix="record the log again",
+        )
+    header = _header(lines[filled[0]], f"{where}:line {filled[0] + 1}")
+    if len(filled) == 1:
+        raise InputError(
+            "E115",
+            "no rows below the header",
+            where=where,
+            got="0 rows",
+            expected="at least two rows",
+            fix="record the log again",
+        )
+    numbers = np.asarray(filled[1:], dtype=np.int64) + 1
+    rows = [lines[i] for i in filled[1:]]
+    columns = [_position(name, header, where) for name in wanted]
+    quoted = '"' in text
+    _check_widths(rows, header, numbers, where, quoted)
+    values = _parse(rows, columns, header, numbers, where, quoted, time)
+    found = {name: values[:, i] for i, name in enumerate(wanted)}
+    return Table(where, header, found, numbers)
+
+
+def _header(line: str, where: str) -> tuple[str, ...]:
+    names = [name.strip() for name in next(csv.reader([line], skipinitialspace=True))]
+    if len(names) == 1:
+        for mark, word in ((";", "semicolons"), ("\t", "tabs"), ("|", "bars")):
+            if mark in line:
+                raise _delimiter(line, where, word)
+    for i, name in enumerate(names):
+        if name and name in names[:i]:
+            raise InputError(
+                "E104",
+                f"column {name} stands twice",
+                where=where,
+                got=f"columns {names.index(name) + 1} and {i + 1}",
+                expected="each name once",
+                fix="rename one of them",
+            )
+    if all(_is_number(name) for name in names if name):
+        raise InputError(
+            "E103",
+            "no header",
+            where=where,
+            got=repr(_cut(line)),
+            expected="a first line with the names of the columns",
+            fix="add the names as the first line",
+        )
+    return tuple(names)
+
+
+def _delimiter(line: str, where: str, word: str) -> InputError:
+    return InputError(
+        "E119",
+        "wrong delimiter",
+        where=where,
+        got=f"{word} in {_cut(line)!r}",
+        expected="values separated by commas, decimals by points",
+        fix="save the table with commas and decimal points",
+    )
+
+
+def _position(name: str, header: tuple[str, ...], where: str) -> int:
+    if name in header:
+        return header.index(name)
+    close = nearest(name, header)
+    raise InputError(
+        "E103",
+        f"missing column {name}",
+        where=f"{where}:line 1",
+        got=_cut(", ".join(header), 120),
+        expected=f"a column named {name}",
+        fix=f"did you mean {close}" if close else "name a column of the file",
+    )
+
+
+def _check_widths(
+    rows: list[str],
+    header: tuple[str, ...],
+    numbers: np.ndarray,
+    where: str,
+    quoted: bool,
+) -> None:
+    """Every row has as many fields as the header (E121), and commas between them."""
+    if quoted:
+        widths = [len(fields) for fields in csv.reader(rows, skipinitialspace=True)]
+        if len(widths) != len(rows):
+            raise InputError(
+                "E121",
+                "quote that never closes",
+                where=where,
+                got=f"{len(widths)} records on {len(rows)} lines",
+                expected="one record per line",
+                fix="remove the quotes",
+            )
+    else:
+        widths = [row.count(",") + 1 for row in rows]
+    want = len(header)
+    wrong = np.flatnonzero(np.asarray(widths) != want)
+    if wrong.size == 0:
+        return
+    i = int(wrong[0])
+    place, line = f"{where}:line {numbers[i]}", rows[i]
+    if wrong.size == len(rows) and not quoted:
+        if widths[i] == 1 and any(mark in line for mark in ";\t"):
+            raise _delimiter(line, place, "semicolons or tabs")
+        if set(widths) == {2 * want}:
+            raise _delimiter(line, place, "decimal commas")
+    raise InputError(
+        "E121",
+        "ragged row",
+        where=place,
+        got=f"{widths[i]} fields",
+        expected=f"{want} fields",
+        fix=f"mend or delete the line ({wrong.size} such in the file)",
+    )
+
+
+def _parse(
+    rows: list[str],
+    columns: list[int],
+    header: tuple[str, ...],
+    numbers: np.ndarray,
+    where: str,
+    quoted: bool,
+    time: str | None,
+) -> Float[np.ndarray, "N k"]:
+    if not quoted:
+        try:
+            return np.loadtxt(
+                rows,
+                delimiter=",",
+                usecols=columns,
+                ndmin=2,
+                comments=None,
+                dtype=np.float64,
+            )
+        except ValueError:
+            pass  # some cell is not a number: the search below says which
+    out = np.empty((len(rows), len(columns)))
+    for r, fields in enumerate(csv.reader(rows, skipinitialspace=True)):
+        for c, column in enumerate(columns):
+            cell = fields[column].strip()
+            if not cell:
+                out[r, c] = np.nan
+            elif _is_number(cell):
+                out[r, c] = float(cell)
+            else:
+                name = header[column]
+                place = f"{where}:line {numbers[r]}, column {name}"
+                raise _not_a_number(cell, place, name == time)
+    return out
+
+
+def _not_a_number(cell: str, place: str, is_time: bool) -> InputError:
+    code, what, expected = "E121", "text in a numeric column", "a number"
+    fix = "mend the cell, or leave it empty and set drop_nonfinite"
+    if is_time and _DATE.search(cell):
+        code, what = "E114", "time written as a date or clock"
+        expected = "seconds as a number, such as 12.345"
+        fix = "write the time as seconds since the start"
+    elif cell.lower() in ("true", "false") or _is_complex(cell):
+        code, what, expected = "E123", "truth value or complex number", "a real number"
+        fix = "write real numbers"
+    elif "," in cell:
+        fix = "write numbers without thousands separators, such as 1234"
+    return InputError(
+        code, what, where=place, got=repr(_cut(cell)), expected=expected, fix=fix
+    )
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return "_" not in cell
+
+
+def _is_complex(cell: str) -> bool:
+    try:
+        complex(cell.replace("i", "j"))
+    except ValueError:
+        return False
+    return True
+
+
+def _cut(text: str, width: int = 40) -> str:
+    return text if len(text) <= width else text[: width - 3] + "..."
