@@ -107,9 +107,9 @@ def top_level_imports(tree: ast.Module) -> Iterator[tuple[int, str]]:
             pending.extend(ast.iter_child_nodes(node))
 
 
-def violations(source: str) -> list[str]:
+def violations(source: str, filename: str = "<source>") -> list[str]:
     """Forbidden constructs of one file, as "line: rule"."""
-    tree = ast.parse(source)
+    tree = ast.parse(source, filename)
     found = [
         (line, f"top-level import of {name}")
         for line, name in top_level_imports(tree)
