@@ -21,7 +21,7 @@ Lines = Int[np.ndarray, " N"]
 GAP = 5.0  # periods without a row that end an episode
 JITTER = 0.10  # relative spread of the period that is worth stating
 DAY = 86400.0
-SENTINELS = (-999.0, -9999.0, 9999.0, -99999.0, 99999.0, 1e30, -1e30)
+SENTINELS: tuple[float, ...] = (-999.0, -9999.0, 9999.0, -99999.0, 99999.0, 1e30, -1e30)
 SENTINELS += (32767.0, -32768.0, 65535.0, 2147483647.0, 4294967295.0)
 _FACTORS = {  # slope of displacement on integrated velocity -> what it betrays
     180 / np.pi: "the position is in degrees or the velocity in rad/s of another kind",
@@ -188,18 +188,21 @@ def counter_wraps(values: Values, name: str, source: str) -> list[Note]:
 
 
 def in_reach(values: Values, channel: ChannelLike, source: str) -> None:
-    """A joint with limits is not measured twenty times beyond them (E107)."""
-    bound = max(abs(channel.low), abs(channel.high))
-    if not np.isfinite(bound) or len(values) == 0:
+    """A joint with limits does not travel ten times their distance (E107).
+
+    The distance counts and not the place: a measured angle may be any of its turns.
+    """
+    allowed = channel.high - channel.low
+    if not np.isfinite(allowed) or len(values) == 0:
         return
-    worst = float(np.max(np.abs(values)))
-    if worst > 20 * bound:
+    travel = float(np.ptp(values))
+    if travel > 10 * allowed:
         raise InputError(
             "E107",
             f"{channel.name} in another unit",
             where=source,
-            got=f"{worst:g} {channel.unit}",
-            expected=f"at most {bound:g} {channel.unit}",
+            got=f"a travel of {travel:g} {channel.unit}",
+            expected=f"about {allowed:g} {channel.unit}",
             fix="state the unit of the column",
         )
 
@@ -230,7 +233,7 @@ def velocity_agrees(
     if found is None:
         return
     slope, correlation = found
-    if correlation > 0.8 and 2 / 3 < slope < 1.5 or 0.5 < correlation <= 0.8:
+    if (correlation > 0.8 and 2 / 3 < slope < 1.5) or 0.5 < correlation <= 0.8:
         return
     got = f"slope {slope:.3g}, correlation {correlation:.2f}"
     where = f"{source}: {name} and {name}.velocity"

@@ -8,6 +8,7 @@ masked, because whatever disturbed the machine there also moved it.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -32,12 +33,14 @@ def read_csv(
     time: Column | str = "time",
     exclude: Sequence[tuple[float, float]] = (),
     drop_nonfinite: bool = False,
+    limits: Mapping[str, tuple[float, float]] | None = None,
     fixed: Mapping[str, float] | None = None,
     group: int = 0,
 ) -> tuple[Log, ...]:
     """Read one file into logs without gaps; a number for an input holds it constant.
 
     ``exclude`` lists intervals of the file's time in s; a log is cut around them.
+    ``limits`` are end stops of states, in their units: samples there are masked.
     Raises `InputError` with the codes of bad tables (E101 to E131).
     """
     path = Path(path)
@@ -50,7 +53,7 @@ def read_csv(
     stamps = _converted(table.columns[clock.column], clock, "s", table.source)
     checks.stamps(stamps, table.lines, table.source)
     notes = checks.rate(stamps, table.source)
-    channels, mask, more = _channels(table, specs, states)
+    channels, mask, more = _channels(table, specs, states, limits or {})
     inputs, clipped = _inputs(table, columns, actions, len(stamps))
     checked = {name: channels[name][mask[name]] for name in channels}
     notes += more + clipped + checks.excitation(checked, inputs, table.source)
@@ -170,7 +173,10 @@ def _converted(
 
 
 def _channels(
-    table: Table, specs: Mapping[str, Column], states: Sequence[ChannelLike]
+    table: Table,
+    specs: Mapping[str, Column],
+    states: Sequence[ChannelLike],
+    limits: Mapping[str, tuple[float, float]],
 ) -> tuple[dict[str, Values], dict[str, Mask], list[Note]]:
     """Measured channels in the system's units, their masks, and what to say."""
     channels: dict[str, Values] = {}
@@ -194,7 +200,8 @@ def _channels(
         if spec.saturation is not None:
             mask &= (raw > spec.saturation[0]) & (raw < spec.saturation[1])
         checks.in_reach(values[mask], state, source)
-        mask &= (values > state.low) & (values < state.high)
+        low, high = limits.get(state.name, (-np.inf, np.inf))
+        mask &= (values > low) & (values < high)
         lost = int((~mask).sum())
         if lost:
             text = f"{lost} samples of {state.name} in {source} are masked"
@@ -251,8 +258,7 @@ def _cut(log: Log, cuts: Mask, lines: Int[np.ndarray, " N"]) -> tuple[Log, ...]:
         text = f"gap of {steps[i - 1]:.3g} s in {log.source} before line {lines[i]}"
         notes.append(Note("W111", f"{text}: a new episode starts there"))
     edges = [0, *np.flatnonzero(gaps | cuts), len(log)]
-    pairs = zip(edges[:-1], edges[1:], strict=True)
-    pieces = [slice(int(a), int(b)) for a, b in pairs if b - a >= 2]
+    pieces = [slice(int(a), int(b)) for a, b in pairwise(edges) if b - a >= 2]
     if not pieces:
         raise _too_short(log.source, len(log))
     single = len(pieces) == 1

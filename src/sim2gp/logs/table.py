@@ -46,7 +46,7 @@ def shown(path: Path) -> str:
 
 
 def read_bytes(path: Path, limit: int = MAX_BYTES) -> bytes:
-    """The content of a regular file; refuses folders, devices and pipes unread (E130)."""
+    """The content of a regular file; folders, devices and pipes are refused (E130)."""
     where = shown(path)
     if "\x00" in str(path):
         raise InputError(
