@@ -26,8 +26,8 @@ from sim2gp.parameters import Parameters, bounded, log_bounded
 from sim2gp.systems.base import (
     AbstractMechanism,
     Channel,
+    Inertia,
     record_from,
-    symmetric,
     table_for,
 )
 from sim2gp.types import Action, Scalar
@@ -113,13 +113,11 @@ class CartPole(AbstractMechanism):
     def record(self, values: Mapping[str, Scalar]) -> CartPoleParams:
         return record_from(CartPoleParams, values)
 
-    def mass_matrix(
-        self, params: CartPoleParams, q: Float[Array, " 2"]
-    ) -> Float[Array, "2 2"]:
+    def inertia(self, params: CartPoleParams, q: Float[Array, " 2"]) -> Inertia:
         """Joint-space inertia, in kg, kg m and kg m^2."""
         p, l = params, params.pole_half_length
         reflected = self.motor_inertia * (self.gear_ratio / self.pinion_radius) ** 2
-        return symmetric(
+        return (
             p.pole_mass + p.cart_mass + self.gear_efficiency * reflected,
             p.pole_mass * l * jnp.cos(q[1]),
             4.0 / 3.0 * p.pole_mass * l**2,

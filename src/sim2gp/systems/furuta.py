@@ -29,8 +29,8 @@ from sim2gp.parameters import Parameters, bounded, log_bounded
 from sim2gp.systems.base import (
     AbstractMechanism,
     Channel,
+    Inertia,
     record_from,
-    symmetric,
     table_for,
 )
 from sim2gp.types import Action, Scalar
@@ -104,16 +104,14 @@ class Furuta(AbstractMechanism):
     def record(self, values: Mapping[str, Scalar]) -> FurutaParams:
         return record_from(FurutaParams, values)
 
-    def mass_matrix(
-        self, params: FurutaParams, q: Float[Array, " 2"]
-    ) -> Float[Array, "2 2"]:
+    def inertia(self, params: FurutaParams, q: Float[Array, " 2"]) -> Inertia:
         """``[[A, B], [B, C]]`` of the module's equations, in kg m^2."""
         p, alpha = params, q[1]
         l = 0.5 * p.pendulum_length
         Jr = p.arm_mass * p.arm_length**2 / 12.0
         Jp = p.pendulum_mass * p.pendulum_length**2 / 12.0
         first, second = p.pendulum_mass * l, p.pendulum_mass * l**2
-        return symmetric(
+        return (
             Jr + p.pendulum_mass * p.arm_length**2 + second * jnp.sin(alpha) ** 2,
             first * p.arm_length * jnp.cos(alpha),
             Jp + second,
