@@ -1,0 +1,121 @@
+"""What planners see: a world made of one dynamics and one objective.
+
+Posterior sampling draws worlds. A `World` is one draw ``s' = f(s, a)``, one objective
+and the limits of the machine; a planner turns it into actions and knows nothing of
+beliefs or data. Rollouts are guarded: a state that is not finite or beyond 1e10 makes
+the whole rollout invalid, a finite one is clipped to ``|s| <= state_bound`` so that a
+draw that is wrong far away cannot run off.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from sim2gp.types import Action, Box, Dynamics, Key, Reward, Scalar, State
+
+#: A rollout beyond this magnitude has diverged, whatever its units.
+DIVERGED = 1e10
+
+
+class AbstractObjective(eqx.Module):
+    """What is maximised along a trajectory; it may carry state from step to step."""
+
+    @abstractmethod
+    def init(self) -> Any:
+        """The carry at the start of a rollout; ``()`` where nothing is carried."""
+
+    @abstractmethod
+    def step(self, carry: Any, s: State, a: Action, s2: State) -> tuple[Any, Scalar]:
+        """The next carry and the reward of one step."""
+
+
+class MarkovObjective(AbstractObjective):
+    """The sum of a reward ``r(s, a, s')`` that remembers nothing."""
+
+    reward: Reward
+
+    def init(self) -> tuple[()]:
+        return ()
+
+    def step(self, carry: Any, s: State, a: Action, s2: State) -> tuple[Any, Scalar]:
+        return carry, self.reward(s, a, s2)
+
+
+class World(eqx.Module):
+    """One draw of everything a planner needs; a pytree, so a new draw is new data.
+
+    ``horizon`` is the episode's length in steps. The planning defaults travel with the
+    machine: a fast pendulum wants a short plan and restless noise, a slow one the
+    opposite, and a planner built without arguments is right on both.
+    """
+
+    dynamics: Dynamics
+    objective: AbstractObjective
+    reset: Callable[[Key], Array]
+    actions: Box
+    horizon: int = eqx.field(static=True)
+    state_bound: Float[Array, " n"] | None = None
+    planning_horizon: int = eqx.field(static=True, default=30)
+    planning_iterations: int = eqx.field(static=True, default=4)
+    noise_colour: float = eqx.field(static=True, default=1.0)
+
+    def step(self, s: State, a: Action) -> tuple[State, Bool[Array, ""]]:
+        """The guarded next state, and whether the dynamics gave a usable one."""
+        s2 = self.dynamics(s, a)
+        # Judge before clipping: clip would turn inf into a respectable number.
+        usable = jnp.all(jnp.abs(s2) < DIVERGED)
+        if self.state_bound is not None:
+            s2 = jnp.clip(s2, -self.state_bound, self.state_bound)
+        return s2, usable
+
+
+class AbstractPlanner(eqx.Module):
+    """Turns worlds into actions; all state is explicit, all methods are pure."""
+
+    @abstractmethod
+    def init(self, world: World, *, key: Key) -> Any:
+        """The state before anything is known."""
+
+    @abstractmethod
+    def prepare(self, state: Any, world: World, data: Any, *, key: Key) -> Any:
+        """Get ready for an episode in a new world; ``data`` are past transitions."""
+
+    @abstractmethod
+    def act(
+        self, state: Any, world: World, s: State, *, key: Key
+    ) -> tuple[Action, Any]:
+        """The action at ``s``, inside the world's box, and the next state."""
+
+    @abstractmethod
+    def failed(self, state: Any) -> Bool[Array, ""]:
+        """Whether the last action rests on no valid prediction at all."""
+
+
+def rollout(
+    world: World, s: State, actions: Float[Array, "H m"]
+) -> tuple[Scalar, Bool[Array, ""]]:
+    """The return of one action sequence from ``s``, and whether it is valid."""
+
+    def step(carry: Any, a: Action) -> tuple[Any, Scalar]:
+        s, memory, valid = carry
+        s2, usable = world.step(s, a)
+        memory, reward = world.objective.step(memory, s, a, s2)
+        return (s2, memory, valid & usable), reward
+
+    start = (s, world.objective.init(), jnp.all(jnp.isfinite(s)))
+    (_, _, valid), rewards = jax.lax.scan(step, start, actions)
+    total = jnp.sum(rewards)
+    return total, valid & jnp.isfinite(total)
+
+
+def masked(returns: Float[Array, " N"], valid: Bool[Array, " N"]) -> Float[Array, " N"]:
+    """Returns that can be ranked: every invalid one is the smallest finite number.
+
+    Before any ranking, because ``top_k`` puts NaN first.
+    """
+    return jnp.where(valid, returns, jnp.finfo(returns.dtype).min)
