@@ -6,8 +6,9 @@ user sees. Shapes and types are checked by jaxtyping and beartype (pyproject.tom
 
 import itertools
 import os
+import sys
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import hypothesis
@@ -18,6 +19,21 @@ ROOT = Path(__file__).resolve().parents[1]
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+#: What no test, and nothing that a test calls, may do: load pickled objects, start a
+#: shell, look up or reach a host (reliability: data never run code, no network).
+FORBIDDEN_EVENTS = frozenset(
+    {"pickle.find_class", "os.system", "socket.getaddrinfo", "socket.connect"}
+)
+
+
+def refuse(event: str, args: tuple[object, ...]) -> None:
+    """An audit hook of the interpreter: raising stops the operation."""
+    if event in FORBIDDEN_EVENTS:
+        raise RuntimeError(f"forbidden while testing: {event} {args!r:.200}")
+
+
+sys.addaudithook(refuse)
 
 # A compile inside an example is slow once; a flaky example is slow for ever.
 hypothesis.settings.register_profile("unit", deadline=None, derandomize=True)
@@ -31,6 +47,13 @@ def getkey(request: pytest.FixtureRequest) -> Callable[[], jax.Array]:
     root = jax.random.key(zlib.crc32(request.node.nodeid.encode()))
     counter = itertools.count()
     return lambda: jax.random.fold_in(root, next(counter))
+
+
+@pytest.fixture
+def lenient_promotion() -> Iterator[None]:
+    """For code of others that mixes ranks and dtypes inside: MJX, optax."""
+    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -3,7 +3,9 @@
 import ast
 import json
 import os
+import pickle
 import re
+import socket
 import subprocess
 import sys
 import tarfile
@@ -12,7 +14,9 @@ import zipfile
 from pathlib import Path
 from urllib.parse import urlsplit
 
+import jax.numpy as jnp
 import pytest
+from jaxtyping import TypeCheckError
 
 from house_rules import (
     LAYERS,
@@ -260,6 +264,26 @@ def test_wheel_is_the_package(tmp_path: Path) -> None:
     assert "sim2gp/py.typed" in names
     assert all(re.match(r"sim2gp(-[^/]+\.dist-info)?/", name) for name in names)
     assert {f"sim2gp/{p.relative_to(PACKAGE).as_posix()}" for p in MODULES} <= names
+
+
+def test_shapes_are_checked_under_pytest() -> None:
+    """The import hook of pyproject.toml is at work; users do not pay for it."""
+    from sim2gp.types import Box
+
+    with pytest.raises(TypeCheckError):
+        Box(low=jnp.zeros(2), high=jnp.zeros(3))
+    code = "import jax.numpy as jnp; from sim2gp.types import Box; "
+    run_python(code + "Box(low=jnp.zeros(2), high=jnp.zeros(3))")
+
+
+def test_unpickling_shells_and_network_are_refused() -> None:
+    """The audit hook of conftest.py stands guard over the whole suite."""
+    with pytest.raises(RuntimeError, match=r"pickle\.find_class"):
+        pickle.loads(b"cbuiltins\nlist\n.")
+    with pytest.raises(RuntimeError, match=r"os\.system"):
+        os.system("true")
+    with pytest.raises(RuntimeError, match=r"socket\.getaddrinfo"):
+        socket.getaddrinfo("localhost", 80)
 
 
 def tracked_files() -> list[Path]:
