@@ -1,0 +1,221 @@
+"""A checked file becomes a machine: options, priors, actuators, and every name known.
+
+This half of the project loads the simulators; `sim2gp.project.schema` does not.
+"""
+
+import inspect
+from collections.abc import Collection, Mapping
+from typing import Any, get_type_hints
+
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+
+from sim2gp.errors import InputError, nearest
+from sim2gp.parameters import Parameter, Parameters, unknown_parameter
+from sim2gp.project.priors import located, prior
+from sim2gp.project.schema import ActuatorSpec, PriorSpec, ProjectSpec
+from sim2gp.project.source import Source
+from sim2gp.systems import AbstractSystem
+
+NEUTRAL = {"gain": 1.0, "offset": 0.0, "delay": 0.0}
+
+
+def build_system(
+    spec: ProjectSpec, source: Source, kind: type[AbstractSystem]
+) -> AbstractSystem:
+    """The machine of the file, wrapped by its actuators (E141, E145, E160)."""
+    options = _options(spec.options, source, kind)
+    try:
+        plain = kind(**options)
+    except InputError as error:
+        raise located(error, source.where("options")) from error
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            "E160",
+            "options refused",
+            where=source.where("options"),
+            got=", ".join(f"{k} = {v}" for k, v in options.items()),
+            expected=str(error),
+            fix="correct the options",
+        ) from error
+    table = _table(plain.parameters, dict(spec.parameters), source, ("parameters",))
+    system: AbstractSystem = kind(parameters=table, **options)
+    return _actuated(system, spec.actuators, source) if spec.actuators else system
+
+
+def _options(
+    options: Mapping[str, Any], source: Source, kind: type[AbstractSystem]
+) -> dict[str, Any]:
+    """The options that the class takes, each of its declared type."""
+    hints = get_type_hints(kind.__init__)
+    known = [
+        name
+        for name in inspect.signature(kind).parameters
+        if name not in ("self", "parameters")
+    ]
+    out = {}
+    for name, value in options.items():
+        where = source.where("options", name)
+        if name not in known:
+            raise unknown("option", name, known, where)
+        adapter = TypeAdapter(hints[name], config=ConfigDict(strict=True))
+        value = tuple(value) if isinstance(value, list) else value
+        try:
+            out[name] = adapter.validate_python(value)
+        except ValidationError as error:
+            raise InputError(
+                "E160",
+                "wrong value",
+                where=where,
+                got=repr(value)[:40],
+                expected=str(error.errors()[0]["msg"]).lower(),
+                fix="correct the value",
+            ) from error
+    return out
+
+
+def _table(
+    table: Parameters,
+    specs: Mapping[str, PriorSpec | float],
+    source: Source,
+    path: tuple[str, ...],
+) -> Parameters:
+    """The table with the file's priors and fixed values in place of its own."""
+    fixed = dict(table.fixed)
+    changes = {}
+    for name, stated in specs.items():
+        where = source.where(*path, name)
+        if name in table.names:
+            base = table[name]
+        elif name in fixed:
+            base = Parameter(name, "", "", "identity", mean=fixed[name], sd=1.0)
+        else:
+            known = [*table.names, *fixed]
+            raise located(unknown_parameter(name, known), where)
+        changes[name] = prior(stated, base, where)
+    return table.replace(**changes)
+
+
+def _actuated(
+    system: AbstractSystem, specs: Mapping[str, ActuatorSpec], source: Source
+) -> AbstractSystem:
+    """The machine behind its actuators; what the file does not name is neutral."""
+    from sim2gp.systems import Actuated
+
+    names = [channel.name for channel in system.actions]
+    for name in specs:
+        if name not in names:
+            raise unknown("input", name, names, source.where("actuators", name))
+    wrapped = Actuated(system)
+    changes: dict[str, Parameter | float] = {}
+    for name in names:
+        spec = specs.get(name, ActuatorSpec())
+        for part in NEUTRAL:
+            stated = getattr(spec, part)
+            if stated == "free":
+                continue
+            full, where = f"{name}.{part}", source.where("actuators", name, part)
+            changes[full] = prior(stated, wrapped.parameters[full], where)
+            _check_delay(part, changes[full], where)
+    return Actuated(system, parameters=wrapped.parameters.replace(**changes))
+
+
+def _check_delay(part: str, stated: Parameter | float, where: str) -> None:
+    low = stated.low if isinstance(stated, Parameter) else stated
+    if part == "delay" and low < 0:
+        raise InputError(
+            "E141",
+            "negative delay",
+            where=where,
+            got=f"{low:g} s",
+            expected="a delay of at least 0 s",
+            fix="state low and high, with low >= 0",
+        )
+
+
+def unknown(kind: str, name: str, known: Collection[str], where: str) -> InputError:
+    """E160 with the name that was probably meant."""
+    close = nearest(name, known)
+    return InputError(
+        "E160",
+        f"unknown {kind}",
+        where=where,
+        got=name,
+        expected="one of " + ", ".join(known) if known else f"no {kind}",
+        fix=f"did you mean {close}" if close else "use a known name",
+    )
+
+
+def check_names(spec: ProjectSpec, source: Source, system: AbstractSystem) -> None:
+    """Every channel and parameter that the file names is the machine's."""
+    states = [channel.name for channel in system.physical_states]
+    inputs = [channel.name for channel in system.actions]
+    constants = [*system.parameters.names, *(n for n, _ in system.parameters.fixed)]
+    for i, group in enumerate(spec.logs):
+        for name, value in group.columns.items():
+            where = source.where("logs", i, "columns", name)
+            if name not in (*states, *inputs):
+                raise unknown("channel", name, [*states, *inputs], where)
+            if isinstance(value, float) and name not in inputs:
+                raise InputError(
+                    "E160",
+                    "a measured channel cannot be a constant",
+                    where=where,
+                    got=f"{value:g}",
+                    expected="a column in quotes",
+                    fix="name the column, or leave the channel out",
+                )
+        _check_complete(list(group.columns), states, inputs, source, i)
+        for name in group.fixed:
+            if name not in constants:
+                where = source.where("logs", i, "fixed", name)
+                raise located(unknown_parameter(name, constants), where)
+        for k, (low, high) in enumerate(group.exclude):
+            where = source.where("logs", i, "exclude", k)
+            _check_pair("excluded interval", low, high, where)
+    for name, (low, high) in spec.limits.items():
+        where = source.where("limits", name)
+        if name not in (*states, *inputs):
+            raise unknown("channel", name, [*states, *inputs], where)
+        _check_pair(f"limits of {name}", low, high, where)
+    for section, key, named in (
+        ("likelihood", "start_sd", spec.likelihood.start_sd),
+        ("likelihood", "noise_floor", spec.likelihood.noise_floor),
+        ("task", "target", spec.task.target),
+        ("task", "weights", spec.task.weights),
+    ):
+        for name in named if isinstance(named, dict) else ():
+            if name not in (*states, *inputs):
+                where = source.where(section, key, name)
+                raise unknown("channel", name, [*states, *inputs], where)
+
+
+def _check_complete(
+    named: list[str], states: list[str], inputs: list[str], source: Source, i: int
+) -> None:
+    """Every input is known, and something is measured."""
+    where = source.where("logs", i, "columns")
+    lacking = [name for name in inputs if name not in named]
+    if not set(named) & set(states):
+        lacking = lacking or states
+    elif not lacking:
+        return
+    raise InputError(
+        "E160",
+        f"no column for {lacking[0]}",
+        where=where,
+        got=", ".join(named) or "no columns",
+        expected="every input, and at least one measured channel",
+        fix=f'add {lacking[0]} = "its column" (an input may be a constant number)',
+    )
+
+
+def _check_pair(what: str, low: float, high: float, where: str) -> None:
+    if not low < high:
+        raise InputError(
+            "E141",
+            f"{what} reversed" if low > high else f"{what} empty",
+            where=where,
+            got=f"[{low:g}, {high:g}]",
+            expected="[low, high] with low < high",
+            fix="swap the two" if low > high else "leave room between them",
+        )

@@ -1,0 +1,112 @@
+"""What the file says of a constant, turned into a prior or a fixed value.
+
+``value`` fixes; ``mean, sd`` are physical moments, inside ``low, high`` where these
+stand too; ``low, high`` alone make a nearly uniform box (logarithmic where the
+system's own prior is).
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+from sim2gp.errors import InputError
+from sim2gp.parameters import BOX_SD, Parameter, prior_from_moments
+from sim2gp.project.schema import PriorSpec
+
+
+def located(error: InputError, where: str) -> InputError:
+    """The same error with its place in the file."""
+    return InputError(
+        error.code,
+        error.what,
+        where=where,
+        got=error.got,
+        expected=error.expected,
+        fix=error.fix,
+    )
+
+
+def prior(spec: PriorSpec | float, base: Parameter, where: str) -> Parameter | float:
+    """The prior, or the fixed value, that a table of the file states (E141 to E144)."""
+    if not isinstance(spec, PriorSpec):
+        return float(spec)
+    given = spec.model_dump(exclude_none=True)
+    if spec.value is not None:
+        if len(given) > 1:
+            raise _conflict(where, "value", given, "value alone, or a prior")
+        return spec.value
+    _check_bounds(spec, base, where)
+    try:
+        if spec.mean is None and spec.sd is None:
+            return _box(spec, base, where)
+        if spec.mean is None or spec.sd is None:
+            raise _conflict(where, "mean and sd", given, "both of them")
+        return _moments(spec, spec.mean, spec.sd, base)
+    except InputError as error:
+        raise located(error, where) from error
+
+
+def _conflict(
+    where: str, what: str, given: Mapping[str, object], expected: str
+) -> InputError:
+    return InputError(
+        "E160",
+        f"incomplete prior: {what}",
+        where=where,
+        got=", ".join(given) or "an empty table",
+        expected=expected,
+        fix="state mean and sd, or low and high, or value",
+    )
+
+
+def _check_bounds(spec: PriorSpec, base: Parameter, where: str) -> None:
+    low = base.low if spec.low is None else spec.low
+    high = base.high if spec.high is None else spec.high
+    if low < high:
+        return
+    same = low == high
+    raise InputError(
+        "E141",
+        f"bounds of {base.name} " + ("leave no room" if same else "reversed"),
+        where=where,
+        got=f"low = {low:g}, high = {high:g}",
+        expected="low < high",
+        fix=f"fix it instead: value = {low:g}" if same else "swap low and high",
+    )
+
+
+def _box(spec: PriorSpec, base: Parameter, where: str) -> Parameter:
+    if spec.low is None and spec.high is None:
+        if spec.map is None:
+            raise _conflict(where, "nothing stated", {}, "a prior or a value")
+        return replace(base, map=spec.map)
+    low = base.low if spec.low is None else spec.low
+    high = base.high if spec.high is None else spec.high
+    if not (math.isfinite(low) and math.isfinite(high)):
+        raise InputError(
+            "E141",
+            f"half a box for {base.name}",
+            got=f"low = {low:g}, high = {high:g}",
+            expected="two finite bounds",
+            fix="state both low and high",
+        )
+    logarithmic = base.map in ("log", "log_box") and low > 0
+    kind = spec.map or ("log_box" if logarithmic else "box")
+    if kind not in ("box", "log_box"):
+        given = {"low": low, "high": high, "map": kind}
+        raise _conflict(where, f"map = {kind}", given, "box or log_box with bounds")
+    return replace(base, map=kind, low=low, high=high, mean=0.0, sd=BOX_SD)
+
+
+def _moments(spec: PriorSpec, mean: float, sd: float, base: Parameter) -> Parameter:
+    low, high = spec.low, spec.high
+    if spec.map in ("box", "log_box"):
+        low = base.low if low is None else low
+        high = base.high if high is None else high
+        # The map decides in which box the moments are matched.
+        base = replace(base, map=spec.map, low=low, high=high)
+    elif spec.map == "identity":
+        base = replace(base, map="identity", low=-math.inf, high=math.inf)
+    elif spec.map == "log":
+        base = replace(base, map="log", low=0.0, high=math.inf)
+    return prior_from_moments(base, mean, sd, low, high)

@@ -1,0 +1,221 @@
+"""A project file: the machine, what is believed of it, its logs, and what to do.
+
+`load_project` checks everything but the logs themselves; `Project.build_system` and
+`Project.load_logs` then cannot meet a misspelt name. Paths are relative to the file.
+"""
+
+import glob
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sim2gp.errors import InputError, nearest
+from sim2gp.logs import Column, Log, read_csv
+from sim2gp.logs.table import shown
+from sim2gp.project.schema import ColumnSpec, LogSpec, ProjectSpec, validated
+from sim2gp.project.source import Source, read_source
+
+if TYPE_CHECKING:
+    from sim2gp.systems import AbstractSystem
+
+#: Names of a project file -> classes of sim2gp.systems.
+SYSTEMS = {
+    "furuta": "Furuta",
+    "cartpole": "CartPole",
+    "cart_pole": "CartPole",
+    "two_link": "TwoLink",
+}
+
+
+@dataclass(frozen=True)
+class Project:
+    """A validated project file."""
+
+    path: Path
+    source: Source
+    spec: ProjectSpec
+    system: "AbstractSystem"
+
+    @property
+    def name(self) -> str:
+        """The file's name without its ending; names the default run folder."""
+        return self.path.stem
+
+    def build_system(self) -> "AbstractSystem":
+        """The machine with the file's options, priors and actuators."""
+        return self.system
+
+    def load_logs(self) -> tuple[Log, ...]:
+        """Every log of every group, cut at gaps; names are unique (E101 to E131)."""
+        seen: dict[Path, int] = {}
+        logs: list[Log] = []
+        for group, spec in enumerate(self.spec.logs):
+            for file in self.files(group):
+                if file.resolve() in seen:
+                    raise InputError(
+                        "E160",
+                        "file listed twice",
+                        where=self.source.where("logs", group, "files"),
+                        got=shown(file),
+                        expected="each file in one group",
+                        fix=f"remove it here or from group {seen[file.resolve()] + 1}",
+                    )
+                seen[file.resolve()] = group
+                logs += self._read(file, group, spec)
+        if not logs:
+            raise InputError(
+                "E160",
+                "no logs",
+                where=self.source.where("logs"),
+                got="no [[logs]] table",
+                expected="at least one",
+                fix="add a [[logs]] table with files and columns",
+            )
+        return tuple(_uniquely_named(logs))
+
+    def read_logs(self, files: Iterable[Path | str]) -> tuple[Log, ...]:
+        """Other files, each read like the first group whose columns it has."""
+        logs: list[Log] = []
+        for file in files:
+            path, first = Path(file), None
+            for group, spec in enumerate(self.spec.logs):
+                try:
+                    logs += self._read(path, group, spec)
+                    break
+                except InputError as error:
+                    first = first or error
+                    if error.code != "E103":
+                        raise
+            else:
+                raise first or _no_group(self.source)
+        return tuple(_uniquely_named(logs))
+
+    def files(self, group: int) -> list[Path]:
+        """The files of a group, in the order of their names (E130 if there is none)."""
+        found: dict[Path, None] = {}
+        for i, pattern in enumerate(self.spec.logs[group].files):
+            where = self.source.where("logs", group, "files", i)
+            if "\x00" in pattern:
+                raise InputError("E131", "NUL in a path", where=where, got="NUL")
+            anchored = os.path.join(self.path.parent, pattern)
+            if not glob.has_magic(pattern):
+                found[Path(anchored)] = None
+                continue
+            matches = sorted(glob.glob(anchored, recursive=True))
+            if not matches:
+                raise InputError(
+                    "E130",
+                    "no file matches",
+                    where=where,
+                    got=repr(pattern),
+                    expected="at least one file below " + shown(self.path.parent),
+                    fix="correct the pattern; it is relative to the project file",
+                )
+            found.update(dict.fromkeys(Path(match) for match in matches))
+        return list(found)
+
+    def _read(self, path: Path, group: int, spec: LogSpec) -> tuple[Log, ...]:
+        return read_csv(
+            path,
+            {name: _column(value) for name, value in spec.columns.items()},
+            states=self.system.physical_states,
+            actions=self.system.actions,
+            time=_clock(spec.time),
+            exclude=[(a, b) for a, b in spec.exclude],
+            drop_nonfinite=spec.drop_nonfinite,
+            limits={name: (a, b) for name, (a, b) in self.spec.limits.items()},
+            fixed=spec.fixed,
+            group=group,
+        )
+
+
+def load_project(path: Path | str) -> Project:
+    """Read and check a project file; logs are not opened yet (E120 to E162)."""
+    path = Path(path)
+    source = read_source(path)
+    spec = validated(source)
+    _check_planner(spec, source)
+    # Imported late: a misspelt key is reported before the simulators are loaded.
+    from sim2gp.project.build import build_system, check_names
+
+    system = build_system(spec, source, system_class(spec, source))
+    check_names(spec, source, system)
+    return Project(path, source, spec, system)
+
+
+def system_class(spec: ProjectSpec, source: Source) -> "type[AbstractSystem]":
+    """The class that the file names (E160)."""
+    if spec.system not in SYSTEMS:
+        close = nearest(spec.system, SYSTEMS)
+        raise InputError(
+            "E160",
+            "unknown system",
+            where=source.where("system"),
+            got=repr(spec.system),
+            expected="one of " + ", ".join(SYSTEMS),
+            fix=f"did you mean {close}" if close else "name one of these",
+        )
+    import sim2gp.systems
+
+    found: type[AbstractSystem] = getattr(sim2gp.systems, SYSTEMS[spec.system])
+    return found
+
+
+def _check_planner(spec: ProjectSpec, source: Source) -> None:
+    planner = spec.planner
+    if planner.elites and planner.samples and planner.elites > planner.samples:
+        raise InputError(
+            "E148",
+            "more elites than samples",
+            where=source.where("planner", "elites"),
+            got=f"{planner.elites} of {planner.samples}",
+            expected="elites <= samples",
+            fix="lower elites",
+        )
+
+
+def _column(value: str | float | ColumnSpec) -> Column | float:
+    if isinstance(value, str):
+        return Column(value)
+    if not isinstance(value, ColumnSpec):
+        return float(value)
+    low_high = value.saturation
+    return Column(
+        value.column,
+        value.unit,
+        value.sign,
+        value.scale,
+        value.offset,
+        None if low_high is None else (low_high[0], low_high[1]),
+    )
+
+
+def _clock(value: str | ColumnSpec) -> Column | str:
+    found = _column(value)
+    return found if isinstance(found, Column) else str(found)
+
+
+def _no_group(source: Source) -> InputError:
+    return InputError(
+        "E160",
+        "no logs",
+        where=source.where("logs"),
+        got="no [[logs]] table",
+        expected="one that says how columns are named",
+        fix="add a [[logs]] table with columns",
+    )
+
+
+def _uniquely_named(logs: Sequence[Log]) -> list[Log]:
+    """Files of one name in several folders get their folder's name in front."""
+    folders: dict[str, set[str]] = {}
+    for log in logs:
+        folders.setdefault(log.name, set()).add(log.source)
+    return [
+        log
+        if len(folders[log.name]) == 1
+        else replace(log, name=f"{Path(log.source).parent.name}/{log.name}")
+        for log in logs
+    ]

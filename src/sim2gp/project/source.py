@@ -1,0 +1,196 @@
+"""The text of a project file: parsed safely, and every key remembered with its line.
+
+TOML runs no code; what remains is size, depth, and values that other tools would
+evaluate. Python's parser forgets where a key stood, so the text is scanned once more:
+`Source.where` names the line of the longest part of a key's path that the file spells.
+"""
+
+import re
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sim2gp.errors import InputError
+from sim2gp.logs.table import decode, read_bytes, shown
+
+MAX_BYTES = 1_000_000
+MAX_DEPTH = 64
+Path_ = tuple[str | int, ...]
+
+_KEY = r"""(?:[A-Za-z0-9_-]+|"(?:[^"\\]|\\.)*"|'[^']*')"""
+_DOTTED = re.compile(rf"\s*({_KEY}(?:\s*\.\s*{_KEY})*)\s*")
+_TOKEN = re.compile(
+    r'"""(?:[^\\]|\\.)*?"""|\'\'\'.*?\'\'\'|"(?:[^"\\\n]|\\.)*"|\'[^\'\n]*\'|#[^\n]*',
+    re.DOTALL,
+)
+_HOSTILE = re.compile(r"\$\{|^\s*(eval|exec|import|env|file|python)\s*:|^\s*!!")
+
+
+@dataclass(frozen=True)
+class Source:
+    """A parsed project file: its values, and the line of each key it spells."""
+
+    name: str
+    values: dict[str, Any]
+    lines: dict[Path_, int]
+
+    def where(self, *path: str | int) -> str:
+        """``file:line 7, key parameters.m2.sd`` for the key at a path."""
+        spelt = path
+        while spelt and spelt not in self.lines:
+            spelt = spelt[:-1]
+        line = self.lines.get(spelt, 1)
+        key = ".".join(str(part) for part in path if isinstance(part, str))
+        return f"{self.name}:line {line}" + (f", key {key}" if key else "")
+
+
+def read_source(path: Path) -> Source:
+    """Read and parse a project file (E120, E130, E160, E161, E162)."""
+    name = shown(path)
+    text = decode(read_bytes(path, limit=64 * MAX_BYTES), name)
+    if len(text) > MAX_BYTES:
+        raise _refused(name, f"{len(text)} characters", f"at most {MAX_BYTES}")
+    # Strings and comments keep their length and lines but lose their content.
+    bare = _TOKEN.sub(_blank, text)
+    depth = _depth(bare)
+    if depth > MAX_DEPTH:
+        raise _refused(name, f"a nesting of {depth}", f"at most {MAX_DEPTH}")
+    try:
+        values = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
+        raise _syntax(name, text, str(error)) from error
+    source = Source(name, values, dict(_lines(text, bare)))
+    for key, value in _leaves(values, ()):
+        if _is_hostile(key, value):
+            raise InputError(
+                "E162",
+                "code or substitution in a project file",
+                where=source.where(*key),
+                got=repr(value)[:40],
+                expected="plain values",
+                fix="write the value itself",
+            )
+    return source
+
+
+def _refused(name: str, got: str, expected: str) -> InputError:
+    fix = "write a smaller, flatter file"
+    return InputError(
+        "E161", "project file refused", where=name, got=got, expected=expected, fix=fix
+    )
+
+
+def _blank(match: re.Match[str]) -> str:
+    token = match.group()
+    if token.startswith("#"):
+        return " " * len(token)
+    # Keys may be quoted: the quotes stay so that a quoted key is still a key.
+    inner = re.sub(r"[^\n]", "_", token[1:-1])
+    return token[0] + inner + token[-1]
+
+
+def _depth(bare: str) -> int:
+    """Deepest nesting of brackets, or longest dotted key."""
+    depth = deepest = 0
+    for mark in re.findall(r"[\[\]{}]", re.sub(r'"[^"]*"|\'[^\']*\'', "", bare)):
+        depth = depth + 1 if mark in "[{" else max(0, depth - 1)
+        deepest = max(deepest, depth)
+    dotted = re.findall(rf"{_KEY}(?:\s*\.\s*{_KEY})+", bare)
+    return max([deepest, *(key.count(".") + 1 for key in dotted)])
+
+
+def _syntax(name: str, text: str, message: str) -> InputError:
+    place = re.search(r"at line (\d+), column (\d+)", message)
+    line = int(place.group(1)) if place else len(text.splitlines())
+    rows = text.splitlines()
+    shown_line = rows[line - 1].strip() if 0 < line <= len(rows) else ""
+    reason = re.sub(r"\s*\(at .*\)", "", message)
+    twice = re.search(r"overwrite|twice|redefine|already", reason, re.IGNORECASE)
+    what = "key stands twice" if twice else "not valid TOML"
+    code = "E160"
+    if twice and _table_at(text, line).startswith("parameters"):
+        code, what = "E145", "duplicate parameter"
+    return InputError(
+        code,
+        what,
+        where=f"{name}:line {line}",
+        got=repr(shown_line[:60]),
+        expected="each key once" if twice else "TOML (" + reason[:80].lower() + ")",
+        fix="remove one of the two" if twice else "mend the line",
+    )
+
+
+def _table_at(text: str, line: int) -> str:
+    headers = [m for m in text.splitlines()[:line] if m.lstrip().startswith("[")]
+    return headers[-1].strip(" []") if headers else ""
+
+
+def _lines(text: str, bare: str) -> Iterator[tuple[Path_, int]]:
+    """The path and line of each table header and each key at a line's start."""
+    table: Path_ = ()
+    counts: dict[Path_, int] = {}
+    depth = 0
+    for number, (line, shape) in enumerate(
+        zip(text.split("\n"), bare.split("\n"), strict=True), 1
+    ):
+        stripped = line.strip()
+        if depth == 0 and stripped.startswith("["):
+            double = stripped.startswith("[[")
+            found = _DOTTED.match(stripped.lstrip("["))
+            if found:
+                parts = _parts(found.group(1))
+                table = _resolve(parts, counts, double)
+                yield table, number
+            continue
+        found = _DOTTED.match(line) if depth == 0 else None
+        if found and line[found.end() :].startswith("="):
+            key = (*table, *_parts(found.group(1)))
+            for end in range(len(table) + 1, len(key) + 1):
+                yield key[:end], number
+            yield from _inline(key, line[found.end() + 1 :], number)
+        marks = re.sub(r'"[^"]*"|\'[^\']*\'', "", shape)
+        depth += sum(marks.count(c) for c in "[{") - sum(marks.count(c) for c in "]}")
+        depth = max(depth, 0)
+
+
+def _inline(key: Path_, rest: str, number: int) -> Iterator[tuple[Path_, int]]:
+    """Keys of a one-line inline table share its line."""
+    if rest.lstrip().startswith("{"):
+        for inner in re.findall(rf"[{{,]\s*({_KEY})\s*=", rest):
+            yield (*key, *_parts(inner)), number
+
+
+def _resolve(parts: Path_, counts: dict[Path_, int], double: bool) -> Path_:
+    """A header's path with the index of each array of tables that it passes."""
+    table: Path_ = ()
+    for i, part in enumerate(parts):
+        table = (*table, part)
+        if double and i == len(parts) - 1:
+            counts[table] = counts.get(table, -1) + 1
+        if table in counts:
+            table = (*table, counts[table])
+    return table
+
+
+def _parts(dotted: str) -> Path_:
+    return tuple(part.strip("\"'") for part in re.findall(_KEY, dotted))
+
+
+def _leaves(value: Any, path: Path_) -> Iterator[tuple[Path_, Any]]:
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield (*path, key), ""
+            yield from _leaves(inner, (*path, key))
+    elif isinstance(value, list):
+        for i, inner in enumerate(value):
+            yield from _leaves(inner, (*path, i))
+    else:
+        yield path, value
+
+
+def _is_hostile(path: Path_, value: Any) -> bool:
+    key = str(path[-1])
+    spelt = isinstance(value, str) and _HOSTILE.search(value) is not None
+    return key in ("_target_", "__class__", "_partial_") or spelt
