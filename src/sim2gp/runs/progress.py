@@ -1,0 +1,106 @@
+"""Progress for people: bars on a terminal, plain lines elsewhere, nothing when quiet.
+
+Everything goes to the error stream, so that ``--json`` leaves stdout to the summary.
+"""
+
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TypeVar
+
+T = TypeVar("T")
+
+
+@dataclass
+class Task:
+    """One job under way: ``advance`` after each part of it."""
+
+    label: str
+    total: int
+    show: Callable[["Task", str], None]
+    done: int = 0
+
+    def advance(self, note: str = "", count: int = 1) -> None:
+        """``count`` more parts are finished; ``note`` is shown beside them."""
+        self.done += count
+        self.show(self, note)
+
+
+def _silent(task: Task, note: str) -> None:
+    """Nothing to see."""
+
+
+def _lines(seconds: float = 2.0) -> Callable[[Task, str], None]:
+    """A line for the last part, and before it at most one every two seconds."""
+    last = float("-inf")
+
+    def show(task: Task, note: str) -> None:
+        nonlocal last
+        now = time.monotonic()
+        if task.done < task.total and now - last < seconds:
+            return
+        last = now
+        text = f"{task.label}: {task.done}/{task.total}"
+        print(f"{text}  {note}".rstrip(), file=sys.stderr, flush=True)
+
+    return show
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where progress is shown; a quiet one shows nothing."""
+
+    quiet: bool = False
+
+    def say(self, text: str) -> None:
+        """One line of text, such as a warning or what comes next."""
+        if not self.quiet:
+            print(text, file=sys.stderr, flush=True)
+
+    @contextmanager
+    def task(self, label: str, total: int) -> Iterator[Task]:
+        """A job of ``total`` parts: a bar while the block runs, or plain lines."""
+        if self.quiet:
+            yield Task(label, total, _silent)
+        elif sys.stderr.isatty():
+            with _bar(label, total) as task:
+                yield task
+        else:
+            yield Task(label, total, _lines())
+
+    def track(self, items: Iterable[T], label: str) -> Iterator[T]:
+        """Pass items on and show how many are done."""
+        items = list(items)
+        with self.task(label, len(items)) as task:
+            for item in items:
+                yield item
+                task.advance()
+
+
+@contextmanager
+def _bar(label: str, total: int) -> Iterator[Task]:
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        TextColumn,
+        TimeElapsedColumn,
+    )
+    from rich.progress import Progress as Bars
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[note]}"),
+    )
+    with Bars(*columns, console=Console(stderr=True)) as bars:
+        number = bars.add_task(label, total=total, note="")
+
+        def show(task: Task, note: str) -> None:
+            bars.update(number, completed=task.done, note=note)
+
+        yield Task(label, total, show)

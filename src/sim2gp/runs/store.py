@@ -1,0 +1,364 @@
+"""A run directory appears whole or not at all, and says when it is no longer whole.
+
+Files are written into a hidden sibling of the target, each flushed to the disk. At the
+end ``manifest.json`` (the size and SHA-256 of every file) is written there too, and the
+sibling is renamed onto the target; where a run stands there already, each file is
+renamed into it, the manifest last. A failed command removes the sibling and the folders
+it made. The sibling is locked, so a second process on the same target is told so; a
+lock dies with its process, and what a killed one left behind is cleared.
+"""
+
+import errno
+import fcntl
+import hashlib
+import importlib.metadata
+import io
+import json
+import math
+import os
+import platform
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim2gp.errors import InputError, Sim2GPError
+
+FORMAT = 1
+MANIFEST = "manifest.json"
+SUMMARY = "summary.json"
+ARRAYS = "arrays.npz"
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG)
+
+
+class DiskError(Sim2GPError):
+    """E190: the disk is full or broken; nothing of the run was changed (exit 74)."""
+
+
+class RunOwned(Sim2GPError):
+    """E191: another process writes this run directory (exit 75)."""
+
+
+@dataclass
+class Writer:
+    """The files of a run that is not committed yet."""
+
+    folder: Path
+    files: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    def write_bytes(self, name: str, content: bytes) -> None:
+        """Write one file and wait until it is on the disk."""
+        target = self.folder / _plain(name)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with open(target, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        digest = hashlib.sha256(content).hexdigest()
+        self.files[name] = {"bytes": len(content), "sha256": digest}
+
+    def write_text(self, name: str, text: str) -> None:
+        """Write text as UTF-8."""
+        self.write_bytes(name, text.encode("utf-8"))
+
+    def write_json(self, name: str, values: Mapping[str, Any]) -> None:
+        """Write a table as JSON; every number must be finite (E203)."""
+        self.write_text(name, to_json(values))
+
+    def write_arrays(self, name: str, arrays: Mapping[str, Any]) -> None:
+        """Write numeric arrays as one ``.npz``; object arrays are refused (E182)."""
+        plain = {key: np.asarray(value) for key, value in arrays.items()}
+        for key, value in plain.items():
+            if value.dtype.kind not in "biufcSU":
+                got, fix = f"dtype {value.dtype}", "store numbers"
+                raise Sim2GPError("E182", f"array {key}", got=got, fix=fix)
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, allow_pickle=False, **plain)
+        self.write_bytes(name, buffer.getvalue())
+
+    def write_summary(self, summary: Mapping[str, Any]) -> None:
+        """Write ``summary.json``."""
+        self.write_json(SUMMARY, summary)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run: its folder, summary, and arrays by name."""
+
+    path: Path
+    summary: dict[str, Any]
+    arrays: dict[str, np.ndarray]
+
+
+@contextmanager
+def new_run(path: Path | str, command: str) -> Iterator[Writer]:
+    """Write a run directory: committed when the block ends, gone when it raises.
+
+    Raises `InputError` E132 for a folder that is not a run and not empty, `RunOwned`
+    for one that another process writes, `DiskError` when the disk fails.
+    """
+    path = Path(os.path.abspath(path))
+    try:
+        check_target(path)
+        made = _make_parents(path.parent)
+        try:
+            with _staging(path) as folder:
+                writer = Writer(folder)
+                yield writer
+                _commit(writer, path, command)
+        except BaseException:
+            for parent in made:
+                _remove_if_empty(parent)
+            raise
+    except BrokenPipeError:
+        raise  # somebody closed the stream we print to; the disk is well
+    except OSError as error:
+        raise disk_error(path, error) from error
+
+
+def check_target(path: Path) -> None:
+    """Refuse to write into a folder that is somebody else's (E132)."""
+    if not path.exists() and not path.is_symlink():
+        return
+    if path.is_dir() and not path.is_symlink():
+        if (path / MANIFEST).is_file() or not any(path.iterdir()):
+            return
+        got = "a folder with other files"
+    else:
+        got = "a link" if path.is_symlink() else "a file"
+    raise InputError(
+        "E132",
+        "output folder is not a run",
+        where=str(path),
+        got=got,
+        expected="a new folder, an empty one, or an earlier run",
+        fix="choose another --out",
+    )
+
+
+def load_run(path: Path | str) -> Run:
+    """Read a run and check every file against its manifest (E130, E183, E185)."""
+    path = Path(path)
+    manifest = _read_manifest(path)
+    contents = {}
+    for name, entry in manifest["files"].items():
+        try:
+            content = (path / _plain(name)).read_bytes()
+        except OSError as error:
+            raise _damaged(path, name, (error.strerror or "").lower()) from error
+        if hashlib.sha256(content).hexdigest() != entry["sha256"]:
+            got = f"{len(content)} bytes of another checksum"
+            raise _damaged(path, name, got)
+        contents[name] = content
+    summary = json.loads(contents[SUMMARY]) if SUMMARY in contents else {}
+    arrays = {}
+    if ARRAYS in contents:
+        with np.load(io.BytesIO(contents[ARRAYS]), allow_pickle=False) as stored:
+            arrays = {key: stored[key] for key in stored.files}
+    return Run(path, summary, arrays)
+
+
+def to_json(values: Mapping[str, Any]) -> str:
+    """JSON with finite numbers only; arrays become lists (E203 names the key)."""
+    plain = _plain_values(values, "")
+    return json.dumps(plain, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def disk_error(path: Path, error: OSError) -> Sim2GPError:
+    """What the disk refused, as an error of ours: E190 (exit 74) or E130 (exit 2)."""
+    reason = (error.strerror or str(error)).lower()
+    if error.errno in _FULL:
+        fix = "make room and run the command again; nothing was changed"
+        return DiskError("E190", "disk failure", where=str(path), got=reason, fix=fix)
+    return InputError(
+        "E130",
+        "output cannot be written",
+        where=str(error.filename or path),
+        got=reason,
+        expected="a folder you may write",
+        fix="choose another --out",
+    )
+
+
+def _plain_values(value: Any, key: str) -> Any:
+    if isinstance(value, Mapping):
+        return {str(k): _plain_values(v, f"{key}.{k}") for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain_values(v, f"{key}[{i}]") for i, v in enumerate(value)]
+    if value is None or isinstance(value, str | bool | int):
+        return value
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, float):
+        if not math.isfinite(value):
+            where, expected = key.lstrip("."), "a finite number"
+            raise Sim2GPError(
+                "E203", "result", where=where, got=value, expected=expected
+            )
+        return float(value)
+    return _plain_values(np.asarray(value).tolist(), key)
+
+
+def _plain(name: str) -> Path:
+    """A name below the run directory, never outside it."""
+    path = Path(name)
+    if path.is_absolute() or ".." in path.parts or name in ("", "."):
+        raise Sim2GPError("E131", "file name", got=name, expected="a name in the run")
+    return path
+
+
+def _make_parents(folder: Path) -> list[Path]:
+    """Make missing folders; returns those made, the deepest first."""
+    missing = []
+    while not folder.exists():
+        missing.append(folder)
+        folder = folder.parent
+    for parent in reversed(missing):
+        parent.mkdir(exist_ok=True)
+    return missing
+
+
+def _remove_if_empty(folder: Path) -> None:
+    try:
+        folder.rmdir()
+    except OSError:
+        return  # not empty, or not ours any more: it stays
+
+
+@contextmanager
+def _staging(path: Path) -> Iterator[Path]:
+    """The locked hidden sibling that the run is written into."""
+    folder = path.with_name(f".{path.name}.partial")
+    lock = _locked(folder, path)
+    try:
+        yield folder
+    finally:
+        if folder.exists() and os.fstat(lock).st_ino == folder.stat().st_ino:
+            shutil.rmtree(folder)
+        os.close(lock)
+
+
+def _locked(folder: Path, path: Path) -> int:
+    """Make and lock the folder; an unlocked one was left by a killed process."""
+    while True:
+        folder.mkdir(exist_ok=True)
+        try:
+            lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+        except FileNotFoundError:
+            continue  # committed by another process just now
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            os.close(lock)
+            raise RunOwned(
+                "E191",
+                "another process writes this run",
+                where=str(path),
+                fix="wait for it, or choose another --out",
+            ) from error
+        if folder.exists() and folder.stat().st_ino == os.fstat(lock).st_ino:
+            break
+        os.close(lock)
+    for stale in folder.iterdir():
+        shutil.rmtree(stale) if stale.is_dir() else stale.unlink()
+    return lock
+
+
+def _commit(writer: Writer, path: Path, command: str) -> None:
+    manifest = {
+        "sim2gp": _version("sim2gp"),
+        "format": FORMAT,
+        "command": command,
+        "environment": environment(),
+        "files": writer.files,
+    }
+    content = to_json(manifest)
+    writer.write_text(MANIFEST, content)
+    for folder in sorted({(writer.folder / n).parent for n in writer.files}):
+        _sync(folder)
+    check_target(path)
+    if path.exists() and any(path.iterdir()):
+        _merge(writer, path)
+    else:
+        os.rename(writer.folder, path)
+    _sync(path.parent)
+
+
+def _merge(writer: Writer, path: Path) -> None:
+    """Replace an earlier run file by file; its manifest changes last."""
+    try:
+        before = _read_manifest(path)["files"]
+    except InputError:
+        before = {}  # damaged: it is being replaced, and its strays stay visible
+    names = [name for name in writer.files if name != MANIFEST]
+    for name in [*names, MANIFEST]:
+        (path / name).parent.mkdir(parents=True, exist_ok=True)
+        os.replace(writer.folder / name, path / name)
+    _sync(path)
+    for name in set(before) - set(names):
+        (path / _plain(name)).unlink(missing_ok=True)
+
+
+def _sync(folder: Path) -> None:
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _read_manifest(path: Path) -> dict[str, Any]:
+    target = path / MANIFEST
+    try:
+        manifest = json.loads(target.read_text(encoding="utf-8"))
+        number, files = manifest["format"], manifest["files"]
+    except OSError as error:
+        raise InputError(
+            "E130",
+            "not a run",
+            where=str(path),
+            got=f"{MANIFEST}: {(error.strerror or '').lower()}",
+            expected="a folder that a sim2gp command wrote",
+            fix="name the --out folder of an earlier command",
+        ) from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise _damaged(path, MANIFEST, "unreadable JSON") from error
+    if number > FORMAT or not isinstance(files, dict):
+        raise InputError(
+            "E185",
+            "run of a newer format",
+            where=str(target),
+            got=number,
+            expected=f"at most {FORMAT}",
+            fix="update sim2gp",
+        )
+    return dict(manifest)
+
+
+def _damaged(path: Path, name: str, got: str) -> InputError:
+    return InputError(
+        "E183",
+        "damaged run",
+        where=f"{path}/{name}",
+        got=got,
+        expected="the file as it was written",
+        fix="run the command again",
+    )
+
+
+def environment() -> dict[str, str]:
+    """Versions and machine that a result was made with."""
+    names = ("sim2gp", "jax", "jaxlib", "equinox", "numpy", "scipy", "optimistix")
+    found = {name: _version(name) for name in names}
+    return found | {"python": platform.python_version(), "machine": platform.machine()}
+
+
+def _version(name: str) -> str:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
