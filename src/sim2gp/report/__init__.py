@@ -1,0 +1,21 @@
+"""One self-contained HTML file per run, drawn from summary.json and arrays.npz alone.
+
+Nothing here is computed anew: a report shows what the run stored. Figures for papers
+and README files are drawn by the same rooms (`figure1`, `animation_gif`).
+"""
+
+from sim2gp.report.animation import animation_gif, animation_png
+from sim2gp.report.document import write_report
+from sim2gp.report.figure1 import arm_drawing, figure1, figure_bytes
+from sim2gp.report.redraw import load_run, redraw
+
+__all__ = [
+    "animation_gif",
+    "animation_png",
+    "arm_drawing",
+    "figure1",
+    "figure_bytes",
+    "load_run",
+    "redraw",
+    "write_report",
+]

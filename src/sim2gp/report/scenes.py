@@ -175,7 +175,7 @@ def furuta(state: np.ndarray, params: Mapping[str, float]) -> Scene:
 
 def cartpole(state: np.ndarray, params: Mapping[str, float]) -> Scene:
     """A cart on a rail: position x, pole angle theta (0 hanging, pi up)."""
-    pole = params.get("pole_length", 2 * params.get("half_length", 0.16825))
+    pole = 2.0 * params.get("pole_half_length", 0.16825)
     rail = params.get("rail_length", 0.814)
     x, theta = state[:, 0], state[:, 1]
     zero = np.zeros_like(x)

@@ -1,0 +1,197 @@
+"""The report of a run: its sections in the order in which a reader asks for them."""
+
+import base64
+import shlex
+from collections.abc import Mapping
+from typing import Any
+
+from sim2gp.report import data, parameters
+from sim2gp.report.animation import player
+from sim2gp.report.markup import (
+    Raw,
+    asset,
+    duration,
+    esc,
+    is_number,
+    number,
+    page,
+    paragraph,
+    section,
+)
+from sim2gp.report.parameters import Arrays, Summary
+from sim2gp.report.returns import returns
+
+#: Plain numbers of the summary that belong at the top, where present.
+_FACTS = {
+    "n_transitions": "transitions",
+    "n_rows": "rows",
+    "n_logs": "logs",
+    "log_evidence": "log evidence",
+    "best_return": "best return",
+    "deadline_misses": "deadline misses",
+    "information_nats": "information, nats",
+}
+
+
+def _said(item: object) -> str:
+    """One warning as text, whether it came as a string or as {code, text}."""
+    if isinstance(item, Mapping):
+        code, text = item.get("code", ""), item.get("text") or item.get("message", "")
+        return f"{code} {text}".strip()
+    return str(item)
+
+
+def _named(summary: Summary, verdict: str) -> str:
+    entries: Mapping[str, Any] = summary.get("parameters") or {}
+    return ", ".join(n for n, e in entries.items() if e.get("verdict") == verdict)
+
+
+def _problems(summary: Summary) -> list[tuple[str, str]]:
+    """What a reader must know before any number: pairs of weight and words."""
+    found: list[tuple[str, str]] = []
+    status = summary.get("status")
+    if summary.get("converged") is False:
+        found.append(("bad", "The fit did not converge; its numbers are not a result."))
+    elif status and str(status) not in ("ok", "done", "converged", "complete"):
+        found.append(("bad", f"Status: {status}."))
+    pressed = _named(summary, "at_bound")
+    if pressed:
+        text = "The data press these against the edge of their range"
+        found.append(("bad", f"{text}: {pressed}."))
+    idle = _named(summary, "dead")
+    if idle:
+        found.append(("bad", f"The data do not depend on: {idle}."))
+    for item in summary.get("prior_conflicts") or ():
+        found.append(("warn", f"Data against prior: {_said(item)}"))
+    flat = [d for d in summary.get("directions") or () if d.get("flat")]
+    if flat:
+        noun = "combination is" if len(flat) == 1 else "combinations are"
+        text = f"{len(flat)} {noun} left open by the data (see Combinations)"
+        found.append(("warn", f"{text}."))
+    found += [("warn", _said(item)) for item in summary.get("warnings") or ()]
+    return found
+
+
+def _status(summary: Summary) -> Raw:
+    """The box at the top: what went wrong, or that nothing did."""
+    problems = _problems(summary)
+    if not problems:
+        good = "Converged. " if summary.get("converged") else ""
+        text = f"{good}No warnings."
+        return Raw(f'<div class="status"><p><strong>{text}</strong></p></div>\n')
+    tone = "bad" if any(weight == "bad" for weight, _ in problems) else "warn"
+    items = "".join(f"<li>{esc(words)}</li>" for _, words in problems)
+    title = "Read this first" if tone == "bad" else "Keep in mind"
+    return Raw(
+        f'<div class="status {tone}"><p><strong>{title}</strong></p>'
+        f"<ul>{items}</ul></div>\n"
+    )
+
+
+def _facts(summary: Summary) -> Raw:
+    """Command line, size, time and versions."""
+    rows: list[tuple[str, object]] = []
+    line = summary.get("command_line")
+    if line:
+        text = line if isinstance(line, str) else shlex.join(map(str, line))
+        rows.append(("command line", Raw(f"<code>{esc(text)}</code>")))
+    for key, words in _FACTS.items():
+        if is_number(summary.get(key)):
+            rows.append((words, number(summary[key], 4)))
+    latency = summary.get("latency_ms")
+    if isinstance(latency, Mapping):
+        parts = [f"{name} {number(value)} ms" for name, value in latency.items()]
+        rows.append(("latency", ", ".join(parts)))
+    if is_number(summary.get("interaction_seconds")):
+        rows.append(("real interaction", duration(summary["interaction_seconds"])))
+    if is_number(summary.get("wall_seconds")):
+        rows.append(("wall time", duration(summary["wall_seconds"])))
+    if summary.get("seed") is not None:
+        rows.append(("seed", summary["seed"]))
+    versions = summary.get("versions") or {}
+    if versions:
+        rows.append(("versions", ", ".join(f"{n} {v}" for n, v in versions.items())))
+    inner = "".join(f"<dt>{esc(k)}</dt><dd>{esc(v)}</dd>\n" for k, v in rows)
+    return Raw(f'<dl class="facts">\n{inner}</dl>\n' if inner else "")
+
+
+def _machine(summary: Summary, arrays: Arrays) -> Raw:
+    about, state = summary.get("animation"), arrays.get("animation/state")
+    if not about or state is None or len(state) < 2:
+        return Raw("")
+    return section(
+        "machine", "The machine", player(about, state, arrays.get("animation/action"))
+    )
+
+
+def _figure1(summary: Summary, arrays: Arrays) -> Raw:
+    if not summary.get("figure1") or "figure1/prior/mean" not in arrays:
+        return Raw("")
+    from sim2gp.report.figure1 import figure1, figure_bytes
+
+    drawing = figure_bytes(figure1(arrays, summary), "svg")
+    code = base64.b64encode(drawing).decode("ascii")
+    words = (
+        "Figure 1: the arm over two data sets, and the beliefs before and after each"
+    )
+    return section(
+        "figure1",
+        "Figure 1",
+        Raw(
+            f'<div class="picture"><img alt="{words}" '
+            f'src="data:image/svg+xml;base64,{code}"></div>\n'
+        ),
+        paragraph(
+            "Shades are the central 90 % of draws, dashed black lines the recording; "
+            "the ellipses hold one and two standard deviations.",
+            "soft",
+        ),
+    )
+
+
+def _contents(sections: list[Raw]) -> Raw:
+    """Links to the sections that are there."""
+    links = []
+    for text in sections:
+        if not text:
+            continue
+        anchor = text.split('id="', 1)[1].split('"', 1)[0]
+        title = text.split("<h2>", 1)[1].split("</h2>", 1)[0]
+        links.append(f'<a href="#{anchor}">{title}</a>')
+    return Raw(f"<nav>{' '.join(links)}</nav>\n" if len(links) > 2 else "")
+
+
+def write_report(summary: Summary, arrays: Arrays) -> str:
+    """The report as one self-contained HTML document.
+
+    A section is drawn only if its data are there; the same input gives the same bytes.
+    """
+    sections = [
+        data.claims(summary),
+        _figure1(summary, arrays),
+        _machine(summary, arrays),
+        returns(summary, arrays),
+        parameters.parameter_table(summary),
+        parameters.parameter_densities(summary, arrays),
+        parameters.directions(summary),
+        parameters.correlations(summary, arrays),
+        data.noise_and_misfit(summary),
+        data.traces(summary, arrays),
+        data.held_out(summary, arrays),
+        data.extra_tables(summary),
+    ]
+    name = f"sim2gp {summary.get('command') or 'run'}"
+    headline = summary.get("headline")
+    body = "".join(
+        [
+            f"<header>\n<h1>{esc(summary.get('title') or name)}</h1>\n",
+            _status(summary),
+            paragraph(headline, "lead") if headline else "",
+            _facts(summary),
+            _contents(sections),
+            "</header>\n",
+            *sections,
+        ]
+    )
+    script = asset("player.js") if 'class="player"' in body else ""
+    return page(name, body, script)
