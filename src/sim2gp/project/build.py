@@ -15,8 +15,7 @@ from sim2gp.project.priors import located, prior
 from sim2gp.project.schema import ActuatorSpec, PriorSpec, ProjectSpec
 from sim2gp.project.source import Source
 from sim2gp.systems import AbstractSystem
-
-NEUTRAL = {"gain": 1.0, "offset": 0.0, "delay": 0.0}
+from sim2gp.systems.actuator import Actuated, actuator_prior
 
 
 def build_system(
@@ -99,24 +98,19 @@ def _actuated(
     system: AbstractSystem, specs: Mapping[str, ActuatorSpec], source: Source
 ) -> AbstractSystem:
     """The machine behind its actuators; what the file does not name is neutral."""
-    from sim2gp.systems import Actuated
-
-    names = [channel.name for channel in system.actions]
-    for name in specs:
-        if name not in names:
-            raise unknown("input", name, names, source.where("actuators", name))
-    wrapped = Actuated(system)
-    changes: dict[str, Parameter | float] = {}
-    for name in names:
-        spec = specs.get(name, ActuatorSpec())
-        for part in NEUTRAL:
-            stated = getattr(spec, part)
-            if stated == "free":
-                continue
-            full, where = f"{name}.{part}", source.where("actuators", name, part)
-            changes[full] = prior(stated, wrapped.parameters[full], where)
-            _check_delay(part, changes[full], where)
-    return Actuated(system, parameters=wrapped.parameters.replace(**changes))
+    channels = {channel.name: channel for channel in system.actions}
+    stated: dict[str, Parameter | float] = {}
+    for name, spec in specs.items():
+        if name not in channels:
+            raise unknown("input", name, channels, source.where("actuators", name))
+        for part in ("gain", "offset", "delay"):
+            said = getattr(spec, part)
+            where = source.where("actuators", name, part)
+            base = actuator_prior(channels[name], part)
+            chosen = base if said == "free" else prior(said, base, where)
+            _check_delay(part, chosen, where)
+            stated[f"{name}.{part}"] = chosen
+    return Actuated(system, stated)
 
 
 def _check_delay(part: str, stated: Parameter | float, where: str) -> None:

@@ -5,6 +5,7 @@
 """
 
 import glob
+import importlib
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -20,12 +21,13 @@ from sim2gp.project.source import Source, read_source
 if TYPE_CHECKING:
     from sim2gp.systems import AbstractSystem
 
-#: Names of a project file -> classes of sim2gp.systems.
+#: Names of a project file -> module and class in sim2gp.systems.
 SYSTEMS = {
-    "furuta": "Furuta",
-    "cartpole": "CartPole",
-    "cart_pole": "CartPole",
-    "two_link": "TwoLink",
+    "furuta": ("furuta", "Furuta"),
+    "cartpole": ("cartpole", "CartPole"),
+    "cart_pole": ("cartpole", "CartPole"),
+    "two_link": ("two_link", "TwoLink"),
+    "uniform_rod_arm": ("two_link", "UniformRodArm"),
 }
 
 
@@ -157,9 +159,10 @@ def system_class(spec: ProjectSpec, source: Source) -> "type[AbstractSystem]":
             expected="one of " + ", ".join(SYSTEMS),
             fix=f"did you mean {close}" if close else "name one of these",
         )
-    import sim2gp.systems
-
-    found: type[AbstractSystem] = getattr(sim2gp.systems, SYSTEMS[spec.system])
+    module, name = SYSTEMS[spec.system]
+    found: type[AbstractSystem] = getattr(
+        importlib.import_module(f"sim2gp.systems.{module}"), name
+    )
     return found
 
 
