@@ -132,7 +132,7 @@ def _strip(
     lines[[s for s in starts if 0 < s < len(lines)]] = np.nan
     low, high = svg.span(values)
     axes = svg.Axes(
-        (0.0, max(float(time[-1]), 1e-9)), (low, high), width=480.0, height=120.0
+        (0.0, max(float(time[-1]), 1e-9)), (low, high), 400.0, 112.0, x_label="s"
     )
     marks = []
     if unit == "deg" and name.startswith("p"):
@@ -145,7 +145,7 @@ def _strip(
         f'<line class="rule c1 cursor" x1="0" x2="0" y1="0" y2="{axes.size[1]:.1f}" '
         f'data-width="{axes.size[0]:.1f}"/>'
     )
-    return svg.chart(axes, marks, title=name, unit=unit, x_label="s")
+    return svg.chart(axes, marks, title=name, unit=unit)
 
 
 def _frames(count: int, dt: float) -> np.ndarray:
@@ -191,12 +191,12 @@ def player(
     words = marks[0][1] if marks and marks[0][0] <= 0 else ""
     hint = " Drag the picture to look from another side." if scene.camera.turns else ""
     return Raw(
-        f'<div class="player">\n{_still(scene, title, words)}\n'
+        f'<div class="player">\n<div>{_still(scene, title, words)}\n'
         '<div class="controls" hidden><button type="button" class="play">Play</button>'
         '<input type="range" min="0" value="0" step="any" aria-label="time">'
         '<output>0 s</output><button type="button" class="pace">1×</button></div>\n'
         f'<script type="application/json">{film}</script>\n'
-        f'<p class="soft">{esc(title)}.{hint}</p>\n{cards(strips, "wide")}</div>\n'
+        f'<p class="soft">{esc(title)}.{hint}</p></div>\n{cards(strips, "strips")}</div>\n'
     )
 
 

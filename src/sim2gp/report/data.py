@@ -13,6 +13,7 @@ from sim2gp.report.markup import (
     is_number,
     legend,
     listing,
+    name_text,
     number,
     paragraph,
     percent,
@@ -50,7 +51,7 @@ def records(entries: Mapping[str, Any], first: str) -> Raw:
     return table(
         [first, *(key.replace("_", " ") for key in keys)],
         [
-            [Raw(f"<b>{esc(name)}</b>"), *(_cell(key, row.get(key)) for key in keys)]
+            [name_text(name), *(_cell(key, row.get(key)) for key in keys)]
             for name, row in rows.items()
         ],
         words=(0, *words),
@@ -133,7 +134,7 @@ def _trace(
     }
     # The band may be far wider than the signal: it must not set the scale alone.
     lines = [curves[k] for k in ("measured", "predicted") if k in curves]
-    axes = svg.Axes(svg.span(time, margin=0.0), svg.span(*lines), width=520.0)
+    axes = svg.Axes(svg.span(time, margin=0.0), svg.span(*lines), 440.0, x_label="s")
     marks = []
     if "low" in curves and "high" in curves:
         marks.append(svg.band(axes, time, curves["low"], curves["high"], "c1"))
@@ -147,7 +148,7 @@ def _trace(
         if np.isfinite(gap).any():
             remark = f"rms difference {number(float(np.sqrt(np.nanmean(gap**2))))}"
     return svg.chart(
-        axes, marks, title=title, unit=unit, x_label="s", remark=f"{remark} {unit}"
+        axes, marks, title=title, unit=unit, remark=f"{remark} {unit}"
     )
 
 
@@ -239,7 +240,7 @@ def _by_channel(summary: Summary) -> Raw:
     used = [w for w in known.values() if any(w in row for row in rows.values())]
     return table(
         ["channel", *used],
-        [[Raw(f"<b>{esc(c)}</b>"), *(row.get(w, "") for w in used)]
+        [[name_text(c), *(row.get(w, "") for w in used)]
          for c, row in rows.items()],
         words=(0,),
     )  # fmt: skip
@@ -255,13 +256,13 @@ def _curve(
         if f"curve/{method}/{channel}" in arrays
     }
     top = svg.span(*curves.values())[1]
-    axes = svg.Axes(svg.span(horizon, margin=0.0), (0.0, top), width=520.0, height=220.0)
+    axes = svg.Axes(svg.span(horizon, margin=0.0), (0.0, top), 440.0, 230.0, x_label="horizon, s")
     marks = [
         svg.line(axes, horizon, curve, _COLOURS[methods.index(method) % 6])
         for method, curve in reversed(curves.items())
     ]
     unit = _unit(summary, channel)
-    return svg.chart(axes, marks, title=channel, unit=unit, x_label="horizon, s")
+    return svg.chart(axes, marks, title=channel, unit=unit)
 
 
 def held_out(summary: Summary, arrays: Arrays) -> Raw:
@@ -322,7 +323,7 @@ def claims(summary: Summary) -> Raw:
             if entry.get("holds")
             else Raw('<span class="chip bad">does not hold</span>'),
             _cell("", entry.get("figure")),
-            entry.get("text") or "",
+            Raw(f'<span class="why">{esc(entry.get("text") or "")}</span>'),
         )
         for name, entry in (summary.get("claims") or {}).items()
     ]

@@ -49,7 +49,9 @@ def view(
     if truth is not None:
         a, b = min(a, truth), max(b, truth)
     lower, upper = _bound(low), _bound(high)
-    log = a > 0 and np.log10(b / a) >= _DECADES_FOR_LOG
+    # A box that spans decades was given in decades; without one, the draws decide.
+    ends = (a if lower is None else lower), (b if upper is None else upper)
+    log = min(a, ends[0]) > 0 and np.log10(ends[1] / ends[0]) >= _DECADES_FOR_LOG
     if not b > a:
         pad = 0.05 * abs(a) or 1.0
         return View(a - pad, b + pad, False, (lower, upper))

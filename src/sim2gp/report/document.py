@@ -129,7 +129,7 @@ def _figure1(summary: Summary, arrays: Arrays) -> Raw:
         return Raw("")
     from sim2gp.report.figure1 import figure1, figure_bytes
 
-    drawing = figure_bytes(figure1(arrays, summary), "svg")
+    drawing = figure_bytes(figure1(arrays, summary), "png")
     code = base64.b64encode(drawing).decode("ascii")
     words = (
         "Figure 1: the arm over two data sets, and the beliefs before and after each"
@@ -139,7 +139,7 @@ def _figure1(summary: Summary, arrays: Arrays) -> Raw:
         "Figure 1",
         Raw(
             f'<div class="picture"><img alt="{words}" '
-            f'src="data:image/svg+xml;base64,{code}"></div>\n'
+            f'src="data:image/png;base64,{code}"></div>\n'
         ),
         paragraph(
             "Shades are the central 90 % of draws, dashed black lines the recording; "

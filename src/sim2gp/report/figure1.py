@@ -59,7 +59,6 @@ def arm_drawing(
     """Draw the arm over a recording: earlier poses paler, with the path of its tip."""
     l1, l2 = (float(length) for length in lengths)
     elbow, tip = two_link_points(np.asarray(state), (l1, l2), vertical=vertical)
-    reach = l1 + l2
     axes.plot(tip[:, 0], tip[:, 1], color=_SOFT, lw=0.5, alpha=0.45, zorder=1)
     rows = np.unique(np.linspace(0, len(state) - 1, poses).astype(int))
     for order, row in enumerate(rows):
@@ -73,9 +72,7 @@ def arm_drawing(
         joint = {"color": _INK, "alpha": strength, "zorder": 2 + order}
         axes.plot([x1], [y1], "o", ms=2.4, **joint)
     axes.plot([0], [0], "o", color=_INK, ms=5, zorder=40)
-    axes.set_xlim(-1.08 * reach, 1.08 * reach)
-    axes.set_ylim(-1.08 * reach, 1.08 * reach)
-    axes.set_aspect("equal")
+    axes.set_aspect("equal", anchor="W")
     axes.set_axis_off()
 
 
@@ -110,7 +107,8 @@ def marginal(
         height = np.exp(-0.5 * ((at - mean[index]) / sd) ** 2)
         colour = STAGES[stage][0]
         axes.fill_between(at, height, color=colour, alpha=0.22, lw=0)
-        axes.plot(at, height, color=colour, lw=1.2)
+        # The prior's line is broad: it shows beneath a posterior that equals it.
+        axes.plot(at, height, color=colour, lw=2.6 if stage == "prior" else 1.1)
     truth = arrays.get("figure1/truth")
     if truth is not None:
         axes.axvline(float(truth[index]), color=_INK, lw=0.9, ls=(0, (3, 2)))
@@ -134,7 +132,7 @@ def pair(
         for size, alpha in ((2.0, 0.18), (1.0, 0.30)):
             x, y = mean[[i, j], None] + size * root @ circle
             axes.fill(x, y, facecolor=colour, alpha=alpha, lw=0)
-            axes.plot(x, y, color=colour, lw=0.7)
+            axes.plot(x, y, color=colour, lw=2.2 if stage == "prior" else 0.8)
     truth = arrays.get("figure1/truth")
     if truth is not None:
         axes.plot([truth[i]], [truth[j]], "+", color=_INK, ms=6, mew=1.1, zorder=9)
@@ -259,14 +257,22 @@ def figure1(arrays: Arrays, summary: Summary) -> "Figure":
             1, 2, width_ratios=(1.0, 1.08), wspace=0.14,
             left=0.045, right=0.985, top=0.945, bottom=0.085,
         )  # fmt: skip
-        left = outer[0].subgridspec(3, 1, height_ratios=(1.5, 1, 1), hspace=0.5)
+        left = outer[0].subgridspec(3, 1, height_ratios=(1.7, 1, 1), hspace=0.45)
         arms = left[0].subgridspec(1, 2, wspace=0.02)
         titles = ("(a) data set 1: second link alone", "data set 2: both links")
+        drawings = []
         for column, title in enumerate(about.get("titles", titles)):
             axes = figure.add_subplot(arms[column])
+            drawings.append(axes)
             state = arrays[f"figure1/data{column + 1}/state"]
             arm_drawing(axes, state, lengths, vertical=vertical)
             axes.set_title(title, loc="left", fontsize=8.5)
+        # One scale for both drawings: the same arm must look the same.
+        x = [end for axes in drawings for end in axes.get_xlim()]
+        y = [end for axes in drawings for end in axes.get_ylim()]
+        for axes in drawings:
+            axes.set_xlim(min(x), max(x))
+            axes.set_ylim(min(y), max(y))
         _compare(
             figure, left[1], arrays, summary, "data1", ("prior", "posterior1"),
             "(b) data set 1: prior and posterior 1",

@@ -6,6 +6,7 @@ markup is a `Raw` and passes as it is.
 
 from html import escape
 import math
+import re
 from collections.abc import Iterable, Sequence
 from importlib import resources
 
@@ -45,8 +46,26 @@ def _shared_exponent(*values: float) -> int:
     return 0 if _SCIENTIFIC_BELOW <= exponent < _SCIENTIFIC_FROM else exponent
 
 
+def power_of_ten(exponent: int) -> str:
+    """A power of ten as it is written by hand."""
+    return f"10{str(exponent).translate(_SUPERSCRIPT)}"
+
+
+def unit_text(unit: object) -> str:
+    """A unit with its powers raised: "kg m^2" becomes "kg m²"."""
+    return re.sub(
+        r"\^(-?\d+)", lambda m: m[1].translate(_SUPERSCRIPT), str(unit or "")
+    )
+
+
+def name_text(name: object) -> Raw:
+    """A name in bold that may break after an underscore, a slash or a dot."""
+    breakable = re.sub(r"([_/.])(?=\w)", r"\1<wbr>", esc(name))
+    return Raw(f"<b>{breakable}</b>")
+
+
 def _power(exponent: int) -> str:
-    return f" × 10{str(exponent).translate(_SUPERSCRIPT)}" if exponent else ""
+    return f" × {power_of_ten(exponent)}" if exponent else ""
 
 
 def _fixed(value: float, decimals: int) -> str:
@@ -64,6 +83,8 @@ def number(value: object, digits: int = 3) -> str:
     if isinstance(value, int) and abs(value) < 10**9:
         return f"{value:,}".replace(",", "\u202f").replace("-", "−")
     exponent = _shared_exponent(x)
+    if exponent == 0 and abs(x) >= 10_000:
+        return number(round(x))
     scaled = x / 10.0**exponent
     return _fixed(scaled, digits - 1 - _exponent(scaled)) + _power(exponent)
 
@@ -87,6 +108,8 @@ def interval(low: object, high: object) -> str:
     if not (is_number(low) and is_number(high)):
         return MISSING
     a, b = float(low), float(high)  # type: ignore[arg-type]
+    if a > 0 and b > 20 * a:  # decades apart: each with its own digits
+        return f"{number(a, 2)} to {number(b, 2)}"
     exponent = _shared_exponent(a, b)
     a, b = a / 10.0**exponent, b / 10.0**exponent
     decimals = 1 - _exponent((b - a) / 4) if b > a else 3
@@ -99,7 +122,7 @@ def percent(share: object) -> str:
     if not is_number(share):
         return MISSING
     value = 100 * float(share)  # type: ignore[arg-type]
-    return f"{value:.1f} %" if abs(value) < 10 or value > 90 else f"{value:.0f} %"
+    return f"{value:.1f} %"
 
 
 def duration(seconds: object) -> str:

@@ -17,10 +17,11 @@ from sim2gp.report.markup import (
     listing,
     number,
     paragraph,
-    percent,
+    name_text,
     plus_minus,
     section,
     table,
+    unit_text,
 )
 
 Summary = Mapping[str, Any]
@@ -52,7 +53,7 @@ def _remaining(entry: Mapping[str, Any]) -> Raw:
     share = float(sd) / float(before)  # type: ignore[arg-type]
     width = 100 * min(share, 1.0)
     return Raw(
-        f'<span class="bar"><i style="width:{width:.0f}%"></i></span>{percent(share)}'
+        f'<span class="bar"><i style="width:{width:.0f}%"></i></span>{100 * share:.{1 if share < 0.1 else 0}f} %'
     )
 
 
@@ -60,9 +61,10 @@ def _row(name: str, entry: Mapping[str, Any], truth: bool) -> list[object]:
     verdict = entry.get("verdict")
     why = entry.get("note") or VERDICTS.get(str(verdict), ("", ""))[1]
     meaning = entry.get("meaning") or ""
+    below = f'<span class="why">{esc(meaning)}</span>' if meaning else ""
     row: list[object] = [
-        Raw(f"<b>{esc(name)}</b>"),
-        entry.get("unit") or "1",
+        Raw(f"{name_text(name)}{below}"),
+        unit_text(entry.get("unit")) or "1",
         plus_minus(entry.get("prior_mean"), entry.get("prior_sd")),
         plus_minus(entry.get("mean"), entry.get("sd")),
         interval(entry.get("q025"), entry.get("q975")),
@@ -73,7 +75,6 @@ def _row(name: str, entry: Mapping[str, Any], truth: bool) -> list[object]:
     return [
         *row,
         Raw(f'{verdict_chip(verdict)}<span class="why">{esc(why)}</span>'),
-        Raw(f'<span class="why">{esc(meaning)}</span>'),
     ]
 
 
@@ -84,7 +85,7 @@ def parameter_table(summary: Summary) -> Raw:
         return Raw("")
     truth = any(is_number(entry.get("truth")) for entry in entries.values())
     columns = ["parameter", "unit", "prior", "posterior", "95 % interval"]
-    columns += ["spread left", *(["truth"] if truth else []), "verdict", "meaning"]
+    columns += ["spread left", *(["truth"] if truth else []), "verdict"]
     rows = [_row(name, entry, truth) for name, entry in entries.items()]
     last = len(columns) - 1
     return section(
@@ -96,7 +97,7 @@ def parameter_table(summary: Summary) -> Raw:
             "prior's.",
             "soft",
         ),
-        table(columns, rows, words=(0, 1, last - 1, last)),
+        table(columns, rows, words=(0, 1, last)),
     )
 
 
@@ -134,7 +135,7 @@ def _density(
     if truth is not None and is_number(entry.get("sd")) and float(entry["sd"]) > 0:
         away = (float(entry["mean"]) - truth) / float(entry["sd"])
         caption += f"; truth {number(truth, 4)}, {abs(away):.1f} sd away"
-    unit = str(entry.get("unit") or "")
+    unit = unit_text(entry.get("unit"))
     chip = verdict_chip(entry["verdict"]) if entry.get("verdict") else ""
     drawing = svg.chart(axes, marks, title=name, unit=unit)
     return Raw(f"{drawing}<figcaption>{esc(caption)} {chip}</figcaption>")
@@ -164,6 +165,23 @@ def parameter_densities(summary: Summary, arrays: Arrays) -> Raw:
     )
 
 
+def _square(x: float, y: float, cell: float, r: float) -> str:
+    """One correlation: a square whose colour is its sign, whose depth its size."""
+    tone = "plus" if r > 0 else "minus"
+    text = f"{100 * r:.0f}".replace("-0", "0").replace("-", "−")
+    number_in = (
+        f'<text class="in" x="{x + cell / 2 - 1:.1f}" y="{y + cell / 2 + 3:.1f}" '
+        f'text-anchor="middle">{text}</text>'
+        if cell > 30
+        else ""
+    )
+    return (
+        f'<rect class="cell {tone}" x="{x:.1f}" y="{y:.1f}" width="{cell - 2:.1f}" '
+        f'height="{cell - 2:.1f}" rx="3" fill-opacity="{0.75 * min(abs(r), 1.0):.2f}"/>'
+        f"{number_in}"
+    )
+
+
 def _matrix(names: list[str], correlation: np.ndarray) -> Raw:
     """The correlations as coloured squares with their numbers in per cent."""
     count = len(names)
@@ -175,32 +193,22 @@ def _matrix(names: list[str], correlation: np.ndarray) -> Raw:
     width += 0.72 * (side - 12.0)
     parts = []
     for i, name in enumerate(names):
-        y = top + cell * i
-        x = side + cell * i
-        parts.append(
-            f'<text x="{side - 8:.1f}" y="{y + cell / 2 + 4:.1f}" '
-            f'text-anchor="end">{esc(name)}</text>'
-            f'<text transform="translate({x + cell / 2:.1f} {top - 6:.1f}) '
-            f'rotate(-45)">{esc(name)}</text>'
-        )
-        for j in range(i + 1):
-            r = float(correlation[i, j])
-            if not np.isfinite(r):
-                continue
-            left, tone = side + cell * j, "plus" if r > 0 else "minus"
-            opacity = 0.0 if i == j else 0.85 * min(abs(r), 1.0)
+        x, y = side + cell * i, top + cell * (i - 1)
+        if i > 0:
             parts.append(
-                f'<rect class="cell {tone}" x="{left:.1f}" y="{y:.1f}" '
-                f'width="{cell - 2:.1f}" height="{cell - 2:.1f}" rx="3" '
-                f'fill-opacity="{opacity:.2f}"/>'
+                f'<text x="{side - 8:.1f}" y="{y + cell / 2 + 4:.1f}" '
+                f'text-anchor="end">{esc(name)}</text>'
             )
-            if cell > 30 and i != j:
-                text = f"{100 * r:.0f}".replace("-0", "0").replace("-", "−")
-                parts.append(
-                    f'<text class="tick" x="{left + cell / 2 - 1:.1f}" '
-                    f'y="{y + cell / 2 + 3:.1f}" text-anchor="middle">{text}</text>'
-                )
-    height = top + cell * count + 4
+        if i < count - 1:
+            parts.append(
+                f'<text transform="translate({x + cell / 2:.1f} {top - 6:.1f}) '
+                f'rotate(-45)">{esc(name)}</text>'
+            )
+        for j in range(i):
+            r = float(correlation[i, j])
+            if np.isfinite(r):
+                parts.append(_square(side + cell * j, y, cell, r))
+    height = top + cell * (count - 1) + 4
     return Raw(
         f'<div class="scroll"><svg viewBox="0 0 {width:.0f} {height:.0f}" role="img" '
         f'style="max-width:{width:.0f}px;min-width:{min(width, 340):.0f}px" '
@@ -248,9 +256,9 @@ def directions(summary: Summary) -> Raw:
     base = summary.get("base_parameters") or []
     rows = [
         (
-            Raw(f"<b>{esc(entry.get('text', ''))}</b>"),
+            name_text(unit_text(entry.get("text"))),
             plus_minus(entry.get("value"), entry.get("sd")),
-            entry.get("unit") or "1",
+            unit_text(entry.get("unit")) or "1",
             verdict_chip(entry.get("verdict")),
         )
         for entry in base

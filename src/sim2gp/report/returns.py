@@ -8,6 +8,7 @@ from sim2gp.report import svg
 from sim2gp.report.data import _COLOURS
 from sim2gp.report.markup import (
     Raw,
+    esc,
     is_number,
     legend,
     number,
@@ -63,8 +64,8 @@ def _episodes_to_95(summary: Summary, method: str, alone: bool) -> str:
         reached = [v for v in value if v is not None]
         if not reached:
             return "never"
-        middle = number(float(np.median(reached)))
-        return f"{middle} (median; {len(reached)} of {len(value)} seeds)"
+        middle = f"{float(np.median(reached)):g}"
+        return f"{middle} ({len(reached)} of {len(value)} seeds)"
     return number(value) if is_number(value) else "never"
 
 
@@ -91,8 +92,6 @@ def _methods(summary: Summary, series: Mapping[str, np.ndarray]) -> Raw:
 
 def method_name(method: str) -> str:
     """The words for a method's key."""
-    from sim2gp.report.markup import esc
-
     return esc(method.replace("_", " "))
 
 
@@ -109,14 +108,15 @@ def returns(summary: Summary, arrays: Arrays) -> Raw:
     most = max(values.shape[1] for values in series.values())
     levels = np.array(list(references.values()))
     axes = svg.Axes(
-        (0.75, most + 0.25), svg.span(*series.values(), levels), 600.0, 300.0
-    )
+        (0.75, most + 0.5), svg.span(*series.values(), levels), 480.0, 270.0,
+        whole=True, x_label="episode",
+    )  # fmt: skip
     marks = [
         svg.level(axes, value, "quiet", words) for words, value in references.items()
     ]
     for index, values in enumerate(series.values()):
         marks += _lines(axes, values, _COLOURS[index % len(_COLOURS)])
-    drawing = svg.chart(axes, marks, title="return", x_label="episode")
+    drawing = svg.chart(axes, marks, title="return")
     keys = [(_COLOURS[i % 6], name.replace("_", " ")) for i, name in enumerate(series)]
     seeds = max(len(values) for values in series.values())
     text = (

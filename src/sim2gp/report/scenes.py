@@ -131,9 +131,9 @@ def furuta(state: np.ndarray, params: Mapping[str, float]) -> Scene:
         - np.cos(alpha)[:, None] * np.stack([zero, zero, one], axis=1)
     )
     floor = -1.12 * rod
-    half = 0.5 * arm
+    half = 0.42 * arm
     cube = _box((-half, -half, floor), (half, half, -0.16 * rod))
-    disc = _circle(1.75 * arm, floor)
+    disc = _circle(1.45 * arm, floor)
     hub = np.array([[0, 0, -0.16 * rod], [0, 0, 0], [0, 0, 0.03 * rod]])
     fixed = np.concatenate([disc, cube, hub])
     n, c = len(fixed), len(disc)
@@ -162,8 +162,8 @@ def furuta(state: np.ndarray, params: Mapping[str, float]) -> Scene:
     )
     reach = max(1.75 * arm, rod)
     camera = Camera(
-        (0.0, 0.0, -0.04 * rod), math.radians(-62), math.radians(24), 7.5 * reach,
-        1420.0, True,
+        (0.0, 0.0, -0.07 * rod), math.radians(-62), math.radians(24), 7.5 * reach,
+        1230.0, True,
     )  # fmt: skip
     return Scene(
         shapes, fixed, moving, camera,

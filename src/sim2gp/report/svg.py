@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim2gp.report.markup import Raw, esc
+from sim2gp.report.markup import Raw, esc, power_of_ten
 
-_TOP, _RIGHT, _BOTTOM = 26.0, 10.0, 22.0
+_TOP, _RIGHT = 26.0, 10.0
 _DIGIT_WIDTH = 6.6  # pixels of a digit of the tick labels
 
 
@@ -27,6 +27,8 @@ class Axes:
     height: float = 180.0
     log_x: bool = False
     y_labels: bool = True
+    whole: bool = False  # the x axis counts: its ticks are integers
+    x_label: str = ""
 
     @property
     def left(self) -> float:
@@ -39,8 +41,13 @@ class Axes:
     @property
     def size(self) -> tuple[float, float]:
         """Width and height of the field inside the axes, in pixels."""
-        bottom = self.height - _TOP - _BOTTOM
-        return self.width - self.left - _RIGHT, bottom
+        height = self.height - _TOP - self.bottom
+        return self.width - self.left - _RIGHT, height
+
+    @property
+    def bottom(self) -> float:
+        """The height of the margin below the field: a long label has its own line."""
+        return 22.0 if len(self.x_label) < 4 else 38.0
 
     def px(self, x: np.ndarray | float) -> np.ndarray:
         """Pixels from the left edge of the field."""
@@ -66,14 +73,16 @@ def span(*values: np.ndarray | float, margin: float = 0.06) -> tuple[float, floa
         return 0.0, 1.0
     low, high = float(flat.min()), float(flat.max())
     pad = margin * (high - low)
-    if pad <= 1e-9 * max(abs(low), abs(high)):
+    if high - low <= 1e-9 * max(abs(low), abs(high)):
         pad = 0.05 * max(abs(low), abs(high)) or 1.0
     return low - pad, high + pad
 
 
-def ticks(low: float, high: float, count: int = 4) -> list[tuple[float, str]]:
-    """Round numbers between two others, with their labels."""
-    raw = (high - low) / count
+def ticks(
+    low: float, high: float, count: int = 4, least: float = 0.0
+) -> list[tuple[float, str]]:
+    """Round numbers between two others, at least so far apart, with their labels."""
+    raw = max((high - low) / count, least)
     power = 10.0 ** math.floor(math.log10(raw))
     step = next(m * power for m in (1, 2, 2.5, 5, 10) if m * power >= raw * 0.999)
     first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
@@ -92,7 +101,7 @@ def log_ticks(low: float, high: float) -> list[tuple[float, str]]:
     powers = list(range(first, last + 1, stride))
     if len(powers) < 2:
         return [(v, f"{v:g}") for v in _round_numbers(low, high)]
-    return [(10.0**p, f"1e{p}".replace("-", "−")) for p in powers]
+    return [(10.0**p, power_of_ten(p)) for p in powers]
 
 
 def _round_numbers(low: float, high: float) -> list[float]:
@@ -199,7 +208,7 @@ def level(axes: Axes, y: float, css: str, words: str) -> str:
     )
 
 
-def _frame(axes: Axes, x_label: str) -> str:
+def _frame(axes: Axes) -> str:
     """Grid, tick labels and the name of the x axis."""
     width, height = axes.size
     left = axes.left
@@ -212,9 +221,13 @@ def _frame(axes: Axes, x_label: str) -> str:
                 f'y1="{y:.1f}" y2="{y:.1f}"/><text class="tick" x="{left - 5:.1f}" '
                 f'y="{y + 4:.1f}" text-anchor="end">{text}</text>'
             )
-    below = axes.height - 6
-    label_width = 6.4 * len(x_label)
-    marks = log_ticks(*axes.x) if axes.log_x else ticks(*axes.x, count=5)
+    below = _TOP + height + 16
+    inline = 12.0 if 0 < len(axes.x_label) < 4 else 0.0
+    marks = (
+        log_ticks(*axes.x)
+        if axes.log_x
+        else ticks(*axes.x, count=5, least=1.0 if axes.whole else 0.0)
+    )
     for value, text in marks:
         x = left + float(axes.px(value))
         parts.append(
@@ -222,7 +235,7 @@ def _frame(axes: Axes, x_label: str) -> str:
             f'y2="{_TOP + height + 4:.1f}"/>'
         )
         half = _DIGIT_WIDTH * len(text) / 2
-        if x + half < left + width - label_width - 4 or not x_label:
+        if x + half < axes.width - 2 - inline:
             parts.append(
                 f'<text class="tick" x="{x:.1f}" y="{below:.1f}" '
                 f'text-anchor="middle">{text}</text>'
@@ -232,8 +245,8 @@ def _frame(axes: Axes, x_label: str) -> str:
         f'y1="{_TOP + height:.1f}" y2="{_TOP + height:.1f}"/>'
     )
     parts.append(
-        f'<text class="tick" x="{axes.width - 2:.1f}" y="{below:.1f}" '
-        f'text-anchor="end">{esc(x_label)}</text>'
+        f'<text class="tick" x="{axes.width - 2:.1f}" y="{axes.height - 6:.1f}" '
+        f'text-anchor="end">{esc(axes.x_label)}</text>'
     )
     return "".join(parts)
 
@@ -244,7 +257,6 @@ def chart(
     *,
     title: str,
     unit: str = "",
-    x_label: str = "",
     remark: str = "",
 ) -> Raw:
     """A titled chart; `marks` are drawn in their order, cut at the field's edge."""
@@ -261,7 +273,7 @@ def chart(
         f'<svg viewBox="0 0 {axes.width:g} {axes.height:g}" role="img" '
         f'aria-label="{esc(words)}">'
         f'<text class="title" x="2" y="15">{esc(title)}{tail}</text>{aside}'
-        f"{_frame(axes, x_label)}"
+        f"{_frame(axes)}"
         f'<svg x="{axes.left:.1f}" y="{_TOP:g}" width="{width:.1f}" '
         f'height="{height:.1f}">{"".join(marks)}</svg></svg>'
     )
