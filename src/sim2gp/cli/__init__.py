@@ -1,0 +1,161 @@
+"""The command line: ``sim2gp COMMAND``; each command loads what it needs when it runs.
+
+Exit codes: 0 done, 1 a bug of ours (or a fit that failed), 2 the user's input, 74 the
+disk, 75 the run is another process's, 130 and 143 interrupted. Results go to stdout,
+everything else to stderr; a fault is one line, its traceback stands behind ``--debug``.
+"""
+
+import contextlib
+import io
+import os
+import re
+import signal
+import sys
+import traceback
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Union
+
+import tyro
+from tyro.conf import subcommand
+
+from sim2gp.cli.arguments import check_arguments, usage_error
+from sim2gp.cli.commands import COMMANDS, Common
+from sim2gp.errors import InputError, Sim2GPError, Sim2GPWarning
+from sim2gp.runs import DiskError, Progress, RunOwned
+from sim2gp.runs.show import print_summary
+from sim2gp.runs.store import disk_error, to_json
+
+OK, BUG, INPUT, DISK, OWNED, INTERRUPTED, TERMINATED = 0, 1, 2, 74, 75, 130, 143
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM arrived; cleaned up after like an interrupt."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code."""
+    args = list(sys.argv[1:] if argv is None else argv)
+    debug = "--debug" in args
+    try:
+        with _terminable():
+            return _run(args)
+    except KeyboardInterrupt as error:
+        print("interrupted; nothing half-written is left", file=sys.stderr)
+        return TERMINATED if isinstance(error, Terminated) else INTERRUPTED
+    except BrokenPipeError:
+        # Whoever read our output has gone; the interpreter must not flush into it.
+        with open(os.devnull, "w") as nowhere:
+            os.dup2(nowhere.fileno(), sys.stdout.fileno())
+        return OK
+    except Sim2GPError as error:
+        return _told(error, _code(error), debug)
+    except OSError as error:
+        typed = disk_error(Path(error.filename or "."), error)
+        return _told(typed, _code(typed), debug)
+    except Exception as error:
+        what = f"{type(error).__name__}: {error}".split("\n")[0][:200]
+        fix = "run the command again with --debug and report what it prints"
+        bug = Sim2GPError("E001", "fault of sim2gp", got=what, fix=fix)
+        return _told(bug, BUG, debug)
+
+
+def _run(args: list[str]) -> int:
+    if args == ["--version"]:
+        from sim2gp import __version__
+
+        print(f"sim2gp {__version__}")
+        return OK
+    helped = not args or "--help" in args or "-h" in args
+    if not helped:
+        check_arguments(args, COMMANDS)
+    command = _parsed(args or ["--help"])
+    if command is None:
+        return OK if args else INPUT
+    progress = Progress(quiet=command.quiet)
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", Sim2GPWarning)
+        warnings.showwarning = _warner(progress, warnings.showwarning)
+        # Whatever a library prints must not mix with the summary.
+        with contextlib.redirect_stdout(sys.stderr):
+            summary = command.run(progress)  # type: ignore[attr-defined]
+    for note in summary.get("warnings", ()):
+        progress.say(str(note))
+    name = args[0]
+    if command.json:
+        sys.stdout.write(to_json(summary))
+    else:
+        print_summary(summary, f"sim2gp {name}")
+    sys.stdout.flush()
+    return BUG if summary.get("passed") is False else OK
+
+
+def _parsed(args: list[str]) -> Common | None:
+    """The command as a record; None where tyro printed a help page."""
+    kinds = tuple(
+        Annotated[kind, subcommand(name, description=kind.__doc__)]
+        for name, kind in COMMANDS.items()
+    )
+    errors = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(errors):
+            found: Common = tyro.cli(
+                Union[kinds],  # type: ignore[call-overload]  # noqa: UP007 - a table
+                args=args,
+                prog="sim2gp",
+                description="A posterior sample is a simulator.",
+                config=(tyro.conf.FlagCreatePairsOff,),
+            )
+            return found
+    except SystemExit as stop:
+        if stop.code in (0, None):
+            return None
+    words = re.sub(r"[^\x20-\x7e]+|-{3,}", " ", errors.getvalue())
+    reason = " ".join(words.split("For full helptext")[0].split())
+    raise usage_error("arguments", " ".join(args), reason or "a command", "see --help")
+
+
+def _warner(progress: Progress, other: Callable[..., None]) -> Callable[..., None]:
+    """Our own warnings as one line; everybody else's as ever."""
+
+    def show(message: Any, category: type[Warning], *place: Any, **more: Any) -> None:
+        if issubclass(category, Sim2GPWarning):
+            progress.say(str(message))
+        else:
+            other(message, category, *place, **more)
+
+    return show
+
+
+@contextlib.contextmanager
+def _terminable() -> Iterator[None]:
+    """SIGTERM ends a command like Ctrl-C does, so that it cleans up after itself."""
+
+    def stop(number: int, frame: Any) -> None:
+        raise Terminated
+
+    try:
+        before = signal.signal(signal.SIGTERM, stop)
+    except ValueError:  # not in the main thread: signals are somebody else's
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _code(error: Sim2GPError) -> int:
+    if isinstance(error, RunOwned):
+        return OWNED
+    if isinstance(error, DiskError):
+        return DISK
+    return INPUT if isinstance(error, InputError) or error.code == "E146" else BUG
+
+
+def _told(error: Exception, code: int, debug: bool) -> int:
+    if debug:
+        traceback.print_exc()
+    print(str(error), file=sys.stderr)
+    return code

@@ -1,0 +1,184 @@
+"""The commands: what each one takes, and which experiment it hands that to.
+
+A command imports its experiment when it runs: help and a mistyped option cost nothing.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Positional, arg
+
+from sim2gp.cli.arguments import usage_error
+from sim2gp.runs import Progress, load_run
+from sim2gp.runs.store import check_target
+
+FIGURES = {"fig1": "two_link"}  # figure -> module of sim2gp.experiments
+
+
+@dataclass(kw_only=True)
+class Common:
+    """Options that every command has."""
+
+    json: bool = False
+    """Print the summary alone, as JSON, on stdout."""
+    quiet: bool = False
+    """No progress and no notes."""
+    debug: bool = False
+    """Show the traceback of an error."""
+
+
+@dataclass(kw_only=True)
+class Writes(Common):
+    """Options of a command that writes a run directory."""
+
+    out: Annotated[Path | None, arg(metavar="DIR")] = None
+    """The run directory; default runs/NAME."""
+
+
+@dataclass(kw_only=True)
+class Demo(Writes):
+    """Learn to swing up a pendulum whose constants are unknown, in a few trials."""
+
+    machine: Literal["furuta", "cartpole"] = "furuta"
+    """Which pendulum."""
+    seed: int = 0
+    """Draws the truth, the noise and the plans."""
+    seeds: int = 1
+    """Run this many seeds, starting at the one given."""
+    episodes: int = 5
+    """Real episodes of each run, 5 s each."""
+
+    def run(self, progress: Progress) -> dict[str, Any]:
+        return _experiment("demo")(
+            out=_out(self.out, "demo"),
+            machine=self.machine,
+            seed=self.seed,
+            seeds=self.seeds,
+            episodes=self.episodes,
+            progress=progress,
+        )
+
+
+@dataclass(kw_only=True)
+class Identify(Writes):
+    """Posterior of a machine's constants from its logs."""
+
+    project: Positional[Path]
+    """The project file (TOML)."""
+    seed: int = 0
+    """Draws the starts of the fit."""
+
+    def run(self, progress: Progress) -> dict[str, Any]:
+        return _experiment("identify")(
+            self.project,
+            out=_out(self.out, self.project.stem),
+            seed=self.seed,
+            progress=progress,
+        )
+
+
+@dataclass(kw_only=True)
+class Evaluate(Writes):
+    """Prediction of logs that a fit has not seen."""
+
+    run_or_project: Annotated[Positional[Path], arg(metavar="RUN|PROJECT")]
+    """An identify run to test; a project file leaves out its logs one by one."""
+    logs: Annotated[tuple[Path, ...], arg(metavar="FILE...")] = ()
+    """The logs to predict (with a run)."""
+    horizon: float = 0.2
+    """Open-loop horizon in s."""
+
+    def run(self, progress: Progress) -> dict[str, Any]:
+        name = self.run_or_project.stem
+        out = _out(self.out, f"evaluate-{name}")
+        if self.run_or_project.suffix == ".toml":
+            if self.logs:
+                got, fix = "--logs", "leave --logs out, or name a run"
+                expected = "no --logs with a project file: its own logs are left out"
+                raise usage_error("too many logs", got, expected, fix)
+            return _experiment("evaluate", "leave_one_out")(
+                self.run_or_project, horizon=self.horizon, out=out, progress=progress
+            )
+        load_run(self.run_or_project)  # a folder that is no run fails before the work
+        if not self.logs:
+            expected, fix = "--logs FILE...", "name the logs to predict"
+            raise usage_error("no logs", "no --logs", expected, fix)
+        return _experiment("evaluate")(
+            self.run_or_project,
+            list(self.logs),
+            horizon=self.horizon,
+            out=out,
+            progress=progress,
+        )
+
+
+@dataclass(kw_only=True)
+class Report(Common):
+    """Draw the report of a run anew."""
+
+    path: Annotated[Positional[Path], arg(metavar="RUN")]
+    """The folder of an earlier command."""
+
+    def run(self, progress: Progress) -> dict[str, Any]:
+        summary = load_run(self.path).summary
+        redraw = import_module("sim2gp.report").redraw
+        progress.say(f"report: {redraw(self.path)}")
+        return summary
+
+
+@dataclass(kw_only=True)
+class Selftest(Common):
+    """Is this installation right? Exactness and calibration in a minute."""
+
+    seed: int = 0
+    """Draws the problems."""
+
+    def run(self, progress: Progress) -> dict[str, Any]:
+        return _experiment("selftest")(seed=self.seed, progress=progress)
+
+
+@dataclass(kw_only=True)
+class Reproduce(Writes):
+    """A figure of the paper: its data, the picture, and the claims checked."""
+
+    figure: Annotated[Positional[Literal["fig1"]], arg(metavar="FIGURE")]
+    """Which figure: fig1."""
+    seed: int = 0
+    """Draws the data."""
+    quick: bool = False
+    """Fewer seeds, for a look."""
+
+    def run(self, progress: Progress) -> dict[str, Any]:
+        return _experiment(FIGURES[self.figure])(
+            out=_out(self.out, self.figure),
+            seed=self.seed,
+            quick=self.quick,
+            progress=progress,
+        )
+
+
+COMMANDS: dict[str, type[Common]] = {
+    "demo": Demo,
+    "identify": Identify,
+    "evaluate": Evaluate,
+    "report": Report,
+    "selftest": Selftest,
+    "reproduce": Reproduce,
+}
+
+
+def _out(out: Path | None, name: str) -> Path:
+    """The run directory; refused before the work if it is somebody else's."""
+    path = Path("runs") / name if out is None else out
+    check_target(path)
+    return path
+
+
+def _experiment(module: str, name: str = "run") -> Callable[..., dict[str, Any]]:
+    found: Callable[..., dict[str, Any]] = getattr(
+        import_module(f"sim2gp.experiments.{module}"), name
+    )
+    return found

@@ -1,0 +1,78 @@
+"""A summary as tables for people: one for single numbers, one for each group of rows.
+
+A value that is a table of tables (``parameters.<name>.{mean, sd, ...}``) becomes one
+with a row for each name; a table of plain values becomes rows ``group.name``.
+"""
+
+import sys
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+LONGEST = 12  # numbers of a list that are still printed
+_HIDDEN = ("warnings", "environment")
+
+
+def print_summary(summary: Mapping[str, Any], title: str) -> None:
+    """Print a summary to stdout, as wide as the terminal allows."""
+    from rich.console import Console
+    from rich.table import Table
+
+    # Away from a terminal nothing may be folded: a pipe has no width.
+    width = None if sys.stdout.isatty() else 160
+    console = Console(file=sys.stdout, width=width, highlight=False)
+    singles = Table(title=title, show_header=False, title_justify="left")
+    for key, text in _singles(summary):
+        singles.add_row(key, text)
+    for name, rows in _groups(summary):
+        columns = list(dict.fromkeys(key for row in rows.values() for key in row))
+        shown = [c for c in columns if any(_is_short(r.get(c)) for r in rows.values())]
+        table = Table("", *shown, title=name, title_justify="left")
+        for label, row in rows.items():
+            cells = [row.get(column) for column in shown]
+            table.add_row(label, *(_text(c) if _is_short(c) else "" for c in cells))
+        console.print(table)
+    if singles.row_count:
+        console.print(singles)
+
+
+def _singles(summary: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    for key, value in summary.items():
+        if prefix == "" and key in _HIDDEN:
+            continue
+        if _is_short(value):
+            yield prefix + key, _text(value)
+        elif isinstance(value, Mapping) and not _is_group(value):
+            yield from _singles(value, f"{prefix}{key}.")
+
+
+def _groups(
+    summary: Mapping[str, Any],
+) -> Iterator[tuple[str, dict[str, Mapping[str, Any]]]]:
+    for key, value in summary.items():
+        if key in _HIDDEN:
+            continue
+        if isinstance(value, Mapping) and _is_group(value):
+            yield key, dict(value)
+        elif isinstance(value, list) and value and isinstance(value[0], Mapping):
+            yield key, {str(i + 1): row for i, row in enumerate(value)}
+
+
+def _is_group(value: Mapping[str, Any]) -> bool:
+    return bool(value) and all(isinstance(row, Mapping) for row in value.values())
+
+
+def _is_short(value: Any) -> bool:
+    if isinstance(value, list | tuple):
+        plain = not any(isinstance(v, Mapping | list | tuple) for v in value)
+        return plain and 0 < len(value) <= LONGEST
+    return not isinstance(value, Mapping)
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, list | tuple):
+        return "  ".join(_text(v) for v in value)
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
