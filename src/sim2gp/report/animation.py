@@ -18,7 +18,7 @@ from sim2gp.report.markup import Raw, cards, esc
 from sim2gp.report.scenes import Scene, Shape, keep_frames, project, scene_of
 
 _MOST_FRAMES = 1500
-_SLOWEST = 0.04  # s between frames; the player interpolates
+_SLOWEST = 0.02  # s between frames; the player interpolates
 _GRAIN = 1e-4  # m; the resolution of the positions on the page
 _TRAIL_SECONDS = 0.6
 #: The light palette of page.css, for pictures that have no style sheet.
@@ -117,7 +117,10 @@ def _film(
             for shape in scene.shapes
         ],
         "fixed": np.round(scene.fixed, 5).tolist(),
-        "moving": np.rint(scene.moving / _GRAIN).astype(int).reshape(count, -1).tolist(),
+        "moving": np.rint(scene.moving / _GRAIN)
+        .astype(int)
+        .reshape(count, -1)
+        .tolist(),
         "marks": [list(mark) for mark in marks],
         "starts": starts,
     }
@@ -238,7 +241,9 @@ def _paint(scene: Scene, frame: int, trail: range, words: str, grain: int) -> An
     return image
 
 
-def _paint_trail(pen: Any, scene: Scene, shape: Shape, trail: range, grain: int) -> None:
+def _paint_trail(
+    pen: Any, scene: Scene, shape: Shape, trail: range, grain: int
+) -> None:
     """The path of the tip, fading into the past."""
     row = shape.points[0] - len(scene.fixed)
     if len(trail) < 2:

@@ -147,9 +147,7 @@ def _trace(
         gap = curves["predicted"] - curves["measured"]
         if np.isfinite(gap).any():
             remark = f"rms difference {number(float(np.sqrt(np.nanmean(gap**2))))}"
-    return svg.chart(
-        axes, marks, title=title, unit=unit, remark=f"{remark} {unit}"
-    )
+    return svg.chart(axes, marks, title=title, unit=unit, remark=f"{remark} {unit}")
 
 
 def _closest_look(arrays: Arrays, log: str, channels: list[str]) -> slice | None:
@@ -159,7 +157,9 @@ def _closest_look(arrays: Arrays, log: str, channels: list[str]) -> slice | None
         return None
     score = np.zeros(time.size)
     for channel in channels:
-        both = [arrays.get(f"trace/{log}/{k}/{channel}") for k in ("measured", "predicted")]
+        both = [
+            arrays.get(f"trace/{log}/{k}/{channel}") for k in ("measured", "predicted")
+        ]
         if both[0] is None or both[1] is None:
             return None
         scale = float(np.nanstd(both[0])) or 1.0
@@ -246,9 +246,7 @@ def _by_channel(summary: Summary) -> Raw:
     )  # fmt: skip
 
 
-def _curve(
-    summary: Summary, arrays: Arrays, channel: str, methods: list[str]
-) -> Raw:
+def _curve(summary: Summary, arrays: Arrays, channel: str, methods: list[str]) -> Raw:
     horizon = np.asarray(arrays["curve/horizon"], dtype=float)
     curves = {
         method: np.asarray(arrays[f"curve/{method}/{channel}"], dtype=float)
@@ -256,7 +254,9 @@ def _curve(
         if f"curve/{method}/{channel}" in arrays
     }
     top = svg.span(*curves.values())[1]
-    axes = svg.Axes(svg.span(horizon, margin=0.0), (0.0, top), 440.0, 230.0, x_label="horizon, s")
+    axes = svg.Axes(
+        svg.span(horizon, margin=0.0), (0.0, top), 440.0, 230.0, x_label="horizon, s"
+    )
     marks = [
         svg.line(axes, horizon, curve, _COLOURS[methods.index(method) % 6])
         for method, curve in reversed(curves.items())
@@ -291,7 +291,9 @@ def held_out(summary: Summary, arrays: Arrays) -> Raw:
         paragraph(", ".join(facts), "soft") if facts and numbers else "",
         numbers,
         Raw("<h3>Error against horizon</h3>\n" if figures else ""),
-        legend([(_COLOURS[i % 6], m) for i, m in enumerate(methods)]) if figures else "",
+        legend([(_COLOURS[i % 6], m) for i, m in enumerate(methods)])
+        if figures
+        else "",
         cards(figures, "wide"),
     )
 

@@ -94,9 +94,7 @@ def _range(arrays: Arrays, index: int) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def marginal(
-    axes: "Axes", arrays: Arrays, index: int, stages: Sequence[str]
-) -> None:
+def marginal(axes: "Axes", arrays: Arrays, index: int, stages: Sequence[str]) -> None:
     """Marginal densities of one virtual parameter, each scaled to its peak."""
     low, high = _range(arrays, index)
     for stage in stages:
@@ -118,9 +116,7 @@ def marginal(
     axes.spines["left"].set_visible(False)
 
 
-def pair(
-    axes: "Axes", arrays: Arrays, i: int, j: int, stages: Sequence[str]
-) -> None:
+def pair(axes: "Axes", arrays: Arrays, i: int, j: int, stages: Sequence[str]) -> None:
     """Ellipses of one and two standard deviations of parameters i (x) and j (y)."""
     angle = np.linspace(0, 2 * np.pi, 121)
     circle = np.stack([np.cos(angle), np.sin(angle)])
@@ -187,7 +183,7 @@ def _compare(
     if drawn:
         state = arrays[f"figure1/{data}/state"]
         rows = [row for row in (0, 1) if np.ptp(state[:, row]) > 1e-6]
-        inner = grid.subgridspec(1, len(rows), wspace=0.22)
+        inner = grid.subgridspec(1, len(rows), wspace=0.32)
         for column, row in enumerate(rows):
             axes = figure.add_subplot(inner[column])
             _prediction(axes, arrays, data, row, float(about.get("dt", 0.02)), stages)

@@ -4,11 +4,12 @@ Every string that comes from a run passes through `esc`; text that already is
 markup is a `Raw` and passes as it is.
 """
 
-from html import escape
 import math
 import re
 from collections.abc import Iterable, Sequence
+from html import escape
 from importlib import resources
+from numbers import Integral, Real
 
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _SCIENTIFIC_BELOW = -3  # 0.001 is the last power of ten written out
@@ -30,9 +31,7 @@ def esc(text: object) -> str:
 def is_number(value: object) -> bool:
     """Whether the value is a finite real number (and not a truth value)."""
     return (
-        isinstance(value, int | float)
-        and not isinstance(value, bool)
-        and math.isfinite(value)
+        isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
     )
 
 
@@ -53,9 +52,7 @@ def power_of_ten(exponent: int) -> str:
 
 def unit_text(unit: object) -> str:
     """A unit with its powers raised: "kg m^2" becomes "kg m²"."""
-    return re.sub(
-        r"\^(-?\d+)", lambda m: m[1].translate(_SUPERSCRIPT), str(unit or "")
-    )
+    return re.sub(r"\^(-?\d+)", lambda m: m[1].translate(_SUPERSCRIPT), str(unit or ""))
 
 
 def name_text(name: object) -> Raw:
@@ -80,8 +77,8 @@ def number(value: object, digits: int = 3) -> str:
     if not is_number(value):
         return MISSING
     x = float(value)  # type: ignore[arg-type]
-    if isinstance(value, int) and abs(value) < 10**9:
-        return f"{value:,}".replace(",", "\u202f").replace("-", "−")
+    if isinstance(value, Integral) and abs(x) < 1e9:
+        return f"{int(value):,}".replace(",", "\u202f").replace("-", "−")
     exponent = _shared_exponent(x)
     if exponent == 0 and abs(x) >= 10_000:
         return number(round(x))

@@ -142,9 +142,7 @@ def _points(x: np.ndarray, y: np.ndarray) -> str:
     return " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, y, strict=True))
 
 
-def line(
-    axes: Axes, x: np.ndarray, y: np.ndarray, css: str, limit: int = 600
-) -> str:
+def line(axes: Axes, x: np.ndarray, y: np.ndarray, css: str, limit: int = 600) -> str:
     """A line, broken where the data are; `css` names its colour."""
     x, y = thin(np.asarray(x, dtype=float), np.asarray(y, dtype=float), limit)
     px, py = axes.px(x), axes.py(y)
