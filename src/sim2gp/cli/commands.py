@@ -72,9 +72,11 @@ class Identify(Writes):
     """Draws the starts of the fit."""
 
     def run(self, progress: Progress) -> dict[str, Any]:
+        out = _out(self.out, self.project.stem)
+        _check_project(self.project)
         return _experiment("identify")(
             self.project,
-            out=_out(self.out, self.project.stem),
+            out=out,
             seed=self.seed,
             progress=progress,
         )
@@ -99,6 +101,7 @@ class Evaluate(Writes):
                 got, fix = "--logs", "leave --logs out, or name a run"
                 expected = "no --logs with a project file: its own logs are left out"
                 raise usage_error("too many logs", got, expected, fix)
+            _check_project(self.run_or_project)
             return _experiment("evaluate", "leave_one_out")(
                 self.run_or_project, horizon=self.horizon, out=out, progress=progress
             )
@@ -175,6 +178,11 @@ def _out(out: Path | None, name: str) -> Path:
     path = Path("runs") / name if out is None else out
     check_target(path)
     return path
+
+
+def _check_project(path: Path) -> None:
+    """A misspelt key is told at once, before the simulators are loaded."""
+    import_module("sim2gp.project").read_spec(path)
 
 
 def _experiment(module: str, name: str = "run") -> Callable[..., dict[str, Any]]:

@@ -81,7 +81,7 @@ def stamps(time: Values, lines: Lines, source: str) -> None:
             fix="write seconds since the start, or float64 stamps",
         )
     stays = i + 2 < len(time) and time[i + 2] <= time[i]
-    back = bad.size and -steps[i] > GAP * period and stays
+    back = 0 < GAP * period < -steps[i] and stays
     if not bad.size or back:
         raise InputError(
             "E109",
@@ -102,7 +102,7 @@ def stamps(time: Values, lines: Lines, source: str) -> None:
     )
 
 
-def rate(time: Values, source: str) -> list[Note]:
+def rate(time: Values, cuts: Mask, source: str) -> list[Note]:
     """A period that is no control period is a unit (E107); jitter is stated (W110)."""
     steps = np.diff(time)
     period = float(np.median(steps))
@@ -115,8 +115,8 @@ def rate(time: Values, source: str) -> list[Note]:
             expected="less than 0.5 s",
             fix=f'say time = {{column = "...", unit = "{_guess(period)}"}}',
         )
-    steady = steps[steps <= GAP * period]
-    spread = float(np.max(np.abs(steady - period))) / period
+    steady = steps[(steps <= GAP * period) & ~cuts[1:]]
+    spread = float(np.max(np.abs(steady - period), initial=0.0)) / period
     if spread <= JITTER:
         return []
     low, high = float(np.min(steady)), float(np.max(steady))
@@ -203,7 +203,8 @@ def in_reach(values: Values, channel: ChannelLike, source: str) -> None:
             where=source,
             got=f"a travel of {travel:g} {channel.unit}",
             expected=f"about {allowed:g} {channel.unit}",
-            fix="state the unit of the column",
+            fix="state the unit of the column"
+            + {"m": ', perhaps "mm"', "rad": ', perhaps "deg"'}.get(channel.unit, ""),
         )
 
 

@@ -49,14 +49,13 @@ def read_csv(
     specs = {name: spec for name, spec in columns.items() if isinstance(spec, Column)}
     wanted = dict.fromkeys([clock.column, *(spec.column for spec in specs.values())])
     table = read_table(path, list(wanted), clock.column)
-    table, cuts = _usable(table, clock, specs, actions, exclude, drop_nonfinite)
+    table, cuts, notes = _usable(table, clock, specs, actions, exclude, drop_nonfinite)
     stamps = _converted(table.columns[clock.column], clock, "s", table.source)
     checks.stamps(stamps, table.lines, table.source)
-    notes = checks.rate(stamps, table.source)
+    notes += checks.rate(stamps, cuts, table.source)
     channels, mask, more = _channels(table, specs, states, limits or {})
     inputs, clipped = _inputs(table, columns, actions, len(stamps))
-    checked = {name: channels[name][mask[name]] for name in channels}
-    notes += more + clipped + checks.excitation(checked, inputs, table.source)
+    notes += more + clipped + checks.excitation(channels, inputs, table.source)
     for name, values in channels.items():
         if f"{name}.velocity" in channels:
             rate = channels[f"{name}.velocity"]
@@ -122,8 +121,9 @@ def _usable(
     actions: Sequence[ChannelLike],
     exclude: Sequence[tuple[float, float]],
     drop: bool,
-) -> tuple[Table, Mask]:
-    """The rows outside the excluded times, and before which of them to cut."""
+) -> tuple[Table, Mask, list[Note]]:
+    """The rows outside the excluded times, before which of them to cut, and notes."""
+    notes = []
     time = _converted(table.columns[clock.column], clock, "s", table.source)
     out = np.zeros(len(time), dtype=bool)
     for low, high in exclude:
@@ -140,7 +140,12 @@ def _usable(
     if drop:
         commands = {specs[a.name].column for a in actions if a.name in specs}
         needed = [clock.column, *commands]
-        out |= ~np.logical_and.reduce([np.isfinite(table.columns[c]) for c in needed])
+        whole = np.logical_and.reduce([np.isfinite(table.columns[c]) for c in needed])
+        count = int((~whole & ~out).sum())
+        if count:
+            text = f"{count} rows of {table.source} have no time or no command"
+            notes.append(Note("W101", f"{text}: the log is cut there"))
+        out |= ~whole
     else:
         checks.finite(table.columns, table.lines, table.source, out)
     keep = np.flatnonzero(~out)
@@ -148,7 +153,7 @@ def _usable(
         raise _too_short(table.source, int(keep.size))
     cuts = np.concatenate([[False], np.diff(keep) > 1])
     kept = {name: values[keep] for name, values in table.columns.items()}
-    return replace(table, columns=kept, lines=table.lines[keep]), cuts
+    return replace(table, columns=kept, lines=table.lines[keep]), cuts, notes
 
 
 def _too_short(source: str, rows: int) -> InputError:

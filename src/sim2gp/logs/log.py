@@ -6,12 +6,13 @@ that must not count has False in its channel's mask; its value is then a stand-i
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 
+@runtime_checkable
 class ChannelLike(Protocol):
     """What a reader must know of a state or an input of a system."""
 

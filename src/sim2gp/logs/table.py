@@ -111,9 +111,9 @@ def _unreadable(path: Path, error: OSError) -> InputError:
         if path.is_symlink():
             hint = f"the link points to {os.readlink(path)}, which is not there"
         elif folder.is_dir():
-            names = [entry.name for entry in folder.iterdir()]
-            close = nearest(path.name, names)
-            hint = f"did you mean {close}" if close else hint
+            stems = [p.stem for p in folder.iterdir() if p.suffix == path.suffix]
+            close = nearest(path.stem, stems)
+            hint = f"did you mean {close}{path.suffix}" if close else hint
     elif isinstance(error, PermissionError):
         hint = "give yourself the right to read it"
     return InputError(
@@ -138,13 +138,14 @@ def decode(content: bytes, where: str) -> str:
             fix="unpack the file first",
         )
     nul = content.find(b"\x00")
-    binary = content.startswith(_BINARY)
-    if nul < 0 and not binary:
-        try:
-            return content.decode("utf-8-sig")
-        except UnicodeDecodeError as error:
-            nul = error.start
-    offset = 0 if binary else nul
+    faults = [0] if content.startswith(_BINARY) else [nul] if nul >= 0 else []
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        faults.append(error.start)
+    if not faults:
+        return text
+    offset = min(faults)
     raise InputError(
         "E120",
         "not UTF-8 text",
@@ -196,6 +197,15 @@ def _header(line: str, where: str) -> tuple[str, ...]:
         for mark, word in ((";", "semicolons"), ("\t", "tabs"), ("|", "bars")):
             if mark in line:
                 raise _delimiter(line, where, word)
+    if all(_is_number(name) for name in names if name):
+        raise InputError(
+            "E103",
+            "no header",
+            where=where,
+            got=repr(_cut(line)),
+            expected="a first line with the names of the columns",
+            fix="add the names as the first line",
+        )
     for i, name in enumerate(names):
         if name and name in names[:i]:
             raise InputError(
@@ -206,15 +216,6 @@ def _header(line: str, where: str) -> tuple[str, ...]:
                 expected="each name once",
                 fix="rename one of them",
             )
-    if all(_is_number(name) for name in names if name):
-        raise InputError(
-            "E103",
-            "no header",
-            where=where,
-            got=repr(_cut(line)),
-            expected="a first line with the names of the columns",
-            fix="add the names as the first line",
-        )
     return tuple(names)
 
 

@@ -2,3 +2,4 @@
 
 from sim2gp.project.project import Project as Project
 from sim2gp.project.project import load_project as load_project
+from sim2gp.project.project import read_spec as read_spec

@@ -136,19 +136,20 @@ class Project:
 def load_project(path: Path | str) -> Project:
     """Read and check a project file; logs are not opened yet (E120 to E162)."""
     path = Path(path)
-    source = read_source(path)
-    spec = validated(source)
-    _check_planner(spec, source)
+    source, spec = read_spec(path)
     # Imported late: a misspelt key is reported before the simulators are loaded.
     from sim2gp.project.build import build_system, check_names
 
-    system = build_system(spec, source, system_class(spec, source))
+    system = build_system(spec, source, system_class(spec.system))
     check_names(spec, source, system)
     return Project(path, source, spec, system)
 
 
-def system_class(spec: ProjectSpec, source: Source) -> "type[AbstractSystem]":
-    """The class that the file names (E160)."""
+def read_spec(path: Path | str) -> tuple[Source, ProjectSpec]:
+    """The file's text and its validated values, without loading any simulator."""
+    source = read_source(Path(path))
+    spec = validated(source)
+    _check_planner(spec, source)
     if spec.system not in SYSTEMS:
         close = nearest(spec.system, SYSTEMS)
         raise InputError(
@@ -159,9 +160,14 @@ def system_class(spec: ProjectSpec, source: Source) -> "type[AbstractSystem]":
             expected="one of " + ", ".join(SYSTEMS),
             fix=f"did you mean {close}" if close else "name one of these",
         )
-    module, name = SYSTEMS[spec.system]
+    return source, spec
+
+
+def system_class(name: str) -> "type[AbstractSystem]":
+    """The class behind a name of `SYSTEMS`."""
+    module, kind = SYSTEMS[name]
     found: type[AbstractSystem] = getattr(
-        importlib.import_module(f"sim2gp.systems.{module}"), name
+        importlib.import_module(f"sim2gp.systems.{module}"), kind
     )
     return found
 

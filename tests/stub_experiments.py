@@ -1,0 +1,44 @@
+"""Stand-ins for the experiments, so that the command line is tested by itself."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from sim2gp.project import load_project
+from sim2gp.runs import Progress, new_run
+
+
+def install(
+    monkeypatch: pytest.MonkeyPatch, **runs: Callable[..., dict[str, Any]]
+) -> None:
+    """Put modules ``sim2gp.experiments.<name>`` with the given ``run`` in place."""
+    parent = ModuleType("sim2gp.experiments")
+    parent.__path__ = []
+    monkeypatch.setitem(sys.modules, "sim2gp.experiments", parent)
+    for name, run in runs.items():
+        module = ModuleType(f"sim2gp.experiments.{name}")
+        module.run = run  # type: ignore[attr-defined]
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+
+
+def identify(
+    project: Path, *, out: Path, seed: int, progress: Progress
+) -> dict[str, Any]:
+    """Everything of an identification that reads input, and no fit."""
+    found = load_project(project)
+    logs = found.load_logs()
+    summary = {
+        "n_transitions": sum(len(log) - 1 for log in logs),
+        "parameters": {p.name: {"sd": p.sd} for p in found.system.parameters.free},
+        "seed": seed,
+        "warnings": [str(note) for log in logs for note in log.notes],
+    }
+    with new_run(out, "identify") as run, progress.task("fit", 2) as task:
+        task.advance("half")
+        run.write_summary(summary)
+        task.advance()
+    return summary
