@@ -105,7 +105,7 @@ def logs(rng: np.random.Generator) -> Run:
                 arrays[f"{base}/high/{channel}"] = simulated + 0.06
     summary = {
         "units": {"q1": "rad", "q2": "rad"},
-        "noise": {"q1": {"sd": 0.0041, "unit": "rad"}, "q2": {"sd": 0.0038, "unit": "rad"}},
+        "noise": {"q1": {"sd": 0.0041, "unit": "rad"}, "q2": {"sd": 0.0038}},
         "misfit": {
             "q1": {"whiteness_p": 0.34, "ratio": 1.02},
             "q2": {"whiteness_p": 2e-5, "ratio": 1.31},
@@ -375,7 +375,8 @@ def test_strings_of_a_run_are_text_not_markup(run: Run) -> None:
     entry |= {"unit": evil, "meaning": evil, "note": evil, "verdict": evil}
     summary["parameters"] = dict(summary["parameters"]) | {"m2": entry, evil: entry}
     summary |= {
-        "command": evil, "headline": evil, "command_line": evil, "versions": {evil: evil},
+        "command": evil, "headline": evil, "command_line": evil,
+        "versions": {evil: evil},
         "warnings": [evil, {"code": evil, "text": evil}], "status": evil, "seed": evil,
         "prior_conflicts": [evil], "units": {evil: evil, "q1": evil}, "misfit": [evil],
         "noise": {evil: {evil: evil, "unit": evil}}, "trace_note": evil,
@@ -459,7 +460,8 @@ def test_means_are_rounded_by_their_uncertainty(
 @pytest.mark.parametrize(
     ("value", "text"),
     [
-        (0.012345, "0.0123"), (1.0, "1.00"), (-3.14159, "−3.14"), (1.5e-7, "1.50 × 10⁻⁷"),
+        (0.012345, "0.0123"), (1.0, "1.00"), (-3.14159, "−3.14"),
+        (1.5e-7, "1.50 × 10⁻⁷"),
         (30124, "30\u202f124"), (81234.5, "81\u202f234"), (0.0, "0.00"), (True, "–"),
         (np.float32(0.5), "0.500"), (np.int64(7), "7"), (float("inf"), "–"),
     ],
@@ -504,7 +506,7 @@ def test_a_box_of_decades_is_drawn_in_decades() -> None:
     axis = densities.view([draws], 1e-6, 1e-3, None)
     assert axis is not None
     assert axis.log
-    at, height = densities.curve(draws, axis)
+    _, height = densities.curve(draws, axis)
     np.testing.assert_allclose(height, 1.0, atol=0.03)
     linear = densities.view([draws], 0.0, 1.0, None)
     assert linear is not None
@@ -536,7 +538,7 @@ def test_ticks_are_round(low: float, high: float, expected: list[str]) -> None:
 
 
 def test_the_furuta_hangs_stands_and_swings_with_its_arm() -> None:
-    """Oracles: lengths of arm and rod; and M12 = +B cos(alpha), from the tip's speed."""
+    """Oracles: lengths of arm and rod; M12 = +B cos(alpha), from the tip's speed."""
     state = np.array(
         [[0.3, 0.0, 0, 0], [0.3, np.pi, 0, 0], [0.3, 0.01, 0, 0], [0.31, 0.0, 0, 0]]
     )
@@ -582,7 +584,7 @@ def test_every_machine_stays_inside_its_picture(system: str) -> None:
 
 
 def test_an_unknown_machine_names_the_nearest() -> None:
-    with pytest.raises(InputError, match="E160.*did you mean furuta"):
+    with pytest.raises(InputError, match=r"E195.*did you mean furuta"):
         scenes.scene_of({"system": "furtua"}, np.zeros((2, 4)))
 
 

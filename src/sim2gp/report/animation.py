@@ -199,7 +199,8 @@ def player(
         '<input type="range" min="0" value="0" step="any" aria-label="time">'
         '<output>0 s</output><button type="button" class="pace">1×</button></div>\n'
         f'<script type="application/json">{film}</script>\n'
-        f'<p class="soft">{esc(title)}.{hint}</p></div>\n{cards(strips, "strips")}</div>\n'
+        f'<p class="soft">{esc(title)}.{hint}</p></div>\n'
+        f"{cards(strips, 'strips')}</div>\n"
     )
 
 

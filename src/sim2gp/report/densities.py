@@ -18,7 +18,7 @@ Draws = Float[np.ndarray, " S"]
 
 @dataclass(frozen=True)
 class View:
-    """How one parameter's axis is drawn: its range, its bounds, linear or in decades."""
+    """How a parameter's axis is drawn: range, bounds, and linear or in decades."""
 
     low: float
     high: float

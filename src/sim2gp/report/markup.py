@@ -11,6 +11,8 @@ from html import escape
 from importlib import resources
 from numbers import Integral, Real
 
+import numpy as np
+
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _SCIENTIFIC_BELOW = -3  # 0.001 is the last power of ten written out
 _SCIENTIFIC_FROM = 5
@@ -30,9 +32,9 @@ def esc(text: object) -> str:
 
 def is_number(value: object) -> bool:
     """Whether the value is a finite real number (and not a truth value)."""
-    return (
-        isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
-    )
+    if isinstance(value, bool | np.bool_):
+        return False
+    return isinstance(value, Real) and math.isfinite(value)
 
 
 def _exponent(value: float) -> int:

@@ -1,4 +1,4 @@
-"""A run directory back into its report: summary.json and arrays.npz are all it needs."""
+"""A run directory back into its report, from summary.json and arrays.npz alone."""
 
 import os
 import tempfile

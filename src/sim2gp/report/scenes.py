@@ -4,7 +4,8 @@ A scene is a list of shapes over points (x, y, z) in metres, z up. Some points s
 the others move with the state. The page's player, its still picture and the GIF all
 draw the same scene through the same perspective projection,
 
-    depth = D - p . forward,   u = c_x + f (p . right) / depth,   v = c_y - f (p . up) / depth.
+    depth = D - p . forward
+    u = c_x + f (p . right) / depth,   v = c_y - f (p . up) / depth.
 """
 
 import math
@@ -18,7 +19,7 @@ from jaxtyping import Float
 from sim2gp.errors import InputError, nearest
 
 Points = Float[np.ndarray, "k 3"]
-Moving = Float[np.ndarray, "T k 3"]
+Moving = Float[np.ndarray, "T j 3"]
 
 
 @dataclass(frozen=True)
@@ -150,7 +151,7 @@ def furuta(state: np.ndarray, params: Mapping[str, float]) -> Scene:
         Shape("rod", (c + 8, n + 3, n + 4), "shadow", width, layer=0),
         Shape("trail", (n + 1,), "red", layer=1, anchor=n),
         *(
-            Shape("face", tuple(c + i for i in face), shade, 0, 1, axis, True)
+            Shape("face", tuple(c + i for i in face), shade, 0.0, 1, axis, True)
             for face, shade in _FACES
         ),
         Shape("rod", (c + 8, axis), "hub", 0.20 * arm, 1, axis),
@@ -162,8 +163,8 @@ def furuta(state: np.ndarray, params: Mapping[str, float]) -> Scene:
     )
     reach = max(1.75 * arm, rod)
     camera = Camera(
-        (0.0, 0.0, -0.07 * rod), math.radians(-62), math.radians(24), 7.5 * reach,
-        1230.0, True,
+        (0.0, 0.0, -0.23 * rod), math.radians(-62), math.radians(24), 7.5 * reach,
+        1190.0, True,
     )  # fmt: skip
     return Scene(
         shapes, fixed, moving, camera,
@@ -201,7 +202,7 @@ def cartpole(state: np.ndarray, params: Mapping[str, float]) -> Scene:
         Shape("rod", (4, 5), "steel-side", width, 0),
         Shape("trail", (n + 1,), "red", layer=1),
         *(
-            Shape("face", tuple(n + 2 + i for i in face), shade, 0, 2, n, True)
+            Shape("face", tuple(n + 2 + i for i in face), shade, 0.0, 2, n, True)
             for face, shade in _FACES
         ),
         Shape("rod", (n, n + 1), "red", 1.1 * width, 3),
@@ -209,13 +210,14 @@ def cartpole(state: np.ndarray, params: Mapping[str, float]) -> Scene:
         Shape("ball", (n + 1,), "red", 1.3 * width, 3),
     )
     distance = 8.0 * pole + 2 * rail
-    reach = max(end / 320 * 1.08, (pole * 1.15) / 210)
+    # The pole may point outwards at either end of the rail.
+    reach = (end + 1.06 * pole) / 320
     camera = Camera(
         (0.0, 0.0, 0.0), math.radians(-90), math.radians(6), distance,
         distance / reach, True,
     )  # fmt: skip
     return Scene(
-        shapes, fixed, moving, camera,
+        shapes, fixed, moving, camera, height=340,
         strips=((1, "pole angle theta", "deg", 180 / math.pi),
                 (0, "cart position x", "m", 1.0)),
         inputs=(("voltage", "V"),),
@@ -283,7 +285,7 @@ def scene_of(about: Mapping[str, Any], state: np.ndarray) -> Scene:
     system = str(about.get("system"))
     if system not in SCENES:
         raise InputError(
-            "E160",
+            "E195",
             "no drawing of this machine",
             where="summary.json, animation.system",
             got=system,

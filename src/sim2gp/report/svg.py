@@ -57,12 +57,13 @@ class Axes:
             low, high = math.log10(low), math.log10(high)
             with np.errstate(invalid="ignore", divide="ignore"):
                 value = np.log10(value)
-        return (value - low) / (high - low) * self.size[0]
+        return np.asarray((value - low) / (high - low) * self.size[0])
 
     def py(self, y: np.ndarray | float) -> np.ndarray:
         """Pixels from the top edge of the field."""
         low, high = self.y
-        return (high - np.asarray(y, dtype=float)) / (high - low) * self.size[1]
+        share = (high - np.asarray(y, dtype=float)) / (high - low)
+        return np.asarray(share * self.size[1])
 
 
 def span(*values: np.ndarray | float, margin: float = 0.06) -> tuple[float, float]:
@@ -200,7 +201,8 @@ def level(axes: Axes, y: float, css: str, words: str) -> str:
     at, width = float(axes.py(y)), axes.size[0]
     below = at + 14 if at < 16 else at - 5
     return (
-        f'<line class="rule {css}" x1="0" x2="{width:.1f}" y1="{at:.1f}" y2="{at:.1f}"/>'
+        f'<line class="rule {css}" x1="0" x2="{width:.1f}" y1="{at:.1f}" '
+        f'y2="{at:.1f}"/>'
         f'<text class="note" x="{width - 4:.1f}" y="{below:.1f}" '
         f'text-anchor="end">{esc(words)}</text>'
     )
