@@ -269,6 +269,15 @@ def _shrunk(scene: Scene, width: int) -> Scene:
     )
 
 
+def _palette(image: Any) -> Any:
+    """The colours of one image, with paper that is exactly white."""
+    palette = image.quantize(64, dither=0)
+    colours = np.asarray(palette.getpalette()).reshape(-1, 3)
+    colours[np.argmax(colours.sum(axis=1))] = 255
+    palette.putpalette(colours.ravel().tolist())
+    return palette
+
+
 def _rows_of_gif(count: int, dt: float, fps: float) -> np.ndarray:
     stride = max(1, round(1.0 / (fps * dt)))
     return np.arange(0, count, stride)
@@ -292,7 +301,7 @@ def animation_gif(
         words = past[-1][1] if past else str(about.get("title") or "")
         images.append(_paint(scene, int(row), range(first, int(row) + 1), words, 2))
     # One palette for all frames, or the colours flicker.
-    palette = images[len(images) // 2].quantize(64, dither=0)
+    palette = _palette(images[len(images) // 2])
     frames = [image.quantize(palette=palette, dither=0) for image in images]
     file = io.BytesIO()
     frames[0].save(
