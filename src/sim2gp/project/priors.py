@@ -22,7 +22,7 @@ def located(error: InputError, where: str) -> InputError:
         where=where,
         got=error.got,
         expected=error.expected,
-        fix=error.fix,
+        fix=error.fix.rstrip("?") or "correct the value",
     )
 
 

@@ -201,7 +201,8 @@ def _fault(
         choices = error["ctx"]["expected"].replace("'", "").replace(" or ", ", ")
         close = nearest(value, choices.split(", "))
         fix = f"did you mean {close!r}" if close else ""
-    fix = fix or f"write {expected}"
+    plain = expected.startswith(("a ", "one ", "text", "true"))
+    fix = fix or (f"write {expected}" if plain else "correct the value")
     return InputError(
         code, "wrong value", where=where, got=got, expected=expected, fix=fix
     )

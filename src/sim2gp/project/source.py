@@ -30,9 +30,10 @@ _HOSTILE = re.compile(r"\$\{|^\s*(eval|exec|import|env|file|python)\s*:|^\s*!!")
 
 @dataclass(frozen=True)
 class Source:
-    """A parsed project file: its values, and the line of each key it spells."""
+    """A parsed project file: its text, its values, and the line of each key."""
 
     name: str
+    text: str
     values: dict[str, Any]
     lines: dict[Path_, int]
 
@@ -61,7 +62,7 @@ def read_source(path: Path) -> Source:
         values = tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
         raise _syntax(name, text, str(error)) from error
-    source = Source(name, values, dict(_lines(text, bare)))
+    source = Source(name, text, values, dict(_lines(text, bare)))
     for key, value in _leaves(values, ()):
         if _is_hostile(key, value):
             raise InputError(
@@ -84,8 +85,8 @@ def _refused(name: str, got: str, expected: str) -> InputError:
 
 def _blank(match: re.Match[str]) -> str:
     token = match.group()
-    if token.startswith("#"):
-        return " " * len(token)
+    if token.startswith(("#", '"""', "'''")):
+        return re.sub(r"[^\n]", " ", token)
     # Keys may be quoted: the quotes stay so that a quoted key is still a key.
     inner = re.sub(r"[^\n]", "_", token[1:-1])
     return token[0] + inner + token[-1]
@@ -136,6 +137,8 @@ def _lines(text: str, bare: str) -> Iterator[tuple[Path_, int]]:
         zip(text.split("\n"), bare.split("\n"), strict=True), 1
     ):
         stripped = line.strip()
+        if not shape.strip():
+            continue  # blank, a comment, or inside a long string
         if depth == 0 and stripped.startswith("["):
             double = stripped.startswith("[[")
             found = _DOTTED.match(stripped.lstrip("["))
