@@ -24,8 +24,9 @@ from sim2gp.cli.arguments import check_arguments, usage_error
 from sim2gp.cli.commands import COMMANDS, Common
 from sim2gp.errors import InputError, Sim2GPError, Sim2GPWarning
 from sim2gp.runs import DiskError, Progress, RunOwned
+from sim2gp.runs.plain import to_json
 from sim2gp.runs.show import print_summary
-from sim2gp.runs.store import disk_error, to_json
+from sim2gp.runs.store import disk_error
 
 OK, BUG, INPUT, DISK, OWNED, INTERRUPTED, TERMINATED = 0, 1, 2, 74, 75, 130, 143
 

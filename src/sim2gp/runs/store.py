@@ -1,22 +1,20 @@
 """A run directory appears whole or not at all, and says when it is no longer whole.
 
-Files are written into a hidden sibling of the target, each flushed to the disk. At the
-end ``manifest.json`` (the size and SHA-256 of every file) is written there too, and the
-sibling is renamed onto the target; where a run stands there already, each file is
-renamed into it, the manifest last. A failed command removes the sibling and the folders
-it made. The sibling is locked, so a second process on the same target is told so; a
-lock dies with its process, and what a killed one left behind is cleared.
+Files are written into a hidden sibling of the target, each flushed to the disk, with a
+``manifest.json`` of their sizes and SHA-256 at the end; then the sibling is renamed to
+the target. An earlier run there is renamed to ``.NAME.previous`` first, read from there
+should the machine stop just then, and removed when the new one stands (files that the
+run did not write are carried over). A failed command removes the sibling and the
+folders it made. The sibling is locked: a second process on the same target is told so.
+A lock dies with its process, and what a killed one left behind is cleared.
 """
 
 import errno
 import fcntl
 import hashlib
-import importlib.metadata
 import io
 import json
-import math
 import os
-import platform
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -27,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from sim2gp.errors import InputError, Sim2GPError
+from sim2gp.runs.plain import environment, to_json, version
 
 FORMAT = 1
 MANIFEST = "manifest.json"
@@ -107,6 +106,7 @@ def new_run(path: Path | str, command: str) -> Iterator[Writer]:
         made = _make_parents(path.parent)
         try:
             with _staging(path) as folder:
+                _settle(path)
                 writer = Writer(folder)
                 yield writer
                 _commit(writer, path, command)
@@ -146,13 +146,14 @@ def load_run(path: Path | str) -> Run:
     Reports and pictures are not read: they may be drawn anew from these two.
     """
     path = Path(path)
-    files = _read_manifest(path)["files"]
+    place = path if path.exists() or not _previous(path).exists() else _previous(path)
+    files = _read_manifest(place)["files"]
     contents = {}
     for name, entry in files.items():
         if name not in (SUMMARY, ARRAYS):
             continue
         try:
-            content = (path / name).read_bytes()
+            content = (place / name).read_bytes()
         except OSError as error:
             raise _damaged(path, name, (error.strerror or "").lower()) from error
         if hashlib.sha256(content).hexdigest() != entry["sha256"]:
@@ -165,12 +166,6 @@ def load_run(path: Path | str) -> Run:
         with np.load(io.BytesIO(contents[ARRAYS]), allow_pickle=False) as stored:
             arrays = {key: stored[key] for key in stored.files}
     return Run(path, summary, arrays)
-
-
-def to_json(values: Mapping[str, Any]) -> str:
-    """JSON with finite numbers only; arrays become lists (E203 names the key)."""
-    plain = _plain_values(values, "")
-    return json.dumps(plain, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
 
 
 def disk_error(path: Path, error: OSError) -> Sim2GPError:
@@ -187,25 +182,6 @@ def disk_error(path: Path, error: OSError) -> Sim2GPError:
         expected="a folder you may write",
         fix="choose another --out",
     )
-
-
-def _plain_values(value: Any, key: str) -> Any:
-    if isinstance(value, Mapping):
-        return {str(k): _plain_values(v, f"{key}.{k}") for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain_values(v, f"{key}[{i}]") for i, v in enumerate(value)]
-    if value is None or isinstance(value, str | bool | int):
-        return value
-    if isinstance(value, Path):
-        return str(value)
-    if isinstance(value, float):
-        if not math.isfinite(value):
-            where, expected = key.lstrip("."), "a finite number"
-            raise Sim2GPError(
-                "E203", "result", where=where, got=value, expected=expected
-            )
-        return float(value)
-    return _plain_values(np.asarray(value).tolist(), key)
 
 
 def _plain(name: str) -> Path:
@@ -243,7 +219,7 @@ def _staging(path: Path) -> Iterator[Path]:
         yield folder
     finally:
         if folder.exists() and os.fstat(lock).st_ino == folder.stat().st_ino:
-            shutil.rmtree(folder)
+            shutil.rmtree(folder, ignore_errors=True)
         os.close(lock)
 
 
@@ -255,6 +231,9 @@ def _locked(folder: Path, path: Path) -> int:
             lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
         except FileNotFoundError:
             continue  # committed by another process just now
+        except OSError:
+            _remove_if_empty(folder)
+            raise
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
@@ -275,7 +254,7 @@ def _locked(folder: Path, path: Path) -> int:
 
 def _commit(writer: Writer, path: Path, command: str) -> None:
     manifest = {
-        "sim2gp": _version("sim2gp"),
+        "sim2gp": version("sim2gp"),
         "format": FORMAT,
         "command": command,
         "environment": environment(),
@@ -287,25 +266,47 @@ def _commit(writer: Writer, path: Path, command: str) -> None:
         _sync(folder)
     check_target(path)
     if path.exists() and any(path.iterdir()):
-        _merge(writer, path)
+        _swap(writer.folder, path)
     else:
         os.rename(writer.folder, path)
-    _sync(path.parent)
+        _sync(path.parent)
 
 
-def _merge(writer: Writer, path: Path) -> None:
-    """Replace an earlier run file by file; its manifest changes last."""
+def _swap(folder: Path, path: Path) -> None:
+    """Put the new run in the place of an earlier one: the second rename decides."""
+    previous = _previous(path)
+    os.rename(path, previous)
     try:
-        before = _read_manifest(path)["files"]
+        os.rename(folder, path)
+    except BaseException:
+        os.rename(previous, path)
+        raise
+    _sync(path.parent)
+    _settle(path)
+
+
+def _previous(path: Path) -> Path:
+    return path.with_name(f".{path.name}.previous")
+
+
+def _settle(path: Path) -> None:
+    """Finish, or undo, a replacement: afterwards only ``path`` is there."""
+    previous = _previous(path)
+    if not previous.exists():
+        return
+    if not path.exists():
+        os.rename(previous, path)
+        return
+    try:
+        written = {*_read_manifest(previous)["files"], MANIFEST}
     except InputError:
-        before = {}  # damaged: it is being replaced, and its strays stay visible
-    names = [name for name in writer.files if name != MANIFEST]
-    for name in [*names, MANIFEST]:
-        (path / name).parent.mkdir(parents=True, exist_ok=True)
-        os.replace(writer.folder / name, path / name)
-    _sync(path)
-    for name in set(before) - set(names):
-        (path / _plain(name)).unlink(missing_ok=True)
+        written = {MANIFEST}  # damaged: nothing says what the run had written
+    for file in [f for f in previous.rglob("*") if f.is_file()]:
+        name = file.relative_to(previous)
+        if str(name) not in written and not (path / name).exists():
+            (path / name).parent.mkdir(parents=True, exist_ok=True)
+            os.replace(file, path / name)
+    shutil.rmtree(previous, ignore_errors=True)
 
 
 def _sync(folder: Path) -> None:
@@ -353,17 +354,3 @@ def _damaged(path: Path, name: str, got: str) -> InputError:
         expected="the file as it was written",
         fix="run the command again",
     )
-
-
-def environment() -> dict[str, str]:
-    """Versions and machine that a result was made with."""
-    names = ("sim2gp", "jax", "jaxlib", "equinox", "numpy", "scipy", "optimistix")
-    found = {name: _version(name) for name in names}
-    return found | {"python": platform.python_version(), "machine": platform.machine()}
-
-
-def _version(name: str) -> str:
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return "not installed"

@@ -1,0 +1,295 @@
+"""Runs on disk: whole or not at all, whatever fails, and honest about damage."""
+
+import contextlib
+import errno
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from sim2gp.errors import InputError, Sim2GPError
+from sim2gp.runs import DiskError, Progress, RunOwned, load_run, new_run
+from sim2gp.runs.plain import to_json
+
+
+def save(path: Path, value: float = 1.0, *, extra: bool = False) -> None:
+    with new_run(path, "test") as run:
+        run.write_summary({"value": value, "none": None, "list": [1, 2.5, "a"]})
+        run.write_arrays("arrays.npz", {"a/b": np.arange(5.0), "mask": [True, False]})
+        run.write_text("report.html", f"<p>{value}</p>")
+        if extra:
+            run.write_text("figures/one.svg", "<svg/>")
+
+
+def save_and_fail(path: Path, error: BaseException | type[BaseException]) -> None:
+    with new_run(path, "test") as run:
+        run.write_summary({"value": 2.0})
+        raise error
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+def test_what_is_written_is_read(tmp_path: Path) -> None:
+    save(tmp_path / "runs" / "a", extra=True)
+    run = load_run(tmp_path / "runs" / "a")
+    assert run.summary == {"value": 1.0, "none": None, "list": [1, 2.5, "a"]}
+    np.testing.assert_array_equal(run.arrays["a/b"], np.arange(5.0))
+    assert run.arrays["mask"].dtype == bool
+    assert sorted(os.listdir(tmp_path / "runs")) == ["a"]
+    manifest = json.loads((run.path / "manifest.json").read_text())
+    assert manifest["command"] == "test"
+    assert {"python", "numpy", "jax"} <= set(manifest["environment"])
+    assert set(manifest["files"]) == set(contents(run.path)) - {"manifest.json"}
+
+
+def test_same_content_same_bytes(tmp_path: Path) -> None:
+    save(tmp_path / "a")
+    save(tmp_path / "b")
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, SystemExit])
+def test_a_failed_command_leaves_nothing(
+    tmp_path: Path, error: type[BaseException]
+) -> None:
+    with pytest.raises(error):
+        save_and_fail(tmp_path / "x" / "y" / "run", error)
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_failed_command_keeps_the_earlier_run(tmp_path: Path) -> None:
+    save(tmp_path / "a")
+    before = contents(tmp_path)
+    with pytest.raises(ValueError, match="no"):
+        save_and_fail(tmp_path / "a", ValueError("no"))
+    assert contents(tmp_path) == before
+
+
+def test_a_second_run_replaces_the_first_and_spares_notes(tmp_path: Path) -> None:
+    save(tmp_path / "a", extra=True)
+    (tmp_path / "a" / "notes.txt").write_text("mine")
+    save(tmp_path / "a", 2.0)
+    assert load_run(tmp_path / "a").summary["value"] == 2.0
+    assert (tmp_path / "a" / "notes.txt").read_text() == "mine"
+    assert not (tmp_path / "a" / "figures" / "one.svg").exists()
+    assert os.listdir(tmp_path) == ["a"]
+
+
+def test_an_empty_folder_is_taken(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    save(tmp_path / "a")
+    assert load_run(tmp_path / "a").summary["value"] == 1.0
+
+
+@pytest.mark.parametrize("kind", ["folder", "file", "link"])
+def test_somebody_elses_place_is_refused(kind: str, tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    if kind == "folder":
+        path.mkdir()
+        (path / "thesis.tex").write_text("")
+    elif kind == "file":
+        path.write_text("")
+    else:
+        path.symlink_to(tmp_path)
+    before = contents(tmp_path)
+    with pytest.raises(InputError, match="E132"):
+        save(path)
+    assert contents(tmp_path) == before
+
+
+def failing(monkeypatch: pytest.MonkeyPatch, at: int, number: int) -> list[str]:
+    """Make the ``at``-th system call that changes the disk fail; returns the calls."""
+    calls: list[str] = []
+
+    def wrap(module: Any, name: str) -> None:
+        original: Callable[..., Any] = getattr(module, name)
+
+        def call(*args: Any, **kwargs: Any) -> Any:
+            calls.append(name)
+            if len(calls) - 1 == at:
+                raise OSError(number, os.strerror(number))
+            return original(*args, **kwargs)
+
+        monkeypatch.setattr(module, name, call)
+
+    for name in ("mkdir", "fsync", "rename", "replace", "open"):
+        wrap(os, name)
+    return calls
+
+
+@pytest.mark.parametrize("earlier", [False, True])
+def test_every_failing_call_leaves_old_or_new(
+    earlier: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Fail the k-th call for every k: the old run or the new one, and both load."""
+    at, done = 0, False
+    while not done:
+        folder = tmp_path / str(at)
+        folder.mkdir()
+        if earlier:
+            save(folder / "a")
+        with monkeypatch.context() as patch:
+            calls = failing(patch, at, errno.ENOSPC)
+            with contextlib.suppress(DiskError):
+                save(folder / "a", 2.0)
+            done = at >= len(calls)
+        found = (folder / "a").exists()
+        values = [load_run(folder / "a").summary["value"]] if found else []
+        assert values in ([[1.0], [2.0]] if earlier else [[], [2.0]])
+        # Should tidying up have failed, the next run does it.
+        save(folder / "a", 3.0)
+        assert os.listdir(folder) == ["a"]
+        at += 1
+    assert at > 10
+
+
+@pytest.mark.parametrize(
+    ("number", "kind"),
+    [(errno.ENOSPC, DiskError), (errno.EIO, DiskError), (errno.EACCES, InputError)],
+)
+def test_disk_faults_are_typed(
+    number: int, kind: type, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failing(monkeypatch, 0, number)
+    with pytest.raises(kind, match=r"E1[39]0"):
+        save(tmp_path / "a")
+
+
+def test_second_process_is_told_and_a_killed_one_forgotten(tmp_path: Path) -> None:
+    code = (
+        "import os, sys\nfrom sim2gp.runs import new_run\n"
+        "with new_run(sys.argv[1], 'test') as run:\n"
+        "    run.write_text('half', 'x')\n"
+        "    print('ready', flush=True)\n"
+        "    sys.stdin.read()\n"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path / "a")]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "ready\n"
+        with pytest.raises(RunOwned, match="E191"):
+            save(tmp_path / "a")
+        other.kill()
+        other.wait()
+    assert os.listdir(tmp_path) == [".a.partial"]
+    save(tmp_path / "a")
+    assert os.listdir(tmp_path) == ["a"]
+    assert not (tmp_path / "a" / "half").exists()
+
+
+@pytest.mark.parametrize("name", ["summary.json", "arrays.npz"])
+def test_every_torn_or_flipped_file_is_noticed(name: str, tmp_path: Path) -> None:
+    save(tmp_path / "a")
+    path = tmp_path / "a" / name
+    good = path.read_bytes()
+    flips = [bytearray(good) for _ in range(0, 8 * len(good), 13)]
+    for i, flipped in enumerate(flips):
+        bit = 13 * i
+        flipped[bit // 8] ^= 1 << bit % 8
+    for bad in [*flips, *(good[:n] for n in range(0, len(good), 64))]:
+        path.write_bytes(bad)
+        with pytest.raises(InputError, match="E183"):
+            load_run(tmp_path / "a")
+    path.unlink()
+    with pytest.raises(InputError, match="E183"):
+        load_run(tmp_path / "a")
+    path.write_bytes(good)
+    load_run(tmp_path / "a")
+
+
+def test_foreign_and_newer_folders(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="E130 not a run"):
+        load_run(tmp_path / "gone")
+    save(tmp_path / "a")
+    manifest = tmp_path / "a" / "manifest.json"
+    text = manifest.read_text()
+    manifest.write_text(text.replace('"format": 1', '"format": 99'))
+    with pytest.raises(InputError, match="E185"):
+        load_run(tmp_path / "a")
+    manifest.write_text(text[:50])
+    with pytest.raises(InputError, match="E183"):
+        load_run(tmp_path / "a")
+    save(tmp_path / "a", 3.0)  # and running again mends it
+    assert load_run(tmp_path / "a").summary["value"] == 3.0
+
+
+def test_a_run_cut_between_two_renames_loads_and_heals(tmp_path: Path) -> None:
+    save(tmp_path / "a")
+    (tmp_path / "a" / "notes.txt").write_text("mine")
+    os.rename(tmp_path / "a", tmp_path / ".a.previous")
+    assert load_run(tmp_path / "a").summary["value"] == 1.0
+    save(tmp_path / "a", 2.0)
+    assert load_run(tmp_path / "a").summary["value"] == 2.0
+    assert (tmp_path / "a" / "notes.txt").read_text() == "mine"
+    assert os.listdir(tmp_path) == ["a"]
+
+
+def test_a_moved_run_still_loads(tmp_path: Path) -> None:
+    save(tmp_path / "a")
+    (tmp_path / "b").mkdir()
+    os.rename(tmp_path / "a", tmp_path / "b" / "c")
+    assert load_run(tmp_path / "b" / "c").summary["value"] == 1.0
+
+
+def test_no_file_outside_no_object_no_nan(tmp_path: Path) -> None:
+    with new_run(tmp_path / "a", "test") as run:
+        for name in ("../x", "/x", "a/../../x", ""):
+            with pytest.raises(Sim2GPError, match="E131"):
+                run.write_text(name, "")
+        with pytest.raises(Sim2GPError, match="E182"):
+            run.write_arrays("arrays.npz", {"a": np.array([{}], dtype=object)})
+        with pytest.raises(Sim2GPError, match=r"E203 .*b\.c\[1\]"):
+            run.write_summary({"b": {"c": [1.0, float("nan")]}})
+        with pytest.raises(Sim2GPError, match=r"E203 .* d"):
+            run.write_summary({"d": np.array(np.inf)})
+    assert os.listdir(tmp_path) == ["a"]
+
+
+finite = st.floats(allow_nan=False, allow_infinity=False)
+leaves = st.none() | st.booleans() | st.integers() | finite | st.text()
+trees = st.recursive(
+    leaves,
+    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
+    max_leaves=20,
+)
+
+
+@given(st.dictionaries(st.text(), trees))
+def test_json_round_trip(tree: dict[str, Any]) -> None:
+    assert json.loads(to_json(tree)) == tree
+
+
+@given(hnp.arrays(np.float64, hnp.array_shapes(max_dims=3), elements=finite))
+@settings(suppress_health_check=[HealthCheck.too_slow])
+def test_arrays_become_lists(array: np.ndarray) -> None:
+    assert json.loads(to_json({"a": array})) == {"a": array.tolist()}
+
+
+def test_progress_lines(capsys: pytest.CaptureFixture[str]) -> None:
+    progress = Progress()
+    assert list(progress.track("abc", "letters")) == ["a", "b", "c"]
+    with progress.task("fit", 2) as task:
+        task.advance("cost 1.5")
+        task.advance("cost 0.5")
+    said = capsys.readouterr()
+    assert said.out == ""
+    lines = ["letters: 1/3", "letters: 3/3", "fit: 1/2  cost 1.5", "fit: 2/2  cost 0.5"]
+    assert said.err.splitlines() == lines
+    quiet = Progress(quiet=True)
+    assert list(quiet.track("abc", "letters")) == ["a", "b", "c"]
+    quiet.say("nothing")
+    assert capsys.readouterr().err == ""
