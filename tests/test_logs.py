@@ -162,6 +162,15 @@ def test_gap_starts_a_new_episode(tmp_path: Path) -> None:
     assert np.max(np.diff(second.time)) < 0.02
 
 
+def test_a_row_alone_between_gaps_is_no_episode(tmp_path: Path) -> None:
+    table = swing()
+    table[150:, 0] += 0.1
+    table[151:, 0] += 0.1
+    logs = read(write(tmp_path / "a.csv", table))
+    assert [len(log) for log in logs] == [150, 249]
+    assert [log.name for log in logs] == ["a[0]", "a[1]"]
+
+
 def test_excluded_times_are_cut_out(tmp_path: Path) -> None:
     table = swing()
     table[100:120, 1] = np.nan  # what is excluded may be anything

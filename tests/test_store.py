@@ -155,6 +155,17 @@ def test_every_failing_call_leaves_old_or_new(
     assert at > 10
 
 
+def test_everything_is_on_the_disk_before_the_rename(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = failing(monkeypatch, -1, errno.EIO)
+    save(tmp_path / "a")
+    written = len(contents(tmp_path / "a"))
+    before = calls[: calls.index("rename")]
+    assert before.count("fsync") == written + 1  # each file, then their folder
+    assert calls[calls.index("rename") :].count("fsync") == 1  # and its name
+
+
 @pytest.mark.parametrize(
     ("number", "kind"),
     [(errno.ENOSPC, DiskError), (errno.EIO, DiskError), (errno.EACCES, InputError)],
