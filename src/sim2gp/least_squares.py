@@ -16,13 +16,14 @@ equations already miss the posterior mean by 5e-10 sd, the QR form by 3e-14.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, Int
 from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp.errors import DeadParameters, NotConverged, NotFinite
 from sim2gp.gaussian import Gaussian
@@ -72,17 +73,25 @@ class Fit(eqx.Module):
     z: Float[Array, " p"]
     data: Factor  # of the data alone, at z
     full: Factor  # of data and prior, at z
+    aux: Any  # what the likelihood wants to remember of z
     cost: Scalar
     gradient: Scalar  # ||g_z||_inf / (1 + cost)
     status: Int[Array, ""]
     steps: Int[Array, ""]
-    dead: Bool[Array, " p"]  # parameters that the data do not depend on at all
-    start_costs: Float[Array, " starts"]
 
     @property
     def R(self) -> Float[Array, "p p"]:
         """Factor of the posterior precision: ``R^T R = Sigma_z^-1``."""
         return self.full[:-1, :-1]
+
+    @property
+    def dead(self) -> Bool[Array, " p"]:
+        """Parameters that the data do not depend on at all."""
+        return jnp.all(self.data[:, :-1] == 0.0, axis=0)
+
+    def scale(self) -> Float[Array, "p p"]:
+        """Square root of ``Sigma_z``: ``R^-1``."""
+        return solve_triangular(self.R, jnp.eye(self.z.size, dtype=self.z.dtype))
 
     def posterior(self, prior: Gaussian) -> Gaussian:
         """``N(tt*, Sigma_q)`` by a triangular solve: scale ``L0 R^-1``."""
@@ -91,9 +100,12 @@ class Fit(eqx.Module):
             solve_triangular(self.R, prior.scale.T, trans="T").T,
         )
 
-    def log_occam(self) -> Scalar:
-        """``-1/2 ||z||^2 - 1/2 logdet(S0 Sq^-1)``: the evidence's price of learning."""
-        return -0.5 * self.z @ self.z - jnp.sum(jnp.log(jnp.diag(self.R)))
+    def log_joint(self) -> Scalar:
+        """``-1/2 ||r||^2 - 1/2 ||z||^2 - 1/2 logdet(S0 Sq^-1)``, nats.
+
+        The Laplace evidence, but for the normalisation of the noise.
+        """
+        return -self.cost - jnp.sum(jnp.log(jnp.diag(self.R)))
 
     def raise_unless_converged(self, names: tuple[str, ...], where: str) -> None:
         """Raise a typed error on the host, naming what to look at."""
@@ -127,19 +139,20 @@ class Fit(eqx.Module):
 
 
 def minimise(
-    factor_of: Callable[[Float[Array, " p"]], Factor],
-    starts: Float[Array, "starts p"],
+    factor_of: Callable[[Float[Array, " p"]], tuple[Factor, Any]],
+    z: Float[Array, " p"],
     *,
     max_steps: int = 100,
     tolerance: float = 1e-10,
 ) -> Fit:
-    """The best of several Levenberg-Marquardt runs, finished by undamped QR steps.
+    """One Levenberg-Marquardt descent, finished by undamped QR steps.
 
-    ``factor_of(z)`` is the factor of the whitened data residual and its Jacobian.
+    ``factor_of(z)`` is the factor of the whitened data residual and its Jacobian, and
+    whatever the caller wants back at the MAP.
     """
 
     def full_of(z: Array) -> Factor:
-        return with_prior(factor_of(z), z)
+        return with_prior(factor_of(z)[0], z)
 
     # The factor's last column has the residual's norm and its first columns the
     # residual's Gauss-Newton matrix, so LM on this small problem *is* LM on the data.
@@ -152,68 +165,95 @@ def minimise(
         full = full_of(primals[0])
         return full[:, -1], full[:, :-1] @ tangents[0]
 
-    solver = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
-
-    def descend(z0: Array) -> tuple[Array, Array, Array]:
-        solution = optx.least_squares(
-            lambda z, _: compressed(z), solver, z0, max_steps=max_steps, throw=False
-        )
-        residual = compressed(solution.value)
-        return solution.value, 0.5 * residual @ residual, solution.stats["num_steps"]
-
-    z, costs, steps = jax.vmap(descend)(starts)
-    costs = jnp.where(jnp.isfinite(costs), costs, jnp.inf)
-    best = jnp.argmin(costs)  # a NaN would win an argmin; it is +inf here
-    return polish(factor_of, z[best], steps[best], costs)
+    solution = optx.least_squares(
+        lambda z, _: compressed(z),
+        optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance),
+        z,
+        max_steps=max_steps,
+        throw=False,
+    )
+    return polish(factor_of, solution.value, solution.stats["num_steps"])
 
 
 def polish(
-    factor_of: Callable[[Float[Array, " p"]], Factor],
+    factor_of: Callable[[Float[Array, " p"]], tuple[Factor, Any]],
     z: Float[Array, " p"],
     steps: Int[Array, ""],
-    start_costs: Float[Array, " starts"],
     *,
     rounds: int = 2,
 ) -> Fit:
     """Undamped QR steps, kept while they do not raise the cost; then the verdict."""
+    blank = jax.eval_shape(factor_of, z)
+    data, aux = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), blank)
+    here = (z, data, aux, jnp.asarray(jnp.inf, z.dtype))
 
-    def improve(carry: tuple[Array, Factor], _: None) -> tuple[tuple, None]:
-        z, data = carry
-        full = with_prior(data, z)
-        z_new = z + gauss_newton_step(full)
-        data_new = factor_of(z_new)
-        cost, cost_new = _cost(full), _cost(with_prior(data_new, z_new))
+    def improve(carry: tuple, _: None) -> tuple[tuple, None]:
+        here, z_try = carry
+        data, aux = factor_of(z_try)
+        cost = _cost(with_prior(data, z_try))
         # Rounding in the cost must not refuse the last, gradient-only digits.
-        keep = cost_new <= cost * (1.0 + 1e-9) + 1e-12
-        return jax.tree.map(
-            lambda new, old: jnp.where(keep, new, old), (z_new, data_new), (z, data)
-        ), None
+        keep = cost <= here[3] * (1.0 + 1e-9) + 1e-12
+        there = (z_try, data, aux, cost)
+        here = jax.tree.map(lambda new, old: jnp.where(keep, new, old), there, here)
+        return (here, here[0] + gauss_newton_step(with_prior(here[1], here[0]))), None
 
-    (z, data), _ = jax.lax.scan(improve, (z, factor_of(z)), None, length=rounds)
+    (here, _), _ = jax.lax.scan(improve, (here, z), None, length=rounds + 1)
+    z, data, aux, cost = here
     full = with_prior(data, z)
-    cost = _cost(full)
-    gradient = jnp.max(jnp.abs(full[:-1, :-1].T @ full[:-1, -1])) / (1.0 + cost)
+    gradient = jnp.max(jnp.abs(full[:-1, :-1].T @ full[:-1, -1]), initial=0.0)
+    gradient = gradient / (1.0 + cost)
     finite = jnp.isfinite(cost) & jnp.all(jnp.isfinite(full))
     status = jnp.where(gradient <= GRADIENT_TOLERANCE, CONVERGED, STALLED)
-    return Fit(
-        z=z,
-        data=data,
-        full=full,
-        cost=cost,
-        gradient=gradient,
-        status=jnp.where(finite, status, NOT_FINITE),
-        steps=steps,
-        dead=jnp.all(data[:, :-1] == 0.0, axis=0),
-        start_costs=start_costs,
-    )
+    status = jnp.where(finite, status, NOT_FINITE)
+    return Fit(z, data, full, aux, cost, gradient, status, steps)
+
+
+def multi_start(
+    factor_of: Callable[[Float[Array, " p"], Any], tuple[Factor, Any]],
+    starts: Float[Array, "starts p"],
+    noise: Any,
+    update: Callable[[Fit, Any], Any],
+    *,
+    rounds: int,
+) -> tuple[Fit, Any, Float[Array, " starts"]]:
+    """The best of several descents; then ``rounds`` of noise update and descent (EM).
+
+    Every descent is one turn of the same scan, so that the likelihood is compiled once.
+    Returns the fit, its noise, and the cost that each start reached.
+    """
+
+    def descend(z: Array, noise: Any) -> Fit:
+        return minimise(lambda z: factor_of(z, noise), z)
+
+    shapes = jax.eval_shape(descend, starts[0], noise)
+    best = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
+    best = eqx.tree_at(lambda f: f.cost, best, jnp.asarray(jnp.inf, starts.dtype))
+
+    def turn(carry: tuple[Fit, Any], x: tuple[Array, Array]) -> tuple[tuple, Array]:
+        best, noise = carry
+        start, searching = x
+
+        def pick(yes: Any, no: Any) -> Any:
+            return jax.tree.map(lambda y, n: jnp.where(searching, y, n), yes, no)
+
+        noise = pick(noise, update(best, noise))
+        fit = descend(jnp.where(searching, start, best.z), noise)
+        # A cost that is not finite never wins; a comparison with NaN is false.
+        better = jnp.where(searching, fit.cost < best.cost, True)
+        best = jax.tree.map(lambda new, old: jnp.where(better, new, old), fit, best)
+        return (best, noise), fit.cost
+
+    count = len(starts)
+    schedule = jnp.concatenate([starts, jnp.zeros((rounds, starts.shape[1]))])
+    searching = jnp.arange(count + rounds) < count
+    (fit, noise), costs = jax.lax.scan(turn, (best, noise), (schedule, searching))
+    return fit, noise, costs[:count]
 
 
 def linear_fit(J: Float[Array, "N p"], r: Float[Array, " N"]) -> Fit:
     """The exact conjugate posterior of ``r(z) = r + J z``: one QR, then refinement."""
     zeros = jnp.zeros(J.shape[1], J.dtype)
-    return polish(
-        lambda z: factor(J, r + J @ z), zeros, jnp.zeros((), int), jnp.zeros(1)
-    )
+    return polish(lambda z: (factor(J, r + J @ z), ()), zeros, jnp.zeros((), int))
 
 
 def _cost(full: Factor) -> Scalar:

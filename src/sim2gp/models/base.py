@@ -1,0 +1,135 @@
+"""What a model is: a recipe that turns data into a belief, and a belief gives draws.
+
+``init -> fit -> sample`` is all that a loop needs. Beside posterior sampling always
+stand the point estimate (certainty equivalence) and the unlearned prior mean.
+"""
+
+from abc import abstractmethod
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sim2gp.gaussian import Gaussian
+from sim2gp.transitions import Transitions
+from sim2gp.types import Action, Dynamics, Key, Scalar, State
+
+
+class AbstractBelief(eqx.Module):
+    """A distribution over dynamics: what is believed after some data."""
+
+    @abstractmethod
+    def latent(self, s: State, a: Action) -> Gaussian:
+        """Epistemic distribution of ``s'``, without noise."""
+
+    @abstractmethod
+    def predict(self, s: State, a: Action) -> Gaussian:
+        """Predictive distribution of ``s'``, with noise."""
+
+    @abstractmethod
+    def sample(self, key: Key) -> Dynamics:
+        """One function: every query sees the same draw. A pytree of float32."""
+
+    @abstractmethod
+    def point(self) -> Dynamics:
+        """The best single function, of the same type as a draw."""
+
+    @abstractmethod
+    def information_gain(self, s: State, a: Action) -> Scalar:
+        """Nats that one more transition from here is expected to give."""
+
+    @abstractmethod
+    def trajectory_information_gain(
+        self, S: Float[Array, "T n"], A: Float[Array, "T m"]
+    ) -> Scalar:
+        """Nats that a whole trajectory is expected to give, redundancy removed."""
+
+
+class AbstractModel(eqx.Module):
+    """A recipe; it keeps the prior, and has no data."""
+
+    @abstractmethod
+    def init(self, key: Key) -> AbstractBelief:
+        """The belief before any data."""
+
+    @abstractmethod
+    def fit(
+        self, belief: AbstractBelief, data: Transitions, *, key: Key
+    ) -> AbstractBelief:
+        """The posterior given *all* of the data; ``belief`` only warm-starts."""
+
+    @abstractmethod
+    def update(
+        self, belief: AbstractBelief, s: State, a: Action, s2: State
+    ) -> AbstractBelief:
+        """One more transition: pure and shape-stable, for use inside scans."""
+
+
+class DeterministicBelief(AbstractBelief):
+    """A belief whose draws all are one function."""
+
+    belief: AbstractBelief
+
+    def latent(self, s: State, a: Action) -> Gaussian:
+        mean = self.point()(s, a)
+        return Gaussian(mean, jnp.zeros((mean.size, 1), mean.dtype))
+
+    def predict(self, s: State, a: Action) -> Gaussian:
+        return self.belief.predict(s, a)
+
+    def sample(self, key: Key) -> Dynamics:
+        del key
+        return self.belief.point()
+
+    def point(self) -> Dynamics:
+        return self.belief.point()
+
+    def information_gain(self, s: State, a: Action) -> Scalar:
+        return jnp.zeros(())
+
+    def trajectory_information_gain(
+        self, S: Float[Array, "T n"], A: Float[Array, "T m"]
+    ) -> Scalar:
+        return jnp.zeros(())
+
+
+class PointEstimate(AbstractModel):
+    """Certainty equivalence: fit like ``model``, then act as if the MAP were true."""
+
+    model: AbstractModel
+
+    def init(self, key: Key) -> DeterministicBelief:
+        return DeterministicBelief(self.model.init(key))
+
+    def fit(
+        self, belief: AbstractBelief, data: Transitions, *, key: Key
+    ) -> DeterministicBelief:
+        assert isinstance(belief, DeterministicBelief)
+        return DeterministicBelief(self.model.fit(belief.belief, data, key=key))
+
+    def update(
+        self, belief: AbstractBelief, s: State, a: Action, s2: State
+    ) -> DeterministicBelief:
+        assert isinstance(belief, DeterministicBelief)
+        return DeterministicBelief(self.model.update(belief.belief, s, a, s2))
+
+
+class PriorMean(AbstractModel):
+    """The simulator as delivered: acts on the prior mean and never learns."""
+
+    model: AbstractModel
+
+    def init(self, key: Key) -> DeterministicBelief:
+        return DeterministicBelief(self.model.init(key))
+
+    def fit(
+        self, belief: AbstractBelief, data: Transitions, *, key: Key
+    ) -> AbstractBelief:
+        del data, key
+        return belief
+
+    def update(
+        self, belief: AbstractBelief, s: State, a: Action, s2: State
+    ) -> AbstractBelief:
+        del s, a, s2
+        return belief

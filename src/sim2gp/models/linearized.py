@@ -1,0 +1,95 @@
+"""A parametric function, linearised at its MAP, is a Gaussian process (paper, eq. 1-2).
+
+    f(x, tt) ~ f(x, tt*) + J(x) (tt - tt*),        tt ~ N(tt*, S S^T)
+
+Here ``J`` is ``(d, p)`` with the bijections inside (the paper's eq. 1 prints ``J^T``).
+A draw of ``tt`` is a whole function; evaluating it costs one ``jvp``. Linearised draws
+stay right on ridges: along a flat direction the tangent moves ``tt`` and not ``f``,
+while the nonlinear function at the same ``tt`` leaves the ridge's curve.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sim2gp.gaussian import Gaussian
+from sim2gp.systems.base import AbstractSystem
+from sim2gp.types import Action, Key, Scalar, State
+
+
+class LinearizedDraw(eqx.Module):
+    """``f(x, tt*) + J(x) delta``: one draw of the Gaussian process, as a simulator."""
+
+    system: AbstractSystem
+    tt: Float[Array, " p"]
+    delta: Float[Array, " p"]
+    dt: float = eqx.field(static=True)
+
+    def __call__(self, s: State, a: Action) -> State:
+        def f(tt: Array) -> Array:
+            return self.system.transition(tt, s, a, self.dt)
+
+        mean, slope = jax.jvp(f, (self.tt,), (self.delta,))
+        return mean + slope
+
+
+class NonlinearDraw(eqx.Module):
+    """``f(x, tt)`` at a drawn ``tt``: for identifiable models, where physics must hold.
+
+    On ridges it under-fits (the Gaussian is tangent to a curved ridge).
+    """
+
+    system: AbstractSystem
+    tt: Float[Array, " p"]
+    dt: float = eqx.field(static=True)
+
+    def __call__(self, s: State, a: Action) -> State:
+        return self.system.transition(self.tt, s, a, self.dt)
+
+
+def value_and_jacobian(
+    f: Callable[[Array], Array], tt: Float[Array, " p"]
+) -> tuple[Float[Array, " d"], Float[Array, "d p"]]:
+    """``f(tt)`` and its Jacobian, by forward mode (p is small, rollouts are long)."""
+
+    def twice(tt: Array) -> tuple[Array, Array]:
+        value = f(tt)
+        return value, value
+
+    J, value = jax.jacfwd(twice, has_aux=True)(tt)
+    return value, J
+
+
+def latent(f: Callable[[Array], Array], posterior: Gaussian) -> Gaussian:
+    """Push a parameter posterior through the linearised function (eq. 2, no noise)."""
+    value, J = value_and_jacobian(f, posterior.mean)
+    return Gaussian(value, J @ posterior.scale)
+
+
+def information_gain(
+    scaled: Float[Array, "rows p"],
+) -> Scalar:
+    """``1/2 logdet(I + A A^T)`` of ``A = Se^-1/2 J S``, by QR; rows may be a trajectory.
+
+    Stacking a trajectory's rows gives the joint information: what the second visit to
+    one place repeats is not counted twice.
+    """
+    p = scaled.shape[1]
+    rows = jnp.concatenate([scaled, jnp.eye(p, dtype=scaled.dtype)])
+    R = jnp.linalg.qr(rows, mode="r")
+    # Rounding may leave log|1 - eps|; information is never negative.
+    return jnp.maximum(jnp.sum(jnp.log(jnp.abs(jnp.diag(R)))), 0.0)
+
+
+def draw(
+    system: AbstractSystem, posterior: Gaussian, dt: float, key: Key, *, linear: bool
+) -> LinearizedDraw | NonlinearDraw:
+    """One float32 function from the parameter posterior."""
+    tt = posterior.sample(key)
+    if not linear:
+        return NonlinearDraw(system, tt.astype(jnp.float32), dt)
+    delta = (tt - posterior.mean).astype(jnp.float32)
+    return LinearizedDraw(system, posterior.mean.astype(jnp.float32), delta, dt)

@@ -1,0 +1,315 @@
+"""SIM2GP: a simulator with bounded parameters, linearised at its MAP, is a GP.
+
+    y_n = s'_n - s_n = f(x_n, tt) + eps_n,   eps ~ N(0, diag(sig^2)),   tt ~ N(mu0, S0)
+    tt*     = argmin 1/2 sum ||y_n - f(x_n, tt)||^2_Se + 1/2 ||tt - mu0||^2_S0
+    Sq^-1   = S0^-1 + sum J_n^T Se^-1 J_n                (Gauss-Newton; paper, eq. 2)
+    sig_k^2 = (2 floor_k^2 + sum r_nk^2 + (J Sq J^T)_kk) / (2 + N)          (EM)
+
+The paper prints the MAP with the prior counted twice and Sq with the full Hessian; the
+linearised model's own Hessian is the Gauss-Newton one, which is also always positive.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from sim2gp.gaussian import LOG_2PI, Gaussian
+from sim2gp.least_squares import (
+    Factor,
+    Fit,
+    factor,
+    gauss_newton_step,
+    multi_start,
+    stack,
+    triangular,
+)
+from sim2gp.models import linearized
+from sim2gp.models.base import AbstractBelief, AbstractModel
+from sim2gp.systems.base import AbstractSystem
+from sim2gp.transitions import Transitions
+from sim2gp.types import Action, Dynamics, Key, Scalar, State, in_float64
+
+NOISE_ROUNDS = 6  # EM; the last change of sig is below 1e-3 relative from here on
+STARTS = 8
+FLOOR = 1e-3  # prior guess of the noise, relative to each channel's rms change
+
+
+class Sim2GPBelief(AbstractBelief):
+    """A Gaussian over virtual parameters, seen through the linearised simulator."""
+
+    system: AbstractSystem
+    prior: Gaussian
+    posterior: Gaussian
+    noise: Float[Array, " d"]  # sd of one step, state units
+    information: Float[Array, "p p"]  # factor of the data's Fisher, whitened by prior
+    log_evidence: Scalar
+    count: Int[Array, ""]
+    dt: float = eqx.field(static=True)
+    linear: bool = eqx.field(static=True)
+
+    @in_float64
+    def latent(self, s: State, a: Action) -> Gaussian:
+        return _latent(self, *_double(s, a))
+
+    @in_float64
+    def predict(self, s: State, a: Action) -> Gaussian:
+        return _predict(self, *_double(s, a))
+
+    @in_float64
+    def sample(self, key: Key) -> Dynamics:
+        return linearized.draw(
+            self.system, self.posterior, self.dt, key, linear=self.linear
+        )
+
+    @in_float64
+    def point(self) -> Dynamics:
+        at_map = Gaussian(self.posterior.mean, jnp.zeros_like(self.posterior.scale))
+        key = jax.random.key(0)  # the scale is zero: no randomness is used
+        return linearized.draw(self.system, at_map, self.dt, key, linear=self.linear)
+
+    @in_float64
+    def information_gain(self, s: State, a: Action) -> Scalar:
+        s, a = _double(s, a)
+        return _trajectory_information_gain(self, s[None], a[None])
+
+    @in_float64
+    def trajectory_information_gain(
+        self, S: Float[Array, "T n"], A: Float[Array, "T m"]
+    ) -> Scalar:
+        return _trajectory_information_gain(self, *_double(S, A))
+
+    @in_float64
+    def parameters(self) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
+        """Virtual mean and sd; push them through the table for physical units."""
+        return self.posterior.mean, self.posterior.sd()
+
+
+class Sim2GP(AbstractModel):
+    """The simulator as a prior over dynamics.
+
+    ``dt`` is the control period (s). ``prior`` replaces the table's own, in virtual
+    space: with a posterior here, data sets are learned one after another. ``draws`` is
+    ``"linearized"`` (the paper's Gaussian process) or ``"nonlinear"``.
+    """
+
+    system: AbstractSystem
+    prior: Gaussian
+    dt: float = eqx.field(static=True)
+    linear: bool = eqx.field(static=True)
+
+    @in_float64
+    def __init__(
+        self,
+        system: AbstractSystem,
+        *,
+        dt: float = 0.02,
+        prior: Gaussian | None = None,
+        draws: str = "linearized",
+    ) -> None:
+        if draws not in ("linearized", "nonlinear"):
+            raise ValueError(f"draws is {draws!r}, not 'linearized' or 'nonlinear'")
+        self.system = system
+        self.prior = system.parameters.prior() if prior is None else prior
+        self.dt = dt
+        self.linear = draws == "linearized"
+
+    def with_prior(self, prior: Gaussian) -> "Sim2GP":
+        """The same recipe, starting from another belief about the constants."""
+        return eqx.tree_at(lambda m: m.prior, self, prior)
+
+    @in_float64
+    def init(self, key: Key) -> Sim2GPBelief:
+        """The prior itself; needs no key."""
+        del key
+        p, d = self.prior.mean.size, len(self.system.physical_states)
+        return Sim2GPBelief(
+            self.system,
+            self.prior,
+            self.prior,
+            jnp.ones(d),
+            jnp.zeros((p, p)),
+            jnp.zeros(()),
+            jnp.zeros((), int),
+            self.dt,
+            self.linear,
+        )
+
+    @in_float64
+    def fit(
+        self, belief: AbstractBelief, data: Transitions, *, key: Key
+    ) -> Sim2GPBelief:
+        """Multi-start MAP, noise by EM, Laplace posterior.
+
+        Raises `NotConverged`, `NotFinite` or `DeadParameters`.
+        """
+        assert isinstance(belief, Sim2GPBelief)
+        p = self.prior.mean.size
+        warm = jax.scipy.linalg.solve(
+            self.prior.scale, belief.posterior.mean - self.prior.mean
+        )
+        spread = 0.7 * jax.random.normal(key, (STARTS - 2, p))
+        starts = jnp.concatenate([warm[None], jnp.zeros((1, p)), spread])
+        fit, fitted = _fit(self, jax.tree.map(jnp.asarray, data), starts)
+        names = self.system.parameters.names
+        fit.raise_unless_converged(names, f"{data.count} transitions")
+        return fitted
+
+    def update(
+        self, belief: AbstractBelief, s: State, a: Action, s2: State
+    ) -> Sim2GPBelief:
+        """Condition on one transition at the current linearisation (a Kalman update).
+
+        Traceable; call it under `in_float64`.
+        """
+        assert isinstance(belief, Sim2GPBelief)
+        return _update(belief, s, a, s2)
+
+
+def _double(*arrays: Array) -> tuple[Array, ...]:
+    return tuple(jnp.asarray(x, float) for x in arrays)
+
+
+def _latent(belief: Sim2GPBelief, s: Array, a: Array) -> Gaussian:
+    def f(tt: Array) -> Array:
+        return belief.system.transition(tt, s, a, belief.dt)
+
+    return linearized.latent(f, belief.posterior)
+
+
+def _predict(belief: Sim2GPBelief, s: Array, a: Array) -> Gaussian:
+    d, n = belief.noise.size, s.size
+    noise = jnp.concatenate([jnp.diag(belief.noise), jnp.zeros((n - d, d))])
+    return _latent(belief, s, a).plus(noise)
+
+
+def _trajectory_information_gain(
+    belief: Sim2GPBelief, S: Float[Array, "T n"], A: Float[Array, "T m"]
+) -> Scalar:
+    d = belief.noise.size
+
+    def rows(s: Array, a: Array) -> Array:
+        return _latent(belief, s, a).scale[:d] / belief.noise[:, None]
+
+    scaled = jax.vmap(rows)(S, A)
+    return linearized.information_gain(scaled.reshape(-1, scaled.shape[-1]))
+
+
+class _OneStep(eqx.Module):
+    """The one-step likelihood: exact states, independent noise on each increment."""
+
+    model: Sim2GP
+    data: Transitions
+
+    def rows(
+        self, z: Float[Array, " p"]
+    ) -> tuple[Float[Array, "N d"], Float[Array, "N d p"]]:
+        """Residuals ``f - y`` and their Jacobian in ``z``; masked rows are zero."""
+        model, d = self.model, len(self.model.system.physical_states)
+
+        def one(s: Array, a: Array, s2: Array, valid: Array) -> tuple[Array, Array]:
+            def f(z: Array) -> Array:
+                tt = model.prior.mean + model.prior.scale @ z
+                return model.system.transition(tt, s, a, model.dt)[:d]
+
+            value, J = linearized.value_and_jacobian(f, z)
+            return jnp.where(valid, value - s2[:d], 0.0), jnp.where(valid, J, 0.0)
+
+        data = self.data
+        return jax.vmap(one)(data.state, data.action, data.next_state, data.mask)
+
+    def factor(
+        self, z: Float[Array, " p"], noise: Float[Array, " d"]
+    ) -> tuple[Factor, Float[Array, "d p1 p1"]]:
+        """Factor of the whitened residual, and each channel's own, not whitened.
+
+        The noise only scales the channels' factors, so EM needs no other pass.
+        """
+        r, J = self.rows(z)
+        channels = jax.vmap(factor, in_axes=1)(J, r)
+        return stack(*(channels / noise[:, None, None])), channels
+
+
+@eqx.filter_jit
+def _fit(
+    model: Sim2GP, data: Transitions, starts: Float[Array, "starts p"]
+) -> tuple[Fit, Sim2GPBelief]:
+    d, N = len(model.system.physical_states), jnp.sum(data.mask)
+    y = jnp.where(data.mask[:, None], data.delta()[:, :d], 0.0)
+    change = jnp.sqrt(jnp.sum(y**2, axis=0) / jnp.maximum(N, 1))
+    change = jnp.where(change > 0.0, change, 1.0)
+
+    def update(fit: Fit, _: Array) -> Array:
+        # The expected squares under the posterior; the prior on the noise counts as
+        # two observations at the floor.
+        r, J = fit.aux[:, :, -1], fit.aux[:, :, :-1]
+        squares = jnp.sum(r**2, axis=1) + jnp.sum((J @ fit.scale()) ** 2, axis=(1, 2))
+        return jnp.sqrt((2.0 * (FLOOR * change) ** 2 + squares) / (2.0 + N))
+
+    # Start from a large noise, so that the first MAP is not trapped.
+    likelihood = _OneStep(model, data)
+    fit, noise, _ = multi_start(
+        likelihood.factor, starts, change, update, rounds=NOISE_ROUNDS
+    )
+    normaliser = N * jnp.sum(jnp.log(noise) + 0.5 * LOG_2PI)
+    belief = Sim2GPBelief(
+        model.system,
+        model.prior,
+        fit.posterior(model.prior),
+        noise,
+        fit.data[:-1, :-1],
+        fit.log_joint() - normaliser,
+        N,
+        model.dt,
+        model.linear,
+    )
+    return fit, belief
+
+
+def _update(belief: Sim2GPBelief, s: Array, a: Array, s2: Array) -> Sim2GPBelief:
+    d = belief.noise.size
+    latent = _latent(belief, s, a)
+    r = (latent.mean - s2)[:d] / belief.noise
+    A = latent.scale[:d] / belief.noise[:, None]
+    # Coordinates whitened by the current posterior: its own rows are [I 0].
+    identity = jnp.eye(A.shape[1], A.shape[1] + 1, dtype=A.dtype)
+    full = stack(jnp.concatenate([A, r[:, None]], axis=1), identity)
+    scale = belief.posterior.scale
+    mean = belief.posterior.mean + scale @ gauss_newton_step(full)
+    scale = jax.scipy.linalg.solve_triangular(full[:-1, :-1], scale.T, trans="T").T
+    # The same rows, whitened by the prior instead.
+    J0 = jnp.linalg.solve(belief.posterior.scale.T, A.T).T @ belief.prior.scale
+    predictive = Gaussian(latent.mean[:d], latent.scale[:d])
+    predictive = predictive.plus(jnp.diag(belief.noise))
+    new = (
+        Gaussian(mean, scale),
+        triangular(jnp.concatenate([belief.information, J0])),
+        belief.log_evidence + predictive.log_prob(s2[:d]),
+        belief.count + 1,
+    )
+    return eqx.tree_at(
+        lambda b: (b.posterior, b.information, b.log_evidence, b.count), belief, new
+    )
+
+
+@eqx.filter_jit
+def _hessian(belief: Sim2GPBelief, data: Transitions) -> Float[Array, "p p"]:
+    model = Sim2GP(belief.system, dt=belief.dt, prior=belief.prior)
+    likelihood = _OneStep(model, data)
+
+    def loss(z: Array) -> Scalar:
+        r = likelihood.rows(z)[0] / belief.noise
+        return 0.5 * jnp.sum(r**2) + 0.5 * z @ z
+
+    offset = belief.posterior.mean - belief.prior.mean
+    return jax.hessian(loss)(jnp.linalg.solve(belief.prior.scale, offset))
+
+
+@in_float64
+def full_hessian(belief: Sim2GPBelief, data: Transitions) -> Float[Array, "p p"]:
+    """Hessian of the negative log posterior in whitened coordinates: a diagnostic.
+
+    It equals the Gauss-Newton precision up to residuals times curvature, and may be
+    indefinite away from a good fit; it is never used as a posterior.
+    """
+    return _hessian(belief, jax.tree.map(jnp.asarray, data))
