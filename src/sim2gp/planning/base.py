@@ -49,9 +49,10 @@ class MarkovObjective(AbstractObjective):
 class World(eqx.Module):
     """One draw of everything a planner needs; a pytree, so a new draw is new data.
 
-    ``horizon`` is the episode's length in steps. The planning defaults travel with the
-    machine: a fast pendulum wants a short plan and restless noise, a slow one the
-    opposite, and a planner built without arguments is right on both.
+    ``horizon`` is the episode's length in steps, ``history`` the number of past actions
+    (newest first) at the end of the state, for delayed inputs. The planning defaults
+    travel with the machine: a fast pendulum wants a short plan and restless noise, a
+    slow one the opposite, and a planner built without arguments is right on both.
     """
 
     dynamics: Dynamics
@@ -60,6 +61,7 @@ class World(eqx.Module):
     actions: Box
     horizon: int = eqx.field(static=True)
     state_bound: Float[Array, " n"] | None = None
+    history: int = eqx.field(static=True, default=0)
     planning_horizon: int = eqx.field(static=True, default=30)
     planning_iterations: int = eqx.field(static=True, default=4)
     noise_colour: float = eqx.field(static=True, default=1.0)

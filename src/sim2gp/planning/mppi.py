@@ -78,7 +78,7 @@ def softmax_of_size(
         w = jnp.where(valid, jnp.exp(-scaled * jnp.exp(-log_temperature)), 0.0)
         return w / jnp.maximum(jnp.sum(w), 1.0)  # the best one alone weighs 1
 
-    def bisect(_: int, ends: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
+    def bisect(_: Array, ends: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
         low, high = ends
         middle = 0.5 * (low + high)
         small = jnp.sum(weights(middle) ** 2) * target > 1.0
