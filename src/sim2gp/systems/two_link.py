@@ -46,8 +46,8 @@ class TwoLinkParams(eqx.Module):
     """Constants of an arm of desk to human size; every box spans two to four decades.
 
     A fixed base leaves ``m2``, ``m1r1`` and ``I1`` collinear: only ``m1r1 + l1 m2`` and
-    ``I1 + l1^2 m2`` act. A real arm also has ``I2 m2 > m2r2^2``, which independent
-    boxes cannot say.
+    ``I1 + l1^2 m2`` act. Without rotors the inertia matrix is positive definite where
+    ``(I1 + l1^2 m2) I2 > (l1 m2r2)^2``, which independent boxes cannot say.
     """
 
     m1r1: Scalar = log_bounded(

@@ -1,0 +1,92 @@
+"""Every bundled system with points to test it at, away from numerical blow-up."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from sim2gp import systems as sy
+from sim2gp.systems import AbstractMechanism, AbstractSystem
+
+SPEEDS = {"rad": 8.0, "m": 1.5}
+
+
+def bare() -> dict[str, AbstractMechanism]:
+    """The machines themselves."""
+    rods = sy.UniformRodArm()
+    six = sy.UniformRodArm(sy.base.parameters_of(sy.UniformRodParams))
+    return {
+        "furuta": sy.Furuta(),
+        "cartpole": sy.CartPole(),
+        "two_link": sy.TwoLink(gravity=9.81),
+        "horizontal": sy.TwoLink(coulomb_shape="arctangent"),
+        "rods": rods,
+        "six": six,
+        "locked": sy.UniformRodArm(locked=(True, False)),
+    }
+
+
+def every() -> dict[str, AbstractSystem]:
+    """The machines, alone, with every effect of the catalogue, and with actuators."""
+    systems: dict[str, AbstractSystem] = dict(bare())
+    for name in ("furuta", "cartpole"):
+        for what in sy.catalogue(name):
+            effect = sy.effect(name, what, "strong")
+            systems[f"{name}/{what}"] = sy.perturb(systems[name], [effect])
+    for name in ("furuta", "two_link"):
+        system = systems[name]
+        free = {
+            f"{c.name}.{q}": sy.actuator_prior(c, q)
+            for c in system.actions
+            for q in ("gain", "offset", "delay")
+        }
+        systems[f"{name}/actuated"] = sy.Actuated(system, free, delay_max=0.02)
+    return systems
+
+
+def points(system: AbstractSystem, count: int, seed: int) -> Iterator[tuple[Any, ...]]:
+    """Random (tt, s, a): constants around the published ones, states over the range."""
+    yield from zip(*batch(system, count, seed), strict=True)
+
+
+def batch(system: AbstractSystem, count: int, seed: int) -> tuple[Array, ...]:
+    """As `points`, stacked: (count, p), (count, n), (count, m)."""
+    rng = np.random.default_rng(seed)
+    nominal = system.parameters.nominal()
+    theta = jnp.array([nominal[name] for name in system.parameters.names])
+    tt = system.parameters.unconstrain(theta)[None] + 0.3 * rng.standard_normal(
+        (count, len(theta))
+    )
+    high = np.array([c.high for c in system.actions])
+    a = rng.uniform(-1.0, 1.0, (count, len(high))) * high
+    columns = []
+    for channel in system.physical_states:
+        position = channel.name.removesuffix(".velocity")
+        unit = next(c.unit for c in system.states if c.name == position)
+        if channel.name != position:
+            span = SPEEDS[unit]
+        else:
+            span = np.pi if unit == "rad" else 0.4
+        columns.append(rng.uniform(-span, span, count))
+    past = rng.uniform(-1.0, 1.0, (count, system.history * len(high)))
+    s = np.stack([*columns, *past.T], 1)
+    return tt, jnp.asarray(s), jnp.asarray(a)
+
+
+def params_at(system: AbstractSystem, tt: Array) -> Any:
+    """The record at a virtual point."""
+    return system.record(system.parameters.values(tt))
+
+
+def nominal(system: AbstractSystem, **changes: float) -> Any:
+    """The published record, with some constants changed."""
+    values = system.parameters.nominal() | changes
+    return system.record({k: jnp.asarray(v, float) for k, v in values.items()})
+
+
+def jitted(system: AbstractSystem, dt: float) -> Any:
+    """The step of (tt, s, a), compiled."""
+    return jax.jit(lambda tt, s, a: system.transition(tt, s, a, dt))
