@@ -1,0 +1,1 @@
+"""Independent reference answers for the tests: plain numpy and scipy."""
