@@ -26,7 +26,7 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp.errors import DeadParameters, NotConverged, NotFinite
-from sim2gp.gaussian import Gaussian
+from sim2gp.gaussian import LOG_2PI, Gaussian, log_det_factor
 from sim2gp.types import Scalar
 
 #: Triangular factor of ``[J r]``, shape (p + 1, p + 1), diagonal non-negative.
@@ -51,7 +51,7 @@ def triangular(rows: Float[Array, "N k"]) -> Float[Array, "k k"]:
     return jnp.where(jnp.diag(R) < 0.0, -1.0, 1.0)[:, None] * R
 
 
-def stack(*factors: Float[Array, "N k"]) -> Float[Array, "k k"]:
+def stack(*factors: Float[Array, "_ k"]) -> Float[Array, "k k"]:
     """The factor of several blocks of rows at once."""
     return triangular(jnp.concatenate(factors))
 
@@ -254,6 +254,28 @@ def linear_fit(J: Float[Array, "N p"], r: Float[Array, " N"]) -> Fit:
     """The exact conjugate posterior of ``r(z) = r + J z``: one QR, then refinement."""
     zeros = jnp.zeros(J.shape[1], J.dtype)
     return polish(lambda z: (factor(J, r + J @ z), ()), zeros, jnp.zeros((), int))
+
+
+def linear_posterior(
+    J: Float[Array, "N d p"],
+    y: Float[Array, "N d"],
+    noise_scale: Float[Array, "d d"],
+    prior: Gaussian,
+) -> tuple[Gaussian, Scalar]:
+    """Exact posterior and log evidence of ``y_n = J_n tt + eps_n``.
+
+    ``eps_n ~ N(0, L L^T)`` with ``L = noise_scale`` lower-triangular, in the units of
+    ``y``. With no rows the prior comes back as it is.
+    """
+    N, d, p = J.shape
+    if N == 0:
+        return prior, jnp.zeros((), J.dtype)
+    rows = jnp.concatenate([J @ prior.scale, (J @ prior.mean - y)[:, :, None]], axis=2)
+    white = jax.vmap(lambda block: solve_triangular(noise_scale, block, lower=True))
+    rows = white(rows).reshape(N * d, p + 1)
+    fit = linear_fit(rows[:, :-1], rows[:, -1])
+    normaliser = N * (log_det_factor(noise_scale) + 0.5 * d * LOG_2PI)
+    return fit.posterior(prior), fit.log_joint() - normaliser
 
 
 def _cost(full: Factor) -> Scalar:
