@@ -124,18 +124,18 @@ def closed_loop(planner: MPC, w: World, s0: Array, key: Array) -> Array:
 
 
 @pytest.mark.parametrize(
-    ("update", "excess"),
+    "update",
     [
-        (ICEM(samples=256, iterations=5), 1.05),
-        (ICEM(samples=256, iterations=5, decay=1.25), 1.05),
-        (MPPI(samples=512, iterations=4, effective=0.05), 1.05),
+        ICEM(samples=256, iterations=5),
+        ICEM(samples=256, iterations=5, decay=1.25),
+        MPPI(samples=512, iterations=4, effective=0.05),
     ],
     ids=["icem", "icem with decay", "mppi"],
 )
-def test_cost_is_within_a_few_percent_of_riccati(update: object, excess: float) -> None:
+def test_cost_is_within_a_few_percent_of_riccati(update: object) -> None:
     optimal = riccati_cost(np.asarray(S0, float))
     cost = float(closed_loop(MPC(update), world(), S0, KEY))
-    assert 0.999 * optimal < cost < excess * optimal
+    assert 0.999 * optimal < cost < 1.05 * optimal
 
 
 def test_more_samples_are_not_much_worse() -> None:
@@ -234,8 +234,7 @@ def test_masked_returns_are_finite_and_last() -> None:
 
 def test_the_guard_judges_before_it_clips() -> None:
     w = world(Trap(jnp.asarray(jnp.inf), jnp.asarray(1.0)), state_bound=jnp.ones(2))
-    s, usable = w.step(S0, jnp.asarray([1.0]))
-    assert not usable
+    assert not w.step(S0, jnp.asarray([1.0]))[1]
     s, usable = w.step(10.0 * S0, jnp.asarray([-1.0]))
     assert usable
     np.testing.assert_allclose(s, [1.0, -0.1], rtol=1e-6)
