@@ -215,6 +215,7 @@ def multi_start(
     update: Callable[[Fit, Any], Any],
     *,
     rounds: int,
+    tolerance: float = 1e-10,
 ) -> tuple[Fit, Any, Float[Array, " starts"]]:
     """The best of several descents; then ``rounds`` of noise update and descent (EM).
 
@@ -223,7 +224,7 @@ def multi_start(
     """
 
     def descend(z: Array, noise: Any) -> Fit:
-        return minimise(lambda z: factor_of(z, noise), z)
+        return minimise(lambda z: factor_of(z, noise), z, tolerance=tolerance)
 
     shapes = jax.eval_shape(descend, starts[0], noise)
     best = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)

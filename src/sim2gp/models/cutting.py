@@ -1,0 +1,252 @@
+"""Logs become windows: consecutive ones to learn from, overlapping ones to be judged.
+
+The time column alone says when a row was taken; no rate is ever assumed. Each recorded
+input is held until the next row.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from sim2gp.errors import InputError
+from sim2gp.logs import Log
+from sim2gp.models.windows import Windows
+from sim2gp.systems.base import AbstractSystem
+
+MAX_SUBSTEP = 2e-3  # s
+HALF_WIDTH = 0.025  # s, half the span of the local parabola that guesses a start
+TOLERANCE = 0.05  # a substep may exceed its limit by this share of clock jitter
+
+
+def cut(
+    logs: Sequence[Log],
+    system: AbstractSystem,
+    *,
+    window: float,
+    start_sd: dict[str, float] | None = None,
+    floor: dict[str, float] | None = None,
+) -> tuple[Windows, list[tuple[int, int]]]:
+    """Windows of ``window`` seconds that use every row once, and (log, row) of each.
+
+    ``window = 0`` gives the one-step likelihood, which needs every state measured.
+    Raises `InputError` E116 where nothing can be cut, E103 where a state is missing.
+    """
+    measured = measured_states(logs, system, every=window == 0.0)
+    pieces = []
+    for k, log in enumerate(logs):
+        if window == 0.0:
+            _, mask = log.measured(measured)
+            whole = mask.all(axis=1)
+            rows = np.flatnonzero(whole[:-1] & whole[1:])
+            pieces += [(k, int(i), int(i) + 2) for i in rows]
+        else:
+            pieces += [(k, i, j) for i, j in _consecutive(log.time, window)]
+    pieces = [p for p in pieces if _has_data(logs[p[0]], measured, p)]
+    if not pieces:
+        raise InputError(
+            "E116",
+            "no window to learn from",
+            got=f"{sum(len(log) for log in logs)} rows",
+            expected=f"logs of at least {window:g} s",
+            fix="shorten likelihood.window, or record longer",
+        )
+    windows = assemble(logs, system, pieces, measured)
+    if window == 0.0:  # the first row is the start itself, not a measurement of it
+        start = np.zeros_like(windows.start)
+        start[:, windows.outputs] = windows.y[:, 0]
+        mask = windows.mask.copy()
+        mask[:, 0] = False
+        sd = np.zeros_like(start)
+        windows = dataclasses.replace(windows, start=start, start_sd=sd, mask=mask)
+    return _with_stated(windows, system, measured, start_sd, floor), [
+        (k, i) for k, i, _ in pieces
+    ]
+
+
+def measured_states(
+    logs: Sequence[Log], system: AbstractSystem, *, every: bool = False
+) -> list[str]:
+    """States that any log measures; with ``every``, all of them or E103."""
+    names = [channel.name for channel in system.physical_states]
+    measured = [name for name in names if any(name in log.channels for log in logs)]
+    missing = [name for name in names if name not in measured]
+    if (every and missing) or not measured:
+        raise InputError(
+            "E103",
+            "unmeasured state",
+            where="the one-step likelihood" if every else "the logs",
+            got=", ".join(measured) or "no state",
+            expected=f"also {', '.join(missing)}",
+            fix="set likelihood.window to some tenths of a second",
+        )
+    return measured
+
+
+def assemble(
+    logs: Sequence[Log],
+    system: AbstractSystem,
+    pieces: Sequence[tuple[int, int, int]],
+    measured: Sequence[str],
+) -> Windows:
+    """Padded windows of rows ``i .. j - 1`` of log ``k``, for each piece (k, i, j).
+
+    The start's prior is a local parabola's value and slope, with a spread far wider
+    than its error, so that the same rows are not believed twice.
+    """
+    actions = [channel.name for channel in system.actions]
+    names = [channel.name for channel in system.physical_states]
+    W, c, m = len(pieces), len(measured), len(actions)
+    inputs = [_knots(log, actions, system.longest_delay) for log in logs]
+    guesses = [_local_parabolas(log, measured) for log in logs]
+    steps = [_steps(log.time) for log in logs]
+    L = max(int(steps[k][0][j - 1] - steps[k][0][i]) + 1 for k, i, j in pieces)
+    ranges = []
+    for k, i, j in pieces:
+        since = logs[k].time[i] - system.longest_delay
+        first = int(np.searchsorted(inputs[k][0], since, side="right")) - 1
+        ranges.append((max(first, 0), j + 1))  # row r stands at knot r + 1
+    H = max(b - a for a, b in ranges)
+    y, mask = np.zeros((W, L, c)), np.zeros((W, L, c), bool)
+    span, knots = np.zeros((W, L)), np.zeros((W, H))
+    area, start = np.zeros((W, H, m)), np.zeros((W, len(names)))
+    for w, ((k, i, j), (a, b)) in enumerate(zip(pieces, ranges, strict=True)):
+        values, valid = logs[k].measured(measured)
+        row, spans = steps[k]
+        at = row[i:j] - row[i]
+        y[w, at], mask[w, at] = values[i:j], valid[i:j]
+        span[w, 1 : at[-1] + 1] = spans[row[i] : row[j - 1]]
+        knots[w, : b - a] = inputs[k][0][a:b] - logs[k].time[i]
+        knots[w, b - a :] = knots[w, b - a - 1] + np.arange(1.0, H - (b - a) + 1)
+        area[w] = inputs[k][1][np.minimum(np.arange(a, a + H), b - 1)]
+        area[w] -= inputs[k][1][i + 1]
+        start[w] = _start(names, measured, *guesses[k](i))
+    floor = np.asarray([_resolution(logs, name) for name in measured])
+    outputs = tuple(names.index(name) for name in measured)
+    spread = np.sqrt(np.mean(start**2, axis=0))
+    for index, resolution in zip(outputs, floor, strict=True):
+        spread[index] = 100.0 * resolution
+    spread = np.where(spread > 0.0, spread, 1.0)
+    sd = np.broadcast_to(spread, start.shape)
+    return Windows(y, mask, span, knots, area, start, sd, floor, outputs)
+
+
+def _with_stated(
+    windows: Windows,
+    system: AbstractSystem,
+    measured: Sequence[str],
+    start_sd: Mapping[str, float] | None,
+    floor: Mapping[str, float] | None,
+) -> Windows:
+    """What the user states replaces what was guessed from the data."""
+    names = [channel.name for channel in system.physical_states]
+    sd, quantum = windows.start_sd.copy(), windows.floor.copy()
+    for name, value in (start_sd or {}).items():
+        sd[:, names.index(name)] = value
+    for name, value in (floor or {}).items():
+        quantum[measured.index(name)] = value
+    return dataclasses.replace(windows, start_sd=sd, floor=quantum)
+
+
+def _consecutive(time: np.ndarray, window: float) -> list[tuple[int, int]]:
+    """Rows [i, j) of windows that do not overlap; a short rest is left out."""
+    slack = 0.5 * float(np.median(np.diff(time)))
+    out, i = [], 0
+    while i < len(time):
+        j = int(np.searchsorted(time, time[i] + window - slack))
+        if time[min(j, len(time) - 1)] - time[i] >= 0.5 * window - slack:
+            out.append((i, j))
+        i = max(j, i + 1)
+    return out
+
+
+def _has_data(log: Log, measured: Sequence[str], piece: tuple[int, int, int]) -> bool:
+    _, mask = log.measured(measured)
+    return bool(mask[piece[1] : piece[2]].any()) and piece[2] - piece[1] > 1
+
+
+def _steps(time: Float[np.ndarray, " N"]) -> tuple[np.ndarray, np.ndarray]:
+    """Integration steps of at most `MAX_SUBSTEP` that meet every stamp.
+
+    Returns each stamp's place among the steps' ends, and the steps' lengths.
+    """
+    gaps = np.diff(time)
+    count = np.maximum(1, np.ceil(gaps / MAX_SUBSTEP - TOLERANCE)).astype(int)
+    place = np.concatenate([[0], np.cumsum(count)])
+    return place, np.repeat(gaps / count, count)
+
+
+def _knots(
+    log: Log, actions: Sequence[str], delay: float
+) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, "K m"]]:
+    """Times and integral of the held inputs; before the log, its first input holds."""
+    u, t = log.commanded(actions), log.time
+    before = delay + 1.0
+    time = np.concatenate([[t[0] - before], t, [t[-1] + 1.0]])
+    held = np.concatenate([u[:1], u])
+    area = np.concatenate([0.0 * u[:1], np.cumsum(held * np.diff(time)[:, None], 0)])
+    return time, area
+
+
+def _local_parabolas(
+    log: Log, measured: Sequence[str]
+) -> Callable[[int], tuple[np.ndarray, np.ndarray]]:
+    """Value and slope of each measured channel at a row, from the rows around it."""
+    values, mask = log.measured(measured)
+
+    def at(i: int) -> tuple[np.ndarray, np.ndarray]:
+        t = log.time - log.time[i]
+        near = slice(
+            int(np.searchsorted(t, -HALF_WIDTH)),
+            int(np.searchsorted(t, HALF_WIDTH)) + 1,
+        )
+        value, slope = np.zeros(len(measured)), np.zeros(len(measured))
+        for c in range(len(measured)):
+            value[c], slope[c] = parabola(
+                t[near], values[near, c], mask[near, c], values[i, c]
+            )
+        return value, slope
+
+    return at
+
+
+def parabola(
+    t: Float[np.ndarray, " N"],
+    y: Float[np.ndarray, " N"],
+    valid: Bool[np.ndarray, " N"],
+    otherwise: float,
+) -> tuple[float, float]:
+    """Value and slope at ``t = 0`` of the least-squares parabola through ``y``."""
+    t, y = t[valid], y[valid]
+    if len(t) < 2:
+        return otherwise, 0.0
+    degree = min(2, len(t) - 1)
+    unit = max(float(np.abs(t).max()), 1e-12)
+    basis = (t[:, None] / unit) ** np.arange(degree + 1)
+    coefficients = np.linalg.lstsq(basis, y, rcond=None)[0]
+    return float(coefficients[0]), float(coefficients[1]) / unit
+
+
+def _start(
+    names: Sequence[str], measured: Sequence[str], value: np.ndarray, slope: np.ndarray
+) -> Float[np.ndarray, " n"]:
+    """The state at a row: measured values, and slopes for unmeasured velocities."""
+    known = dict(zip(measured, value, strict=True))
+    rates = {f"{name}.velocity": s for name, s in zip(measured, slope, strict=True)}
+    return np.asarray([known.get(name, rates.get(name, 0.0)) for name in names])
+
+
+def _resolution(logs: Sequence[Log], name: str) -> float:
+    """Standard deviation of the rounding: quantum / sqrt(12), or a share of the rms."""
+    recorded = [log for log in logs if name in log.channels]
+    y = np.concatenate([log.channels[name][log.mask[name]] for log in recorded])
+    if not len(y):
+        return 1.0
+    steps = np.diff(np.unique(y))
+    spread = float(np.std(y)) or 1.0
+    steps = steps[steps > 1e-9 * spread]  # what is closer is one number, printed twice
+    if len(steps) and len(steps) < 0.5 * len(y):
+        return float(np.median(steps)) / math.sqrt(12.0)
+    return 1e-4 * spread

@@ -1,0 +1,296 @@
+"""The likelihood of real logs: open-loop windows whose start states are unknown.
+
+A log is cut into windows that do not overlap. Within one, the machine is simulated from
+an unknown start state under the recorded inputs, and every measured sample is compared
+once with the simulation at its own time stamp:
+
+    y_j = x_out(t_j; theta, x0) + eps_j,    eps ~ N(0, diag(sig^2) / w)
+    x0  = m0 + S0 e,                        e ~ N(0, I)
+
+Velocities need not be measured, rates need not be known, rows may be missing. The start
+states are eliminated window by window (the arrowhead's arrows), so memory and time are
+linear in the data: with whitened rows,
+
+    [ J_e  J_z  r ]       [ R11  R12  c1 ]
+    [ I    0    e ]  = Q  [ 0    R22  c2 ]
+
+and the ``R22`` of all windows stack into the factor of ``z`` alone, exactly the Schur
+complement, without forming it. Each window's ``e`` is linearised along its own optimum,
+``e(z) = e* - R11^-1 R12 (z - z*)``, about the last descent's result; the elimination
+is one more Gauss-Newton step, so at a fixed point both are at their optimum. ``w`` is
+one Student-t weight per window (1 if off). ``window = 0`` is the paper's one-step
+likelihood: two rows, and ``S0 = 0``.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, Bool, Float
+
+from sim2gp.gaussian import LOG_2PI, Gaussian
+from sim2gp.least_squares import Factor, Fit, multi_start, triangular
+from sim2gp.systems.base import AbstractSystem, rk4
+from sim2gp.types import Key, Scalar, in_float64
+
+NOISE_ROUNDS = 5
+FREEDOM = 4.0  # degrees of freedom of the Student-t weight
+DESCENT = 1e-4  # tolerance of one descent; the undamped steps do the rest
+
+
+class Windows(eqx.Module):
+    """Padded windows, a row for each end of an integration step.
+
+    Row 0 is the start, padding rows have zero length, and a row without a sample (where
+    the clock left a gap too long for one step) has a false mask. ``span`` is the time
+    since the previous row, s. ``knots`` and ``area`` are the times and values at which
+    the integral of the held input bends; between them it is straight, so its mean over
+    any delayed interval is exact. ``outputs`` are the indices of the measured states,
+    ``floor`` the sensors' resolution.
+    """
+
+    y: Float[Array | np.ndarray, "W L c"]
+    mask: Bool[Array | np.ndarray, "W L c"]
+    span: Float[Array | np.ndarray, "W L"]
+    knots: Float[Array | np.ndarray, "W H"]
+    area: Float[Array | np.ndarray, "W H m"]
+    start: Float[Array | np.ndarray, "W n"]
+    start_sd: Float[Array | np.ndarray, "W n"]
+    floor: Float[Array | np.ndarray, " c"]
+    outputs: tuple[int, ...] = eqx.field(static=True)
+
+    def __len__(self) -> int:
+        return len(self.y)
+
+    def each(self, f: Callable[..., Any], *per_window: Any) -> Any:
+        """``f`` of one window (and of one row of each argument), for all windows."""
+        axes = eqx.tree_at(lambda w: w.floor, jax.tree.map(lambda _: 0, self), None)
+        return jax.vmap(f, in_axes=(axes, *[0] * len(per_window)))(self, *per_window)
+
+
+def inputs_of(window: Windows, delays: Float[Array, " m"]) -> Float[Array, "L m"]:
+    """Mean delayed input over the step that ends at each row of one window."""
+    end = jnp.cumsum(window.span)
+    # A row without length has no mean; its input does not matter but must be finite.
+    h = jnp.where(window.span > 0.0, window.span, 1.0)
+
+    def channel(area: Array, delay: Array) -> Array:
+        at = jnp.interp(end - delay, window.knots, area)
+        before = jnp.interp(-delay, window.knots, area)
+        return jnp.diff(at, prepend=before) / h
+
+    return jax.vmap(channel, in_axes=(1, 0), out_axes=1)(window.area, delays)
+
+
+def simulate(
+    system: AbstractSystem, params: Any, window: Windows, x0: Float[Array, " n"]
+) -> Float[Array, "L n"]:
+    """States at the rows of one window, from ``x0`` at its first."""
+
+    def step(x: Array, row: tuple[Array, Array]) -> tuple[Array, Array]:
+        h, u = row
+        x = rk4(lambda y, v: system.ode(params, y, v), x, u, h)
+        return x, x
+
+    inputs = inputs_of(window, system.delays(params))
+    return jax.lax.scan(step, x0, (window.span, inputs))[1]
+
+
+class WindowsBelief(eqx.Module):
+    """What logs say: a Gaussian over virtual parameters, and the noise of each sensor.
+
+    ``starts`` are the smoothed start states of the training windows.
+    """
+
+    system: AbstractSystem
+    prior: Gaussian
+    posterior: Gaussian
+    noise: Float[Array, " c"]
+    information: Float[Array, "p p"]  # factor of the data's Fisher, whitened by prior
+    weights: Float[Array, " W"]
+    starts: Float[Array, "W n"]
+    log_evidence: Scalar
+
+
+class _Noise(eqx.Module):
+    """What a descent holds fixed: noise, weights, and the starts' linearisation."""
+
+    sd: Float[Array, " c"]
+    weights: Float[Array, " W"]
+    z: Float[Array, " p"]
+    e: Float[Array, "W n"]
+    slope: Float[Array, "W n p"]  # de/dz along each window's optimum
+
+
+class _Elimination(eqx.Module):
+    """What remains of one window after its start state is eliminated."""
+
+    data: Factor  # of z
+    channels: Float[Array, "c p1 p1"]  # of z, for each channel, not whitened
+    spread: Float[Array, " c"]  # squares that the start state's own spread adds
+    squares: Float[Array, " c"]  # squared residuals at the best start state
+    log_det: Scalar
+    e: Float[Array, " n"]
+    slope: Float[Array, "n p"]
+
+
+class _Windowed(eqx.Module):
+    """The likelihood as least squares: per-window functions, vmapped at the edge."""
+
+    system: AbstractSystem
+    prior: Gaussian
+    windows: Windows
+
+    def residual(self, window: Windows, x: Float[Array, " pn"]) -> Float[Array, "L c"]:
+        """``prediction - y`` of one window at ``x = (z, e)``, zero where masked."""
+        p = self.prior.mean.size
+        tt = self.prior.mean + self.prior.scale @ x[:p]
+        params = self.system.record(self.system.parameters.values(tt))
+        x0 = window.start + window.start_sd * x[p:]
+        states = simulate(self.system, params, window, x0)
+        r = states[:, np.asarray(window.outputs)] - window.y
+        return jnp.where(window.mask, r, 0.0)
+
+    def eliminate(
+        self,
+        window: Windows,
+        weight: Scalar,
+        z: Float[Array, " p"],
+        e: Float[Array, " n"],
+        noise: Float[Array, " c"],
+    ) -> _Elimination:
+        """The QR of the module's equation, for one window."""
+        p, n, c = z.size, e.size, noise.size
+
+        def twice(x: Array) -> tuple[Array, Array]:
+            r = self.residual(window, x)
+            return r, r
+
+        J, r = jax.jacfwd(twice, has_aux=True)(jnp.concatenate([z, e]))
+        own, rest = J[..., p:], jnp.concatenate([J[..., :p], r[..., None]], axis=-1)
+        root = jnp.sqrt(weight)
+        data = jnp.concatenate([own, rest], axis=-1) * (root / noise)[:, None]
+        prior = jnp.concatenate([jnp.eye(n), jnp.zeros((n, p)), e[:, None]], axis=1)
+        R = triangular(jnp.concatenate([data.reshape(-1, n + p + 1), prior]))
+        R11, slope = R[:n, :n], solve_triangular(R[:n, :n], R[:n, n:])
+        reduced = rest - own @ slope
+        spread = solve_triangular(R11, own.reshape(-1, n).T, trans="T")
+        return _Elimination(
+            data=R[n:, n:],
+            channels=jax.vmap(triangular, in_axes=1)(root * reduced),
+            spread=weight * jnp.sum(spread.reshape(n, -1, c) ** 2, axis=(0, 1)),
+            squares=jnp.sum(reduced[..., -1] ** 2, axis=0),
+            log_det=jnp.sum(jnp.log(jnp.diag(R11))),
+            e=e - slope[:, -1],
+            slope=-slope[:, :-1],
+        )
+
+    def factor(
+        self, z: Float[Array, " p"], noise: _Noise
+    ) -> tuple[Factor, _Elimination]:
+        """Factor of all windows together, and what EM needs of each."""
+        each = self.windows.each(
+            lambda window, weight, e: self.eliminate(window, weight, z, e, noise.sd),
+            noise.weights,
+            noise.e + noise.slope @ (z - noise.z),
+        )
+        rows = jnp.moveaxis(each.channels, 1, 0).reshape(len(noise.sd), -1, z.size + 1)
+        each = eqx.tree_at(
+            lambda w: (w.channels, w.spread, w.log_det),
+            each,
+            (
+                jax.vmap(triangular)(rows),
+                jnp.sum(each.spread, axis=0),
+                jnp.sum(each.log_det),
+            ),
+        )
+        return triangular(each.data.reshape(-1, z.size + 1)), each
+
+
+@eqx.filter_jit
+def _fit(
+    system: AbstractSystem,
+    prior: Gaussian,
+    windows: Windows,
+    starts: Float[Array, "starts p"],
+    freedom: Scalar,
+) -> tuple[Fit, WindowsBelief]:
+    count = jnp.sum(windows.mask, axis=1)  # (W, c)
+    N = jnp.sum(count, axis=0)
+
+    def update(fit: Fit, _: _Noise) -> _Noise:
+        R = fit.aux.channels
+        squares = jnp.sum(R[:, :, -1] ** 2, axis=1) + fit.aux.spread
+        squares = squares + jnp.sum((R[:, :, :-1] @ fit.scale()) ** 2, axis=(1, 2))
+        sd = jnp.sqrt((2.0 * windows.floor**2 + squares) / (2.0 + N))
+        # E-step of the Student-t: an infinite number of degrees of freedom gives 1.
+        misfit = jnp.sum(fit.aux.squares / sd**2, axis=1)
+        weights = (1.0 + jnp.sum(count, 1) / freedom) / (1.0 + misfit / freedom)
+        return _Noise(sd, weights, fit.z, fit.aux.e, fit.aux.slope)
+
+    # Start from a large noise, so that the first MAP is not trapped.
+    mean = jnp.sum(jnp.where(windows.mask, windows.y, 0.0), axis=1)
+    mean = mean / jnp.maximum(count, 1)
+    away = jnp.where(windows.mask, windows.y - mean[:, None], 0.0)
+    sd = jnp.sqrt(jnp.sum(away**2, axis=(0, 1)) / jnp.maximum(N, 1)) + windows.floor
+    (W, n), p = windows.start.shape, prior.mean.size
+    weights, e, slope = jnp.ones(W), jnp.zeros((W, n)), jnp.zeros((W, n, p))
+    fit, noise, _ = multi_start(
+        _Windowed(system, prior, windows).factor,
+        starts,
+        _Noise(sd, weights, jnp.zeros(p), e, slope),
+        update,
+        rounds=NOISE_ROUNDS,
+        tolerance=DESCENT,
+    )
+    log_evidence = (
+        fit.log_joint()
+        - fit.aux.log_det
+        - jnp.sum(N * (jnp.log(noise.sd) + 0.5 * LOG_2PI))
+        + 0.5 * jnp.sum(jnp.sum(count, axis=1) * jnp.log(noise.weights))
+    )
+    belief = WindowsBelief(
+        system,
+        prior,
+        fit.posterior(prior),
+        noise.sd,
+        fit.data[:-1, :-1],
+        noise.weights,
+        windows.start + windows.start_sd * fit.aux.e,
+        log_evidence,
+    )
+    return fit, belief
+
+
+@in_float64
+def fit_windows(
+    system: AbstractSystem,
+    windows: Windows,
+    *,
+    key: Key,
+    prior: Gaussian | None = None,
+    robust: bool = False,
+    starts: int = 2,
+) -> WindowsBelief:
+    """Posterior of the constants given windows of logs.
+
+    Noise by EM, one Student-t weight per window where ``robust``. Raises
+    `NotConverged`, `NotFinite` or `DeadParameters`.
+    """
+    prior = system.parameters.prior() if prior is None else prior
+    p = prior.mean.size
+    spread = 0.7 * jax.random.normal(key, (starts - 1, p))
+    fit, belief = _fit(
+        system,
+        prior,
+        jax.tree.map(jnp.asarray, windows),
+        jnp.concatenate([jnp.zeros((1, p)), spread]),
+        jnp.asarray(FREEDOM if robust else jnp.inf),
+    )
+    names = system.parameters.names
+    fit.raise_unless_converged(names, f"{len(windows)} windows")
+    return belief
