@@ -87,9 +87,7 @@ def cartpole(
     l, m = p.pole_half_length, p.pole_mass
 
     def on_pole(r: Any) -> Callable[[Array], Array]:
-        return lambda q: (
-            (q[0] + r * jnp.sin(q[1])) * along - r * jnp.cos(q[1]) * normal
-        )
+        return lambda q: (q[0] + r * jnp.sin(q[1])) * along - r * jnp.cos(q[1]) * normal
 
     def cart(q: Array) -> Array:
         return q[0] * along

@@ -16,35 +16,30 @@ SPEEDS = {"rad": 8.0, "m": 1.5}
 
 def bare() -> dict[str, AbstractMechanism]:
     """The machines themselves."""
-    rods = sy.UniformRodArm()
     six = sy.UniformRodArm(sy.base.parameters_of(sy.UniformRodParams))
     return {
         "furuta": sy.Furuta(),
         "cartpole": sy.CartPole(),
         "two_link": sy.TwoLink(gravity=9.81),
         "horizontal": sy.TwoLink(coulomb_shape="arctangent"),
-        "rods": rods,
         "six": six,
         "locked": sy.UniformRodArm(locked=(True, False)),
     }
 
 
 def every() -> dict[str, AbstractSystem]:
-    """The machines, alone, with every effect of the catalogue, and with actuators."""
+    """The machines, alone, with all effects of the catalogue, and with actuators."""
     systems: dict[str, AbstractSystem] = dict(bare())
     for name in ("furuta", "cartpole"):
-        for what in sy.catalogue(name):
-            effect = sy.effect(name, what, "strong")
-            systems[f"{name}/{what}"] = sy.perturb(systems[name], [effect])
-    for name in ("furuta", "two_link"):
-        system = systems[name]
-        free = {
-            f"{c.name}.{q}": sy.actuator_prior(c, q)
-            for c in system.actions
-            for q in ("gain", "offset", "delay")
-        }
-        systems[f"{name}/actuated"] = sy.Actuated(system, free, delay_max=0.02)
-    return systems
+        effects = [sy.effect(name, what, "strong") for what in sy.catalogue(name)]
+        systems[f"{name}/all"] = sy.perturb(bare()[name], effects)
+    arm = bare()["two_link"]
+    free = {
+        f"{c.name}.{q}": sy.actuator_prior(c, q)
+        for c in arm.actions
+        for q in ("gain", "offset", "delay")
+    }
+    return systems | {"two_link/actuated": sy.Actuated(arm, free, delay_max=0.02)}
 
 
 def points(system: AbstractSystem, count: int, seed: int) -> Iterator[tuple[Any, ...]]:
@@ -60,6 +55,7 @@ def batch(system: AbstractSystem, count: int, seed: int) -> tuple[Array, ...]:
     tt = system.parameters.unconstrain(theta)[None] + 0.3 * rng.standard_normal(
         (count, len(theta))
     )
+    tt = _feasible(system, tt)
     high = np.array([c.high for c in system.actions])
     a = rng.uniform(-1.0, 1.0, (count, len(high))) * high
     columns = []
@@ -90,3 +86,21 @@ def nominal(system: AbstractSystem, **changes: float) -> Any:
 def jitted(system: AbstractSystem, dt: float) -> Any:
     """The step of (tt, s, a), compiled."""
     return jax.jit(lambda tt, s, a: system.transition(tt, s, a, dt))
+
+
+def _feasible(system: AbstractSystem, tt: Array) -> Array:
+    """Independent constants of an arm may give it a negative inertia: replace those."""
+    machine = getattr(system, "system", system)
+    if not isinstance(machine, sy.TwoLink):
+        return tt
+
+    def margin(t: Array, q2: float) -> Array:
+        p = machine.record(system.parameters.values(t))
+        M = machine.mass_matrix(p, jnp.array([0.0, q2]))
+        return 1.0 - M[0, 1] ** 2 / (M[0, 0] * M[1, 1])
+
+    least = jnp.minimum(
+        *(jax.vmap(lambda t, q=q: margin(t, q))(tt) for q in (0.0, np.pi))
+    )
+    good = least > 0.1
+    return jnp.where(good[:, None], tt, tt[jnp.argmax(good)][None])

@@ -30,7 +30,9 @@ def inertial(mass: float, place: tuple[Any, Any, Any], about: float | str) -> st
     return f'<inertial mass="{mass!r}" pos="{x!r} {y!r} {z!r}" diaginertia="{about}"/>'
 
 
-def furuta(p: dict[str, float], *, full_rod: bool = False, gravity: float = 9.81) -> str:
+def furuta(
+    p: dict[str, float], *, full_rod: bool = False, gravity: float = 9.81
+) -> str:
     """Arm about the vertical, pendulum about the arm; a motor on the arm."""
     k, l = p["motor_constant"], p["pendulum_length"] / 2
     Jr = p["arm_mass"] * p["arm_length"] ** 2 / 12
