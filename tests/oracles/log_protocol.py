@@ -26,6 +26,7 @@ SPACING = 50  # samples between the starts of two windows: 0.1 s
 FILTER_SAMPLES = 25
 FILTER_ORDER = 2
 FIRST = SPACING  # the first start: a multiple of 0.1 s with a full filter behind it
+HORIZONS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # s, of the error curve
 
 Array = np.ndarray
 Acceleration = Callable[[Array, Array, Array], Array]
@@ -48,7 +49,9 @@ class Gridded(NamedTuple):
     input: Array
 
 
-def read(path: Path, time: str, angles: Sequence[str], inputs: Sequence[str]):
+def read(
+    path: Path, time: str, angles: Sequence[str], inputs: Sequence[str]
+) -> Recording:
     """The columns of a csv file as a `Recording`; blanks in the header are dropped."""
     table = np.genfromtxt(path, delimiter=",", names=True, autostrip=True)
     return Recording(
@@ -169,7 +172,7 @@ def pooled_rms(error: Iterable[Array]) -> Array:
 def error_curve(
     acceleration: Acceleration,
     log: Gridded,
-    horizons: Sequence[float] = tuple(0.1 * k for k in range(1, 11)),
+    horizons: Sequence[float] = HORIZONS,
 ) -> Array:
     """Root mean square error (len(horizons), d) in rad at each horizon in s."""
     return np.stack([rms(errors(acceleration, log, h)) for h in horizons])

@@ -46,7 +46,7 @@ Model = Callable[[Array, Array, Array, Array], Array]
 """(parameters (p, B or 1), angle (B, d), velocity (B, d), input (B, m)) -> (B, d)."""
 
 
-def solve2(m11, m12, m22, f1, f2) -> Array:
+def solve2(m11: Array, m12: Array, m22: Array, f1: Array, f2: Array) -> Array:
     """The accelerations of two degrees of freedom, M^-1 f, closed form."""
     det = m11 * m22 - m12**2
     return np.stack([(m22 * f1 - m12 * f2) / det, (m11 * f2 - m12 * f1) / det], axis=1)
