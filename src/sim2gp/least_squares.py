@@ -34,6 +34,7 @@ Factor = Float[Array, "p1 p1"]
 
 CONVERGED, STALLED, NOT_FINITE = 0, 1, 2
 GRADIENT_TOLERANCE = 1e-8
+MAX_POLISH = 30  # undamped steps; under misfit they converge linearly, not in two
 RANK_TOLERANCE = 1e-8  # singular values below this share of the largest count as zero
 
 
@@ -179,29 +180,40 @@ def polish(
     factor_of: Callable[[Float[Array, " p"]], tuple[Factor, Any]],
     z: Float[Array, " p"],
     steps: Int[Array, ""],
-    *,
-    rounds: int = 2,
 ) -> Fit:
-    """Undamped QR steps, kept while they do not raise the cost; then the verdict."""
+    """Undamped QR steps, at least two and on to a zero gradient; then the verdict.
+
+    A step that improves nothing is halved: under misfit the Gauss-Newton step may be
+    too long along a flat direction, though never in the wrong direction.
+    """
     blank = jax.eval_shape(factor_of, z)
     data, aux = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), blank)
-    here = (z, data, aux, jnp.asarray(jnp.inf, z.dtype))
+    infinite = jnp.asarray(jnp.inf, z.dtype)
+    here = (z, data, aux, infinite, infinite)
 
-    def improve(carry: tuple, _: None) -> tuple[tuple, None]:
-        here, z_try = carry
+    def improve(carry: tuple) -> tuple:
+        here, z_try, length, count = carry
         data, aux = factor_of(z_try)
-        cost = _cost(with_prior(data, z_try))
+        full = with_prior(data, z_try)
+        there = (z_try, data, aux, _cost(full), _gradient(full))
         # Rounding in the cost must not refuse the last, gradient-only digits.
-        keep = cost <= here[3] * (1.0 + 1e-9) + 1e-12
-        there = (z_try, data, aux, cost)
+        slack = 1e-9 * here[3] + 1e-12
+        same = (there[3] <= here[3] + slack) & (there[4] < here[4])
+        keep = (there[3] < here[3] - slack) | same | (count == 0)
         here = jax.tree.map(lambda new, old: jnp.where(keep, new, old), there, here)
-        return (here, here[0] + gauss_newton_step(with_prior(here[1], here[0]))), None
+        length = jnp.where(keep, 1.0, 0.5 * length)
+        step = length * gauss_newton_step(with_prior(here[1], here[0]))
+        return here, here[0] + step, length, count + 1
 
-    (here, _), _ = jax.lax.scan(improve, (here, z), None, length=rounds + 1)
-    z, data, aux, cost = here
+    def unfinished(carry: tuple) -> Array:
+        here, _, _, count = carry
+        small = here[4] <= 0.1 * GRADIENT_TOLERANCE
+        return (count <= 2) | (~small & (count <= MAX_POLISH))
+
+    start = (here, z, jnp.ones((), z.dtype), jnp.zeros((), int))
+    here, _, _, _ = jax.lax.while_loop(unfinished, improve, start)
+    z, data, aux, cost, gradient = here
     full = with_prior(data, z)
-    gradient = jnp.max(jnp.abs(full[:-1, :-1].T @ full[:-1, -1]), initial=0.0)
-    gradient = gradient / (1.0 + cost)
     finite = jnp.isfinite(cost) & jnp.all(jnp.isfinite(full))
     status = jnp.where(gradient <= GRADIENT_TOLERANCE, CONVERGED, STALLED)
     status = jnp.where(finite, status, NOT_FINITE)
@@ -228,7 +240,8 @@ def multi_start(
 
     shapes = jax.eval_shape(descend, starts[0], noise)
     best = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
-    best = eqx.tree_at(lambda f: f.cost, best, jnp.asarray(jnp.inf, starts.dtype))
+    nothing = (jnp.asarray(jnp.inf), jnp.full_like(best.status, NOT_FINITE))
+    best = eqx.tree_at(lambda f: (f.cost, f.status), best, nothing)
 
     def turn(carry: tuple[Fit, Any], x: tuple[Array, Array]) -> tuple[tuple, Array]:
         best, noise = carry
@@ -281,3 +294,9 @@ def linear_posterior(
 
 def _cost(full: Factor) -> Scalar:
     return 0.5 * full[:, -1] @ full[:, -1]
+
+
+def _gradient(full: Factor) -> Scalar:
+    """``||g_z||_inf / (1 + cost)``, zero for a problem without parameters."""
+    g = full[:-1, :-1].T @ full[:-1, -1]
+    return jnp.max(jnp.abs(g), initial=0.0) / (1.0 + _cost(full))

@@ -130,9 +130,8 @@ class _Elimination(eqx.Module):
     """What remains of one window after its start state is eliminated."""
 
     data: Factor  # of z
-    channels: Float[Array, "c p1 p1"]  # of z, for each channel, not whitened
+    reduced: Float[Array, "L c p1"]  # rows of (z, r) with the start at its best
     spread: Float[Array, " c"]  # squares that the start state's own spread adds
-    squares: Float[Array, " c"]  # squared residuals at the best start state
     log_det: Scalar
     e: Float[Array, " n"]
     slope: Float[Array, "n p"]
@@ -181,9 +180,8 @@ class _Windowed(eqx.Module):
         spread = solve_triangular(R11, own.reshape(-1, n).T, trans="T")
         return _Elimination(
             data=R[n:, n:],
-            channels=jax.vmap(triangular, in_axes=1)(root * reduced),
-            spread=weight * jnp.sum(spread.reshape(n, -1, c) ** 2, axis=(0, 1)),
-            squares=jnp.sum(reduced[..., -1] ** 2, axis=0),
+            reduced=reduced,
+            spread=jnp.sum(spread.reshape(n, -1, c) ** 2, axis=(0, 1)),
             log_det=jnp.sum(jnp.log(jnp.diag(R11))),
             e=e - slope[:, -1],
             slope=-slope[:, :-1],
@@ -197,16 +195,6 @@ class _Windowed(eqx.Module):
             lambda window, weight, e: self.eliminate(window, weight, z, e, noise.sd),
             noise.weights,
             noise.e + noise.slope @ (z - noise.z),
-        )
-        rows = jnp.moveaxis(each.channels, 1, 0).reshape(len(noise.sd), -1, z.size + 1)
-        each = eqx.tree_at(
-            lambda w: (w.channels, w.spread, w.log_det),
-            each,
-            (
-                jax.vmap(triangular)(rows),
-                jnp.sum(each.spread, axis=0),
-                jnp.sum(each.log_det),
-            ),
         )
         return triangular(each.data.reshape(-1, z.size + 1)), each
 
@@ -222,13 +210,14 @@ def _fit(
     count = jnp.sum(windows.mask, axis=1)  # (W, c)
     N = jnp.sum(count, axis=0)
 
-    def update(fit: Fit, _: _Noise) -> _Noise:
-        R = fit.aux.channels
-        squares = jnp.sum(R[:, :, -1] ** 2, axis=1) + fit.aux.spread
-        squares = squares + jnp.sum((R[:, :, :-1] @ fit.scale()) ** 2, axis=(1, 2))
-        sd = jnp.sqrt((2.0 * windows.floor**2 + squares) / (2.0 + N))
+    def update(fit: Fit, noise: _Noise) -> _Noise:
+        J, r = fit.aux.reduced[..., :-1], fit.aux.reduced[..., -1]
+        squares = jnp.sum(r**2, axis=1)  # of each window and channel, as the next two
+        spread = fit.aux.spread + jnp.sum((J @ fit.scale()) ** 2, axis=(1, 3))
+        expected = noise.weights @ (squares + spread)
+        sd = jnp.sqrt((2.0 * windows.floor**2 + expected) / (2.0 + N))
         # E-step of the Student-t: an infinite number of degrees of freedom gives 1.
-        misfit = jnp.sum(fit.aux.squares / sd**2, axis=1)
+        misfit = jnp.sum(squares / sd**2, axis=1)
         weights = (1.0 + jnp.sum(count, 1) / freedom) / (1.0 + misfit / freedom)
         return _Noise(sd, weights, fit.z, fit.aux.e, fit.aux.slope)
 
@@ -249,7 +238,7 @@ def _fit(
     )
     log_evidence = (
         fit.log_joint()
-        - fit.aux.log_det
+        - jnp.sum(fit.aux.log_det)
         - jnp.sum(N * (jnp.log(noise.sd) + 0.5 * LOG_2PI))
         + 0.5 * jnp.sum(jnp.sum(count, axis=1) * jnp.log(noise.weights))
     )

@@ -1,0 +1,1 @@
+"""What the commands run: each module is one experiment, each writes one run."""

@@ -1,0 +1,12 @@
+"""How data become a belief over dynamics."""
+
+from sim2gp.models.base import AbstractBelief as AbstractBelief
+from sim2gp.models.base import AbstractModel as AbstractModel
+from sim2gp.models.base import PointEstimate as PointEstimate
+from sim2gp.models.base import PriorMean as PriorMean
+from sim2gp.models.cutting import cut as cut
+from sim2gp.models.sim2gp import Sim2GP as Sim2GP
+from sim2gp.models.sim2gp import Sim2GPBelief as Sim2GPBelief
+from sim2gp.models.windows import Windows as Windows
+from sim2gp.models.windows import WindowsBelief as WindowsBelief
+from sim2gp.models.windows import fit_windows as fit_windows
