@@ -1,0 +1,92 @@
+"""Which constants do the data determine, how well, and which combinations they leave.
+
+Everything follows from four things that every belief about parameters has: the table,
+the prior ``N(mu0, L0 L0^T)``, the posterior, and a factor ``A`` of the data's Fisher
+information whitened by the prior,
+
+    tt = mu0 + L0 z,      H = L0^T F L0 = A^T A = sum_k l_k v_k v_k^T,
+
+so that ``l_k`` is what the data know of direction ``v_k`` in units of what the prior
+knew: ``1/2 log(1 + l_k)`` nats. Verdicts compare sd of *virtual* values, where prior
+and posterior are Gaussian; moments and quantiles are reported in physical units.
+"""
+
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from sim2gp.diagnose.base_parameters import base_parameters
+from sim2gp.diagnose.conflicts import prior_conflicts
+from sim2gp.diagnose.directions import directions
+from sim2gp.diagnose.spectrum import FisherAt, Spectrum, spectrum
+from sim2gp.diagnose.table import parameter_table
+from sim2gp.gaussian import Gaussian
+from sim2gp.parameters import Parameters
+from sim2gp.types import Key, in_float64
+
+__all__ = [
+    "FisherAt",
+    "Spectrum",
+    "arrays",
+    "base_parameters",
+    "directions",
+    "parameter_table",
+    "prior_conflicts",
+    "spectrum",
+    "summary",
+]
+
+
+@in_float64
+def summary(
+    parameters: Parameters,
+    prior: Gaussian,
+    posterior: Gaussian,
+    information: Float[Array, "r p"],
+    *,
+    fisher_at: FisherAt | None = None,
+) -> dict[str, Any]:
+    """What summary.json says about the parameters, in physical units and in words.
+
+    ``information`` is the factor ``A`` at the MAP; ``fisher_at(tt)`` the same factor at
+    another virtual vector, which tells combinations that hold everywhere from those
+    that hold at the MAP only ("locally").
+    """
+    spec = spectrum(parameters, prior, posterior, information)
+    return {
+        "parameters": parameter_table(spec),
+        "rank": spec.rank,
+        "directions": directions(spec),
+        "base_parameters": base_parameters(spec, fisher_at),
+        "prior_conflicts": prior_conflicts(spec),
+    }
+
+
+@in_float64
+def arrays(
+    parameters: Parameters,
+    prior: Gaussian,
+    posterior: Gaussian,
+    *,
+    key: Key,
+    count: int = 2000,
+) -> dict[str, np.ndarray]:
+    """Draws of prior and posterior in physical units, and posterior correlations.
+
+    Correlations are those of the virtual values; the maps are increasing, so they are
+    the physical ones wherever the posterior is narrow.
+    """
+
+    def physical(gaussian: Gaussian, key: Key) -> np.ndarray:
+        tt = jax.vmap(gaussian.sample)(jax.random.split(key, count))
+        return np.asarray(jax.vmap(parameters.constrain)(tt))
+
+    before, after = jax.random.split(key)
+    unit = np.asarray(posterior.scale) / np.asarray(posterior.sd())[:, None]
+    return {
+        "parameters/prior_samples": physical(prior, before),
+        "parameters/samples": physical(posterior, after),
+        "parameters/correlation": np.clip(unit @ unit.T, -1.0, 1.0),
+    }
