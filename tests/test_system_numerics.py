@@ -40,12 +40,9 @@ def test_friction_has_finite_gradients_at_any_slope_and_speed(law, dtype):
 def test_smoothing_width_may_be_a_parameter(dtype):
     for width in (1e-12, 1.0, 1e12):
         for v in (0.0, 1e-3, 1e6, 1e30):
-            slope = jax.grad(coulomb, 2)(
-                jnp.asarray(v, dtype),
-                jnp.asarray(1.0, dtype),
-                jnp.asarray(width, dtype),
-            )
-            assert np.isfinite(slope)
+            arguments = [jnp.asarray(x, dtype) for x in (v, 1.0, width)]
+            for mode in (jax.jacfwd, jax.jacrev):  # 0 * inf comes in by either way
+                assert np.isfinite(mode(coulomb, 2)(*arguments))
 
 
 def test_friction_laws():

@@ -43,25 +43,25 @@ STATES = (
 
 
 class TwoLinkParams(eqx.Module):
-    """Constants of an arm of desk to human size; every box spans two to four decades.
+    """Constants of an arm of desk to human size; boxes of about two to four decades.
 
     A fixed base leaves ``m2``, ``m1r1`` and ``I1`` collinear: only ``m1r1 + l1 m2`` and
     ``I1 + l1^2 m2`` act. Without rotors the inertia matrix is positive definite where
-    ``(I1 + l1^2 m2) I2 > (l1 m2r2)^2``, which independent boxes cannot say.
+    ``(I1 + l1^2 m2) I2 > (l1 m2r2)^2``, which independent boxes cannot say (9 prior draws in 100 break it).
     """
 
     m1r1: Scalar = log_bounded(
         0.01, 1.0, "kg m", "first moment of link 1 about joint 1", nominal=0.15173
     )
     I1: Scalar = log_bounded(
-        1e-3, 1.0, "kg m^2", "inertia of link 1 about joint 1", nominal=0.042112
+        5e-3, 1.0, "kg m^2", "inertia of link 1 about joint 1", nominal=0.042112
     )
-    m2: Scalar = log_bounded(0.05, 5.0, "kg", "mass of link 2", nominal=0.33694)
+    m2: Scalar = log_bounded(0.1, 5.0, "kg", "mass of link 2", nominal=0.33694)
     m2r2: Scalar = log_bounded(
-        0.01, 1.0, "kg m", "first moment of link 2 about joint 2", nominal=0.15783
+        0.01, 0.5, "kg m", "first moment of link 2 about joint 2", nominal=0.15783
     )
     I2: Scalar = log_bounded(
-        1e-3, 1.0, "kg m^2", "inertia of link 2 about joint 2", nominal=0.051035
+        5e-3, 1.0, "kg m^2", "inertia of link 2 about joint 2", nominal=0.051035
     )
     b1: Scalar = log_bounded(
         1e-4, 1.0, "N m s/rad", "viscous friction of joint 1", nominal=3.6909e-3
