@@ -47,7 +47,8 @@ class TwoLinkParams(eqx.Module):
 
     A fixed base leaves ``m2``, ``m1r1`` and ``I1`` collinear: only ``m1r1 + l1 m2`` and
     ``I1 + l1^2 m2`` act. Without rotors the inertia matrix is positive definite where
-    ``(I1 + l1^2 m2) I2 > (l1 m2r2)^2``, which independent boxes cannot say (9 prior draws in 100 break it).
+    ``(I1 + l1^2 m2) I2 > (l1 m2r2)^2``, which independent boxes cannot say: 9 prior
+    draws in 100 break it.
     """
 
     m1r1: Scalar = log_bounded(
