@@ -30,8 +30,9 @@ from sim2gp.systems.base import AbstractSystem
 from sim2gp.transitions import Transitions
 from sim2gp.types import Action, Dynamics, Key, Scalar, State, in_float64
 
-NOISE_ROUNDS = 6  # EM; the last change of sig is below 1e-3 relative from here on
-STARTS = 8
+NOISE_ROUNDS = 5  # EM; the last change of sig is below 1e-3 relative from here on
+STARTS = 4
+DESCENT = 1e-4  # tolerance of one descent; the undamped steps do the rest
 FLOOR = 1e-3  # prior guess of the noise, relative to each channel's rms change
 
 
@@ -234,9 +235,9 @@ class _OneStep(eqx.Module):
 def _fit(
     model: Sim2GP, data: Transitions, starts: Float[Array, "starts p"]
 ) -> tuple[Fit, Sim2GPBelief]:
-    d, N = len(model.system.physical_states), jnp.sum(data.mask)
+    d, N = len(model.system.physical_states), jnp.sum(data.mask, dtype=float)
     y = jnp.where(data.mask[:, None], data.delta()[:, :d], 0.0)
-    change = jnp.sqrt(jnp.sum(y**2, axis=0) / jnp.maximum(N, 1))
+    change = jnp.sqrt(jnp.sum(y**2, axis=0) / jnp.maximum(N, 1.0))
     change = jnp.where(change > 0.0, change, 1.0)
 
     def update(fit: Fit, _: Array) -> Array:
@@ -249,7 +250,12 @@ def _fit(
     # Start from a large noise, so that the first MAP is not trapped.
     likelihood = _OneStep(model, data)
     fit, noise, _ = multi_start(
-        likelihood.factor, starts, change, update, rounds=NOISE_ROUNDS
+        likelihood.factor,
+        starts,
+        change,
+        update,
+        rounds=NOISE_ROUNDS,
+        tolerance=DESCENT,
     )
     normaliser = N * jnp.sum(jnp.log(noise) + 0.5 * LOG_2PI)
     belief = Sim2GPBelief(
@@ -259,7 +265,7 @@ def _fit(
         noise,
         fit.data[:-1, :-1],
         fit.log_joint() - normaliser,
-        N,
+        jnp.sum(data.mask),
         model.dt,
         model.linear,
     )
@@ -298,7 +304,7 @@ def _hessian(belief: Sim2GPBelief, data: Transitions) -> Float[Array, "p p"]:
     likelihood = _OneStep(model, data)
 
     def loss(z: Array) -> Scalar:
-        r = likelihood.rows(z)[0] / belief.noise
+        r = likelihood.rows(z)[0] / belief.noise[None]
         return 0.5 * jnp.sum(r**2) + 0.5 * z @ z
 
     offset = belief.posterior.mean - belief.prior.mean

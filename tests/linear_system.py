@@ -1,0 +1,60 @@
+"""A machine whose step is linear in its constants, with any Jacobian one likes.
+
+    s' = s + A tt,    A (d, p) being the action, flattened
+
+so that the Laplace posterior of its constants is exact Bayesian linear regression.
+"""
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from sim2gp.parameters import Parameter, Parameters
+from sim2gp.systems import AbstractSystem, Channel
+from sim2gp.transitions import Transitions
+
+
+class Linear(AbstractSystem):
+    """``d`` outputs; as many constants as the table has, of whatever map."""
+
+    parameters: Parameters = eqx.field(static=True)
+    d: int = eqx.field(static=True)
+
+    max_substep: ClassVar[float] = 1.0
+    history: ClassVar[int] = 0
+    longest_delay: ClassVar[float] = 0.0
+
+    @property
+    def states(self) -> tuple[Channel, ...]:
+        return tuple(Channel(f"x{i}", "m") for i in range(self.d))
+
+    @property
+    def actions(self) -> tuple[Channel, ...]:
+        count = self.d * len(self.parameters)
+        return tuple(Channel(f"a{i}", "m") for i in range(count))
+
+    def record(self, values: Mapping[str, Array]) -> Array:
+        return jnp.stack([values[name] for name in self.parameters.names])
+
+    def ode(self, params: Array, s: Array, a: Array) -> Array:
+        return a.reshape(self.d, -1) @ params
+
+    def delays(self, params: Array) -> Array:
+        return jnp.zeros(len(self.actions))
+
+
+def linear(p: int, d: int, kind: str = "identity", **spec: float) -> Linear:
+    free = tuple(
+        Parameter(f"k{i}", "1", "slope", kind, mean=0.0, sd=1.0, **spec)
+        for i in range(p)
+    )
+    return Linear(Parameters(free), d)
+
+
+def transitions(J: np.ndarray, y: np.ndarray) -> Transitions:
+    """From rest at zero: the increments are ``y`` to the last bit."""
+    return Transitions.of(np.zeros_like(y), J.reshape(len(J), -1), y)
