@@ -18,7 +18,7 @@ import scipy.linalg
 import scipy.stats
 from jaxtyping import Array, Float
 
-from sim2gp.errors import InputError
+from sim2gp.errors import InputError, NotConverged
 from sim2gp.experiments.two_link_study import DT, LEVELS, covered, record
 from sim2gp.gaussian import Gaussian
 from sim2gp.least_squares import linear_posterior
@@ -318,7 +318,11 @@ def arm(rng: Rng) -> float:
         draw, excite, fit = jax.random.split(key, 3)
         truth = model.prior.sample(draw)
         data = record(system, truth, key=excite).transitions()
-        mean, sd = model.fit(model.init(fit), data, key=fit).parameters()
+        try:
+            mean, sd = model.fit(model.init(fit), data, key=fit).parameters()
+        except NotConverged:
+            z.append(np.full(truth.size, np.inf))  # an arm that no interval covers
+            continue
         z.append(np.asarray((truth - mean) / sd))
     worst = 1.0
     for level in LEVELS:

@@ -60,10 +60,10 @@ class Study(eqx.Module):
     posterior2: Sim2GPBelief
 
     @property
-    def z(self) -> Float[Array, " p"]:
+    def z(self) -> Float[np.ndarray, " p"]:
         """Errors after both data sets, in posterior sd."""
-        mean, sd = self.posterior2.parameters()
-        return (mean - self.truth) / sd
+        mean, sd = (np.asarray(x) for x in self.posterior2.parameters())
+        return (mean - np.asarray(self.truth)) / sd
 
 
 @in_float64
@@ -137,7 +137,7 @@ def coverage_study(
                 sd.append(np.asarray(prior.sd()))
                 task.advance(f"arm {seed}: {error.code}")
                 continue
-            z.append(np.asarray(study.z))
+            z.append(study.z)
             sd.append(np.asarray(study.posterior2.parameters()[1]))
             task.advance()
     return {"truth": np.stack(truth), "z": np.stack(z), "sd": np.stack(sd)}, failed
