@@ -34,7 +34,9 @@ Factor = Float[Array, "p1 p1"]
 
 CONVERGED, STALLED, NOT_FINITE = 0, 1, 2
 GRADIENT_TOLERANCE = 1e-8
-MAX_POLISH = 30  # undamped steps; under misfit they converge linearly, not in two
+#: Undamped steps. Under misfit, and where a bound saturates (measured: by 0.9 a step),
+#: they converge linearly, not in two.
+MAX_POLISH = 200
 RANK_TOLERANCE = 1e-8  # singular values below this share of the largest count as zero
 
 
@@ -143,13 +145,14 @@ def minimise(
     factor_of: Callable[[Float[Array, " p"]], tuple[Factor, Any]],
     z: Float[Array, " p"],
     *,
-    max_steps: int = 100,
+    max_steps: int = 60,
     tolerance: float = 1e-10,
+    exact: bool | Bool[Array, ""] = True,
 ) -> Fit:
     """One Levenberg-Marquardt descent, finished by undamped QR steps.
 
     ``factor_of(z)`` is the factor of the whitened data residual and its Jacobian, and
-    whatever the caller wants back at the MAP.
+    whatever the caller wants back at the MAP. ``exact`` asks for a zero gradient.
     """
 
     def full_of(z: Array) -> Factor:
@@ -173,15 +176,18 @@ def minimise(
         max_steps=max_steps,
         throw=False,
     )
-    return polish(factor_of, solution.value, solution.stats["num_steps"])
+    steps = solution.stats["num_steps"]
+    return polish(factor_of, solution.value, steps, exact=exact)
 
 
 def polish(
     factor_of: Callable[[Float[Array, " p"]], tuple[Factor, Any]],
     z: Float[Array, " p"],
     steps: Int[Array, ""],
+    *,
+    exact: bool | Bool[Array, ""] = True,
 ) -> Fit:
-    """Undamped QR steps, at least two and on to a zero gradient; then the verdict.
+    """Undamped QR steps: two, or where ``exact`` on to a zero gradient; the verdict.
 
     A step that improves nothing is halved: under misfit the Gauss-Newton step may be
     too long along a flat direction, though never in the wrong direction.
@@ -206,9 +212,10 @@ def polish(
         return here, here[0] + step, length, count + 1
 
     def unfinished(carry: tuple) -> Array:
-        here, _, _, count = carry
+        here, _, length, count = carry
         small = here[4] <= 0.1 * GRADIENT_TOLERANCE
-        return (count <= 2) | (~small & (count <= MAX_POLISH))
+        hopeless = ~jnp.isfinite(here[3]) | (length < 1e-6) | (count > MAX_POLISH)
+        return (count <= 2) | (exact & ~small & ~hopeless)
 
     start = (here, z, jnp.ones((), z.dtype), jnp.zeros((), int))
     here, _, _, _ = jax.lax.while_loop(unfinished, improve, start)
@@ -235,23 +242,25 @@ def multi_start(
     Returns the fit, its noise, and the cost that each start reached.
     """
 
-    def descend(z: Array, noise: Any) -> Fit:
-        return minimise(lambda z: factor_of(z, noise), z, tolerance=tolerance)
+    def descend(z: Array, noise: Any, exact: Array) -> Fit:
+        return minimise(
+            lambda z: factor_of(z, noise), z, tolerance=tolerance, exact=exact
+        )
 
-    shapes = jax.eval_shape(descend, starts[0], noise)
+    shapes = jax.eval_shape(descend, starts[0], noise, jnp.asarray(True))
     best = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
     nothing = (jnp.asarray(jnp.inf), jnp.full_like(best.status, NOT_FINITE))
     best = eqx.tree_at(lambda f: (f.cost, f.status), best, nothing)
 
-    def turn(carry: tuple[Fit, Any], x: tuple[Array, Array]) -> tuple[tuple, Array]:
+    def turn(carry: tuple[Fit, Any], x: tuple[Array, ...]) -> tuple[tuple, Array]:
         best, noise = carry
-        start, searching = x
+        start, searching, last = x
 
         def pick(yes: Any, no: Any) -> Any:
             return jax.tree.map(lambda y, n: jnp.where(searching, y, n), yes, no)
 
         noise = pick(noise, update(best, noise))
-        fit = descend(jnp.where(searching, start, best.z), noise)
+        fit = descend(jnp.where(searching, start, best.z), noise, last)
         # A cost that is not finite never wins; a comparison with NaN is false.
         better = jnp.where(searching, fit.cost < best.cost, True)
         best = jax.tree.map(lambda new, old: jnp.where(better, new, old), fit, best)
@@ -259,8 +268,9 @@ def multi_start(
 
     count = len(starts)
     schedule = jnp.concatenate([starts, jnp.zeros((rounds, starts.shape[1]))])
-    searching = jnp.arange(count + rounds) < count
-    (fit, noise), costs = jax.lax.scan(turn, (best, noise), (schedule, searching))
+    turns = jnp.arange(count + rounds)
+    plan = (schedule, turns < count, turns == count + rounds - 1)
+    (fit, noise), costs = jax.lax.scan(turn, (best, noise), plan)
     return fit, noise, costs[:count]
 
 

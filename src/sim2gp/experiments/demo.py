@@ -16,8 +16,8 @@ import numpy as np
 
 from sim2gp import diagnose
 from sim2gp.experiments.record import provenance
-from sim2gp.loops import AcceptedTruth, History, accept_truth, psrl
-from sim2gp.models import PointEstimate, PriorMean, Sim2GP, Sim2GPBelief
+from sim2gp.loops import AcceptedTruth, Episode, History, accept_truth, psrl
+from sim2gp.models import AbstractModel, PointEstimate, PriorMean, Sim2GP, Sim2GPBelief
 from sim2gp.planning import MPC
 from sim2gp.runs import Progress, new_run
 from sim2gp.systems import CartPole, Furuta
@@ -30,6 +30,7 @@ from sim2gp.tasks import (
     hanging_return,
     score,
 )
+from sim2gp.types import Key
 
 MACHINES: dict[str, tuple[Callable[[], AbstractSystem], Callable[[Any], Task]]] = {
     "furuta": (Furuta, furuta_swingup),
@@ -70,7 +71,7 @@ def run(
     make, preset = MACHINES[machine]
     system = make()
     model = Sim2GP(system)
-    learners = {
+    learners: dict[str, AbstractModel] = {
         LEARNER: model,
         "point estimate": PointEstimate(model),
         "prior mean": PriorMean(model),
@@ -83,19 +84,7 @@ def run(
                 key = jax.random.key(s)
                 accepted = accept_truth(preset, system, MPC(), key=key)
                 task.advance(f"seed {s}: oracle {accepted.oracle.oracle_return:.0f}")
-                histories = {}
-                for name, learner in learners.items():
-                    histories[name] = psrl(
-                        accepted.task,
-                        learner,
-                        MPC(),
-                        episodes=episodes,
-                        key=key,
-                        on_episode=lambda e, name=name: task.advance(  # type: ignore[misc]
-                            f"{name}, episode {e.index}: "
-                            f"return {float(e.trajectory.total):.0f}"
-                        ),
-                    )
+                histories = _race(accepted.task, learners, episodes, key, task.advance)
                 runs.append(SeedRun(accepted, hanging_return(accepted.task), histories))
         summary, arrays = _summarise(system, machine, runs, seed, episodes)
         summary |= provenance(
@@ -109,6 +98,30 @@ def run(
         writer.write_arrays("arrays.npz", arrays)
         writer.write_text("report.html", write_report(summary, arrays))
     return summary
+
+
+def _race(
+    task: Task,
+    learners: dict[str, AbstractModel],
+    episodes: int,
+    key: Key,
+    advance: Callable[[str], None],
+) -> dict[str, History]:
+    """Every learner on the same machine, under the same noise."""
+
+    def told(name: str) -> Callable[[Episode], None]:
+        def tell(episode: Episode) -> None:
+            total = float(episode.trajectory.total)
+            advance(f"{name}, episode {episode.index}: return {total:.0f}")
+
+        return tell
+
+    return {
+        name: psrl(
+            task, learner, MPC(), episodes=episodes, key=key, on_episode=told(name)
+        )
+        for name, learner in learners.items()
+    }
 
 
 def _summarise(
