@@ -52,7 +52,7 @@ def test_moments_agree_with_monte_carlo():
     assert np.all(np.abs(inside - 0.95) < 4.0 * math.sqrt(0.95 * 0.05 / n))
 
 
-@pytest.mark.parametrize("sd", [1e-6, 0.3, 2.5])
+@pytest.mark.parametrize("sd", [1e-6, 0.3, 6.0])
 def test_moments_in_closed_form(sd):
     free = (Parameter("a", "", "", "identity"), Parameter("b", "", "", "log"))
     mean, spread = np.array([1e3, -1.0]), np.array([1e4 * sd, sd])

@@ -29,6 +29,15 @@ def value_of(text, values):
     return total
 
 
+def move_of(direction, names):
+    """The physical move that a direction's combination prints."""
+    which, _, amounts = direction["combination"].partition(" = ")
+    move = dict.fromkeys(names, 0.0)
+    for name, amount in zip(which.split(" : "), amounts.split(" : "), strict=True):
+        move[name] = float((amount or "1").split()[0])
+    return np.asarray(list(move.values()))
+
+
 def mass_gravity_length():
     """A pendulum's torque: mass, gravity and length act as one product."""
     table = named("mass gravity length damping", "log", sd=0.5, low=0.0)
@@ -125,6 +134,11 @@ def test_unidentified_truth_is_said(case, count):
             assert text.endswith(" (locally)") == (seed >= 3)
             moved = same(dict(zip(table.names, spec.theta.tolist(), strict=True)))
             assert entry["value"] == pytest.approx(value_of(text, moved), rel=1e-9)
+        # The moves that are printed are invisible, up to their four digits.
+        for direction in open_:
+            dz = move_of(direction, table.names) / (spec.slope * spec.prior_sd)
+            seen = np.linalg.norm(spec.factor @ dz)
+            assert seen <= 1e-3 * np.sum(np.linalg.norm(spec.factor, axis=0) * abs(dz))
         # What the data leave open keeps the prior's sd.
         kept = spec.directions.T @ spec.whitened()[1]
         kept = np.sqrt(np.sum(kept**2, axis=1))[spec.null]
@@ -206,6 +220,20 @@ def test_base_parameter_is_the_product_of_the_posterior():
         base["unit"]
         == {"k / R^0.5": "V s ohm^-0.5", "R / k^2": "ohm V^-2 s^-2"}[base["text"]]
     )
+    # By differences through the map: the sd of a product is not that of its logarithm.
+    powers = {"k / R^0.5": (1.0, -0.5), "R / k^2": (-2.0, 1.0)}[base["text"]]
+    gradient = []
+    for step in 1e-5 * np.eye(2):
+        with jax.enable_x64(True):
+            up, down = (table.constrain(jnp.asarray(tt + d)) for d in (step, -step))
+        change = [
+            float(np.prod(np.asarray(x) ** np.asarray(powers))) for x in (up, down)
+        ]
+        gradient.append((change[0] - change[1]) / 2e-5)
+    belief = believe(table, fisher_at(tt), tt)
+    for key, gaussian in (("prior_sd", belief[1]), ("sd", belief[2])):
+        want = np.linalg.norm(np.asarray(gradient) @ np.asarray(gaussian.scale))
+        assert base[key] == pytest.approx(want, rel=1e-4)
     assert base["sd"] < 1e-2 * base["prior_sd"]
     assert base["verdict"] == "identified"
     assert draws["parameters/samples"].shape == (2000, 2)

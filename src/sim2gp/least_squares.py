@@ -169,7 +169,7 @@ def minimise(
         full = full_of(primals[0])
         return full[:, -1], full[:, :-1] @ tangents[0]
 
-    solution = optx.least_squares(
+    solution: Any = optx.least_squares(
         lambda z, _: compressed(z),
         optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance),
         z,

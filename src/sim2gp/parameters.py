@@ -273,7 +273,7 @@ class Parameters(eqx.Module):
         return values | {p.name: theta[i] for i, p in enumerate(self.free)}
 
     def prior(self) -> Gaussian:
-        """The independent Gaussian over virtual values (float64 inside `in_float64`)."""
+        """The independent Gaussian over virtual values; call it under `in_float64`."""
         mean = jnp.asarray([p.mean for p in self.free], float)
         return Gaussian(mean, jnp.diag(jnp.asarray([p.sd for p in self.free], float)))
 

@@ -11,16 +11,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from sim2gp.types import AnyArray
+
 logger = logging.getLogger(__name__)
 
 
 class Transitions(eqx.Module):
     """Rows of ``(state, action, next_state)``; rows with a false mask do not exist."""
 
-    state: Float[Array | np.ndarray, "capacity n"]
-    action: Float[Array | np.ndarray, "capacity m"]
-    next_state: Float[Array | np.ndarray, "capacity n"]
-    mask: Bool[Array | np.ndarray, " capacity"]
+    state: Float[AnyArray, "capacity n"]
+    action: Float[AnyArray, "capacity m"]
+    next_state: Float[AnyArray, "capacity n"]
+    mask: Bool[AnyArray, " capacity"]
 
     @classmethod
     def empty(cls, capacity: int, n: int, m: int) -> "Transitions":
@@ -32,9 +34,9 @@ class Transitions(eqx.Module):
     @classmethod
     def of(
         cls,
-        state: Float[Array | np.ndarray, "N n"],
-        action: Float[Array | np.ndarray, "N m"],
-        next_state: Float[Array | np.ndarray, "N n"],
+        state: Float[AnyArray, "N n"],
+        action: Float[AnyArray, "N m"],
+        next_state: Float[AnyArray, "N n"],
     ) -> "Transitions":
         """Exactly these transitions, at a capacity of their number."""
         n, m = np.shape(state)[1], np.shape(action)[1]
@@ -48,9 +50,9 @@ class Transitions(eqx.Module):
 
     def extend(
         self,
-        state: Float[Array | np.ndarray, "N n"],
-        action: Float[Array | np.ndarray, "N m"],
-        next_state: Float[Array | np.ndarray, "N n"],
+        state: Float[AnyArray, "N n"],
+        action: Float[AnyArray, "N m"],
+        next_state: Float[AnyArray, "N n"],
     ) -> "Transitions":
         """These transitions and more; the capacity doubles as often as needed."""
         count, new = self.count, len(state)
@@ -60,7 +62,7 @@ class Transitions(eqx.Module):
         if capacity != len(self.mask):
             logger.info("transitions: capacity %d -> %d", len(self.mask), capacity)
 
-        def put(old: Array | np.ndarray, add: Array | np.ndarray) -> np.ndarray:
+        def put(old: AnyArray, add: AnyArray) -> np.ndarray:
             out = np.zeros((capacity, *np.shape(old)[1:]), np.float64)
             out[:count] = np.asarray(old)[:count]
             out[count : count + new] = np.asarray(add)

@@ -7,16 +7,23 @@ float32; `in_float64` is the one door between them.
 
 from collections.abc import Callable
 from functools import wraps
-from typing import ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 State = Float[Array, " n"]
 Action = Float[Array, " m"]
 Scalar = Float[Array, ""]
 Key = PRNGKeyArray
+
+if TYPE_CHECKING:
+    #: Data that are numpy's on the host and JAX's inside compiled functions.
+    AnyArray = Any
+else:
+    AnyArray = Array | np.ndarray
 
 #: ``s' = f(s, a)``: one step of the world, for one point; always a pytree.
 Dynamics = Callable[[Array, Array], Array]

@@ -173,17 +173,7 @@ def _summarise(
         for m in methods
     }
     summary["tables"] = [_score_table(runs, methods, scores)]
-    params = {k: float(v) for k, v in first.accepted.task.truth.items()}
-    summary["animation"] = {
-        "system": machine,
-        "dt": first.accepted.task.dt,
-        "params": params,
-        "title": "the machine, flown by the learned model",
-        "marks": [
-            {"time": e * seconds, "text": f"episode {e + 1}, score {s:.2f}"}
-            for e, s in enumerate(scores[LEARNER][0])
-        ],
-    }
+    summary["animation"] = _animation(first.accepted.task, machine, scores[LEARNER][0])
     arrays = {f"returns/{m}": returns[m] for m in methods}
     arrays |= {f"scores/{m}": scores[m] for m in methods}
     # Each episode's last state is left out: time and actions then are T long.
@@ -192,6 +182,20 @@ def _summarise(
     key = jax.random.fold_in(jax.random.key(seed), 1)
     arrays |= diagnose.arrays(table, belief.prior, belief.posterior, key=key)
     return summary, arrays
+
+
+def _animation(task: Task, machine: str, scores: np.ndarray) -> dict[str, Any]:
+    """What the report needs to draw the machine's episodes."""
+    return {
+        "system": machine,
+        "dt": task.dt,
+        "params": {k: float(v) for k, v in task.truth.items()},
+        "title": "the machine, flown by the learned model",
+        "marks": [
+            {"time": e * task.seconds, "text": f"episode {e + 1}, score {s:.2f}"}
+            for e, s in enumerate(scores)
+        ],
+    }
 
 
 def _headline(runs: list[SeedRun], seconds: float) -> str:

@@ -7,18 +7,21 @@ input is held until the next row.
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from sim2gp.errors import InputError
 from sim2gp.logs import Log
-from sim2gp.models.windows import Windows
+from sim2gp.models.windows import DELAY_BLUR, Windows
 from sim2gp.systems.base import AbstractSystem
 
 MAX_SUBSTEP = 2e-3  # s
 HALF_WIDTH = 0.025  # s, half the span of the local parabola that guesses a start
+PAST = 0.049  # s, the span of the causal one: 25 samples of 2 ms
 TOLERANCE = 0.05  # a substep may exceed its limit by this share of clock jitter
+Start = Literal["smoothed", "causal"]
 
 
 def cut(
@@ -28,10 +31,13 @@ def cut(
     window: float,
     start_sd: dict[str, float] | None = None,
     floor: dict[str, float] | None = None,
+    start: Start = "smoothed",
 ) -> tuple[Windows, list[tuple[int, int]]]:
     """Windows of ``window`` seconds that use every row once, and (log, row) of each.
 
     ``window = 0`` gives the one-step likelihood, which needs every state measured.
+    A ``causal`` start knows the past alone, as a forecast does: a log's first 50 ms
+    then serve its first start only.
     Raises `InputError` E116 where nothing can be cut, E103 where a state is missing.
     """
     measured = measured_states(logs, system, every=window == 0.0)
@@ -43,7 +49,8 @@ def cut(
             rows = np.flatnonzero(whole[:-1] & whole[1:])
             pieces += [(k, int(i), int(i) + 2) for i in rows]
         else:
-            pieces += [(k, i, j) for i, j in _consecutive(log.time, window)]
+            past = PAST if start == "causal" else 0.0
+            pieces += [(k, i, j) for i, j in _consecutive(log.time, window, past)]
     pieces = [p for p in pieces if _has_data(logs[p[0]], measured, p)]
     if not pieces:
         raise InputError(
@@ -53,14 +60,14 @@ def cut(
             expected=f"logs of at least {window:g} s",
             fix="shorten likelihood.window, or record longer",
         )
-    windows = assemble(logs, system, pieces, measured)
+    windows = assemble(logs, system, pieces, measured, start)
     if window == 0.0:  # the first row is the start itself, not a measurement of it
-        start = np.zeros_like(windows.start)
-        start[:, windows.outputs] = windows.y[:, 0]
+        x0 = np.zeros_like(windows.start)
+        x0[:, windows.outputs] = windows.y[:, 0]
         mask = windows.mask.copy()
         mask[:, 0] = False
-        sd = np.zeros_like(start)
-        windows = dataclasses.replace(windows, start=start, start_sd=sd, mask=mask)
+        sd = np.zeros_like(x0)
+        windows = dataclasses.replace(windows, start=x0, start_sd=sd, mask=mask)
     return _with_stated(windows, system, measured, start_sd, floor), [
         (k, i) for k, i, _ in pieces
     ]
@@ -90,47 +97,69 @@ def assemble(
     system: AbstractSystem,
     pieces: Sequence[tuple[int, int, int]],
     measured: Sequence[str],
+    start: Start = "smoothed",
 ) -> Windows:
     """Padded windows of rows ``i .. j - 1`` of log ``k``, for each piece (k, i, j).
 
     The start's prior is a local parabola's value and slope, with a spread far wider
-    than its error, so that the same rows are not believed twice.
+    than its error, so that the same rows are not believed twice. A causal start is the
+    recorded value and the slope of the parabola through the past alone.
     """
     actions = [channel.name for channel in system.actions]
     names = [channel.name for channel in system.physical_states]
     W, c, m = len(pieces), len(measured), len(actions)
-    inputs = [_knots(log, actions, system.longest_delay) for log in logs]
-    guesses = [_local_parabolas(log, measured) for log in logs]
+    held = [knots_of(log, actions, system.longest_delay) for log in logs]
+    guesses = [_local_parabolas(log, measured, start) for log in logs]
     steps = [_steps(log.time) for log in logs]
     L = max(int(steps[k][0][j - 1] - steps[k][0][i]) + 1 for k, i, j in pieces)
-    ranges = []
-    for k, i, j in pieces:
-        since = logs[k].time[i] - system.longest_delay
-        first = int(np.searchsorted(inputs[k][0], since, side="right")) - 1
-        ranges.append((max(first, 0), j + 1))  # row r stands at knot r + 1
-    H = max(b - a for a, b in ranges)
+    spans = [
+        (k, logs[k].time[i], logs[k].time[j - 1] - logs[k].time[i])
+        for k, i, j in pieces
+    ]
+    knots, area = inputs_since(held, spans, system.longest_delay)
     y, mask = np.zeros((W, L, c)), np.zeros((W, L, c), bool)
-    span, knots = np.zeros((W, L)), np.zeros((W, H))
-    area, start = np.zeros((W, H, m)), np.zeros((W, len(names)))
-    for w, ((k, i, j), (a, b)) in enumerate(zip(pieces, ranges, strict=True)):
+    span, x0 = np.zeros((W, L)), np.zeros((W, len(names)))
+    for w, (k, i, j) in enumerate(pieces):
         values, valid = logs[k].measured(measured)
-        row, spans = steps[k]
+        row, lengths = steps[k]
         at = row[i:j] - row[i]
         y[w, at], mask[w, at] = values[i:j], valid[i:j]
-        span[w, 1 : at[-1] + 1] = spans[row[i] : row[j - 1]]
-        knots[w, : b - a] = inputs[k][0][a:b] - logs[k].time[i]
-        knots[w, b - a :] = knots[w, b - a - 1] + np.arange(1.0, H - (b - a) + 1)
-        area[w] = inputs[k][1][np.minimum(np.arange(a, a + H), b - 1)]
-        area[w] -= inputs[k][1][i + 1]
-        start[w] = _start(names, measured, *guesses[k](i))
-    floor = np.asarray([_resolution(logs, name) for name in measured])
+        span[w, 1 : at[-1] + 1] = lengths[row[i] : row[j - 1]]
+        x0[w] = start_of(names, measured, *guesses[k](i))
+    floor = np.asarray([resolution(logs, name) for name in measured])
     outputs = tuple(names.index(name) for name in measured)
-    spread = np.sqrt(np.mean(start**2, axis=0))
-    for index, resolution in zip(outputs, floor, strict=True):
-        spread[index] = 100.0 * resolution
+    spread = np.sqrt(np.mean(x0**2, axis=0))
+    for index, quantum in zip(outputs, floor, strict=True):
+        spread[index] = 100.0 * quantum
     spread = np.where(spread > 0.0, spread, 1.0)
-    sd = np.broadcast_to(spread, start.shape)
-    return Windows(y, mask, span, knots, area, start, sd, floor, outputs)
+    sd = np.broadcast_to(spread, x0.shape)
+    return Windows(y, mask, span, knots, area, x0, sd, floor, outputs)
+
+
+def inputs_since(
+    held: Sequence[tuple[np.ndarray, np.ndarray]],
+    spans: Sequence[tuple[int, float, float]],
+    delay: float,
+) -> tuple[Float[np.ndarray, "W H"], Float[np.ndarray, "W H m"]]:
+    """Padded knots and integrals of the inputs for each (log, since, length) in s.
+
+    They reach ``delay`` seconds (and a blur's width) back; knots count from ``since``.
+    """
+    ranges = []
+    for k, since, length in spans:
+        time = held[k][0]
+        back = delay + DELAY_BLUR
+        first = int(np.searchsorted(time, since - back, side="right")) - 1
+        last = int(np.searchsorted(time, since + length + DELAY_BLUR)) + 1
+        ranges.append((max(first, 0), min(last, len(time))))
+    W, H = len(spans), max(b - a for a, b in ranges)
+    knots, area = np.zeros((W, H)), np.zeros((W, H, held[0][1].shape[1]))
+    for w, ((k, since, _), (a, b)) in enumerate(zip(spans, ranges, strict=True)):
+        knots[w, : b - a] = held[k][0][a:b] - since
+        knots[w, b - a :] = knots[w, b - a - 1] + np.arange(1.0, H - (b - a) + 1)
+        area[w] = held[k][1][np.minimum(np.arange(a, a + H), b - 1)]
+        area[w] -= held[k][1][a]
+    return knots, area
 
 
 def _with_stated(
@@ -150,10 +179,12 @@ def _with_stated(
     return dataclasses.replace(windows, start_sd=sd, floor=quantum)
 
 
-def _consecutive(time: np.ndarray, window: float) -> list[tuple[int, int]]:
+def _consecutive(
+    time: np.ndarray, window: float, past: float = 0.0
+) -> list[tuple[int, int]]:
     """Rows [i, j) of windows that do not overlap; a short rest is left out."""
     slack = 0.5 * float(np.median(np.diff(time)))
-    out, i = [], 0
+    out, i = [], int(np.searchsorted(time, time[0] + past))
     while i < len(time):
         j = int(np.searchsorted(time, time[i] + window - slack))
         if time[min(j, len(time) - 1)] - time[i] >= 0.5 * window - slack:
@@ -178,7 +209,7 @@ def _steps(time: Float[np.ndarray, " N"]) -> tuple[np.ndarray, np.ndarray]:
     return place, np.repeat(gaps / count, count)
 
 
-def _knots(
+def knots_of(
     log: Log, actions: Sequence[str], delay: float
 ) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, "K m"]]:
     """Times and integral of the held inputs; before the log, its first input holds."""
@@ -191,22 +222,25 @@ def _knots(
 
 
 def _local_parabolas(
-    log: Log, measured: Sequence[str]
+    log: Log, measured: Sequence[str], start: Start
 ) -> Callable[[int], tuple[np.ndarray, np.ndarray]]:
     """Value and slope of each measured channel at a row, from the rows around it."""
     values, mask = log.measured(measured)
+    before, after = (PAST, 0.0) if start == "causal" else (HALF_WIDTH, HALF_WIDTH)
 
     def at(i: int) -> tuple[np.ndarray, np.ndarray]:
         t = log.time - log.time[i]
         near = slice(
-            int(np.searchsorted(t, -HALF_WIDTH)),
-            int(np.searchsorted(t, HALF_WIDTH)) + 1,
+            int(np.searchsorted(t, -before)),
+            int(np.searchsorted(t, after, side="right")),
         )
         value, slope = np.zeros(len(measured)), np.zeros(len(measured))
         for c in range(len(measured)):
             value[c], slope[c] = parabola(
                 t[near], values[near, c], mask[near, c], values[i, c]
             )
+            if start == "causal" and mask[i, c]:
+                value[c] = values[i, c]
         return value, slope
 
     return at
@@ -229,7 +263,7 @@ def parabola(
     return float(coefficients[0]), float(coefficients[1]) / unit
 
 
-def _start(
+def start_of(
     names: Sequence[str], measured: Sequence[str], value: np.ndarray, slope: np.ndarray
 ) -> Float[np.ndarray, " n"]:
     """The state at a row: measured values, and slopes for unmeasured velocities."""
@@ -238,7 +272,7 @@ def _start(
     return np.asarray([known.get(name, rates.get(name, 0.0)) for name in names])
 
 
-def _resolution(logs: Sequence[Log], name: str) -> float:
+def resolution(logs: Sequence[Log], name: str) -> float:
     """Standard deviation of the rounding: quantum / sqrt(12), or a share of the rms."""
     recorded = [log for log in logs if name in log.channels]
     y = np.concatenate([log.channels[name][log.mask[name]] for log in recorded])

@@ -69,10 +69,8 @@ def latent(f: Callable[[Array], Array], posterior: Gaussian) -> Gaussian:
     return Gaussian(value, J @ posterior.scale)
 
 
-def information_gain(
-    scaled: Float[Array, "rows p"],
-) -> Scalar:
-    """``1/2 logdet(I + A A^T)`` of ``A = Se^-1/2 J S``, by QR; rows may be a trajectory.
+def information_gain(scaled: Float[Array, "rows p"]) -> Scalar:
+    """``1/2 logdet(I + A A^T)`` of ``A = Se^-1/2 J S``, by QR.
 
     Stacking a trajectory's rows gives the joint information: what the second visit to
     one place repeats is not counted twice.

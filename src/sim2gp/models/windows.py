@@ -35,10 +35,11 @@ from jaxtyping import Array, Bool, Float
 from sim2gp.gaussian import LOG_2PI, Gaussian
 from sim2gp.least_squares import Factor, Fit, multi_start, triangular
 from sim2gp.systems.base import AbstractSystem, rk4
-from sim2gp.types import Key, Scalar, in_float64
+from sim2gp.types import AnyArray, Key, Scalar, in_float64
 
 NOISE_ROUNDS = 5
 FREEDOM = 4.0  # degrees of freedom of the Student-t weight
+DELAY_BLUR = 2e-3  # s, of inputs that may be delayed
 DESCENT = 1e-4  # tolerance of one descent; the undamped steps do the rest
 
 
@@ -53,14 +54,14 @@ class Windows(eqx.Module):
     ``floor`` the sensors' resolution.
     """
 
-    y: Float[Array | np.ndarray, "W L c"]
-    mask: Bool[Array | np.ndarray, "W L c"]
-    span: Float[Array | np.ndarray, "W L"]
-    knots: Float[Array | np.ndarray, "W H"]
-    area: Float[Array | np.ndarray, "W H m"]
-    start: Float[Array | np.ndarray, "W n"]
-    start_sd: Float[Array | np.ndarray, "W n"]
-    floor: Float[Array | np.ndarray, " c"]
+    y: Float[AnyArray, "W L c"]
+    mask: Bool[AnyArray, "W L c"]
+    span: Float[AnyArray, "W L"]
+    knots: Float[AnyArray, "W H"]
+    area: Float[AnyArray, "W H m"]
+    start: Float[AnyArray, "W n"]
+    start_sd: Float[AnyArray, "W n"]
+    floor: Float[AnyArray, " c"]
     outputs: tuple[int, ...] = eqx.field(static=True)
 
     def __len__(self) -> int:
@@ -72,18 +73,47 @@ class Windows(eqx.Module):
         return jax.vmap(f, in_axes=(axes, *[0] * len(per_window)))(self, *per_window)
 
 
-def inputs_of(window: Windows, delays: Float[Array, " m"]) -> Float[Array, "L m"]:
-    """Mean delayed input over the step that ends at each row of one window."""
+def inputs_of(
+    window: Windows, delays: Float[Array, " m"], blur: float = 0.0
+) -> Float[Array, "L m"]:
+    """Mean delayed input over the step that ends at each row of one window.
+
+    Where every step is as long as the input is held, all of these means bend at the
+    same delays, and a fit is caught in the kink. ``blur`` (s) averages the held input
+    over that width around each time first, which makes them smooth in the delay.
+    """
     end = jnp.cumsum(window.span)
     # A row without length has no mean; its input does not matter but must be finite.
     h = jnp.where(window.span > 0.0, window.span, 1.0)
 
     def channel(area: Array, delay: Array) -> Array:
-        at = jnp.interp(end - delay, window.knots, area)
-        before = jnp.interp(-delay, window.knots, area)
-        return jnp.diff(at, prepend=before) / h
+        def integral(t: Array) -> Array:
+            if not blur:
+                return jnp.interp(t, window.knots, area)
+            twice = _second_integral(window.knots, area)
+            return (twice(t + 0.5 * blur) - twice(t - 0.5 * blur)) / blur
+
+        before = integral(-delay[None])
+        return jnp.diff(jnp.concatenate([before, integral(end - delay)])) / h
 
     return jax.vmap(channel, in_axes=(1, 0), out_axes=1)(window.area, delays)
+
+
+def _second_integral(
+    knots: Float[Array, " H"], area: Float[Array, " H"]
+) -> Callable[[Array], Array]:
+    """The integral of a piecewise straight function, as a function of its end."""
+    length = jnp.diff(knots)
+    slope = jnp.diff(area) / length
+    whole = jnp.cumsum(length * 0.5 * (area[1:] + area[:-1]))
+    whole = jnp.concatenate([jnp.zeros_like(whole[:1]), whole])
+
+    def at(t: Array) -> Array:
+        k = jnp.clip(jnp.searchsorted(knots, t, side="right") - 1, 0, slope.size - 1)
+        x = t - knots[k]
+        return whole[k] + x * (area[k] + 0.5 * x * slope[k])
+
+    return at
 
 
 def simulate(
@@ -96,7 +126,8 @@ def simulate(
         x = rk4(lambda y, v: system.ode(params, y, v), x, u, h)
         return x, x
 
-    inputs = inputs_of(window, system.delays(params))
+    blur = DELAY_BLUR if system.longest_delay else 0.0
+    inputs = inputs_of(window, system.delays(params), blur)
     return jax.lax.scan(step, x0, (window.span, inputs))[1]
 
 

@@ -3,6 +3,7 @@
 This half of the project loads the simulators; `sim2gp.project.schema` does not.
 """
 
+import dataclasses
 import inspect
 from collections.abc import Collection, Mapping
 from typing import Any, get_type_hints
@@ -12,10 +13,26 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from sim2gp.errors import InputError, nearest
 from sim2gp.parameters import Parameter, Parameters, unknown_parameter
 from sim2gp.project.priors import located, prior
-from sim2gp.project.schema import ActuatorSpec, PriorSpec, ProjectSpec
+from sim2gp.project.schema import ActuatorSpec, EffectSpec, PriorSpec, ProjectSpec
 from sim2gp.project.source import Source
-from sim2gp.systems import AbstractSystem
+from sim2gp.systems import AbstractMechanism, AbstractSystem, Perturbed, effects
 from sim2gp.systems.actuator import Actuated, actuator_prior
+from sim2gp.systems.effects import AbstractEffect
+
+#: Effects by the last part of their constant's name, ``<channel>.<effect>``.
+EFFECTS: dict[str, Any] = {
+    kind.what: kind
+    for kind in (
+        effects.Coulomb,
+        effects.DeadZone,
+        effects.Drag,
+        effects.PoleGeometry,
+        effects.RailFriction,
+        effects.RailTilt,
+        effects.RodInertia,
+        effects.Spring,
+    )
+}
 
 
 def build_system(
@@ -38,6 +55,8 @@ def build_system(
         ) from error
     table = _table(plain.parameters, dict(spec.parameters), source, ("parameters",))
     system: AbstractSystem = kind(parameters=table, **options)
+    if spec.effects:
+        system = _perturbed(system, spec.effects, source)
     return _actuated(system, spec.actuators, source) if spec.actuators else system
 
 
@@ -92,6 +111,47 @@ def _table(
             raise located(unknown_parameter(name, known), where)
         changes[name] = prior(stated, base, where)
     return table.replace(**changes)
+
+
+def _perturbed(
+    system: AbstractSystem,
+    specs: Mapping[str, Mapping[str, EffectSpec | float]],
+    source: Source,
+) -> AbstractSystem:
+    """The machine with the effects of the file; magnitudes are constants by name."""
+    assert isinstance(system, AbstractMechanism)  # as every class of `SYSTEMS` is
+    added: list[AbstractEffect] = []
+    stated: dict[str, Parameter | float] = {}
+    for where, kinds in specs.items():
+        for what, said in kinds.items():
+            line = source.where("effects", where, what)
+            if what not in EFFECTS:
+                raise unknown("effect", what, EFFECTS, line)
+            effect = _effect(what, where, said, line)
+            try:
+                base = effect.parameter(system)
+            except InputError as error:
+                raise located(error, line) from error
+            added.append(effect)
+            stated[effect.name] = prior(said, base, line)
+    table = Perturbed(system, added).parameters.replace(**stated)
+    return Perturbed(system, added, table)
+
+
+def _effect(
+    what: str, where: str, said: EffectSpec | float, line: str
+) -> AbstractEffect:
+    """The effect of a name on a channel, with the options it has (E160)."""
+    given = {} if isinstance(said, float) else {"width": said.width}
+    if isinstance(said, EffectSpec):
+        given["smoothing"] = said.smoothing
+    options = {name: value for name, value in given.items() if value is not None}
+    known = [f.name for f in dataclasses.fields(EFFECTS[what])]
+    for name in options:
+        if name not in known:
+            raise unknown(f"option of {what}", name, known[2:], line)
+    made: AbstractEffect = EFFECTS[what](where=where, magnitude=1.0, **options)
+    return made
 
 
 def _actuated(

@@ -1,8 +1,8 @@
 """The shape of a project file, section by section, and its faults in one line each.
 
     system = "two_link"
-    [options]  [parameters.NAME]  [[logs]]  [actuators.INPUT]  [likelihood]
-    [task]  [limits]  [model]  [planner]
+    [options]  [parameters.NAME]  [effects.CHANNEL.EFFECT]  [[logs]]
+    [actuators.INPUT]  [likelihood]  [task]  [limits]  [model]  [planner]
 
 Types are strict: a number in quotes is text. A fault names the line of its key.
 """
@@ -36,6 +36,18 @@ class PriorSpec(Section):
     map: Literal["box", "log_box", "log", "identity"] | None = None
 
 
+class EffectSpec(PriorSpec):
+    """Physics that the machine's equations lack: its magnitude, as any constant's.
+
+    ``[effects.theta.coulomb]`` adds the constant ``theta.coulomb``; a bare number
+    fixes it. ``width`` (a velocity) and ``smoothing`` (an input) are options of the
+    effects that have them.
+    """
+
+    width: Positive | None = None
+    smoothing: Positive | None = None
+
+
 class ColumnSpec(Section):
     """A column of a file, and how its numbers become a channel's."""
 
@@ -67,9 +79,14 @@ class ActuatorSpec(Section):
 
 
 class LikelihoodSpec(Section):
-    """Windows of a length in s (0: one step); what noise and start are allowed."""
+    """Windows of a length in s (0: one step); what noise and start are allowed.
+
+    ``start``: a window's start is guessed from the samples around it ("smoothed"), or
+    from the past alone ("causal"), as whoever predicts with the model will do.
+    """
 
     window: Annotated[FiniteFloat, Field(ge=0)] = 0.2
+    start: Literal["smoothed", "causal"] = "smoothed"
     robust: bool = False
     start_sd: Positive | dict[str, Positive] | None = None
     noise_floor: Positive | dict[str, Positive] | None = None
@@ -107,6 +124,7 @@ class ProjectSpec(Section):
     system: str
     options: dict[str, Any] = {}
     parameters: dict[str, FiniteFloat | PriorSpec] = {}
+    effects: dict[str, dict[str, FiniteFloat | EffectSpec]] = {}
     logs: list[LogSpec] = []
     actuators: dict[str, ActuatorSpec] = {}
     likelihood: LikelihoodSpec = LikelihoodSpec()
@@ -152,7 +170,9 @@ def _keys_at(path: Path_) -> list[str]:
     """The keys that a table at this path may have."""
     section = path[0] if path else ""
     model: type[BaseModel] = ProjectSpec
-    if section in ("parameters", "actuators") and len(path) > 1:
+    if section == "effects":
+        model = EffectSpec
+    elif section in ("parameters", "actuators") and len(path) > 1:
         last = section == "parameters" or len(path) > 2
         model = PriorSpec if last else ActuatorSpec
     elif section == "logs":
