@@ -241,7 +241,7 @@ def _score_table(
         "title": "Score of each episode (median over machines) and machines solved",
         "columns": ["method", *heads, "by 1", "by 2", "by 3"],
         "rows": rows,
-        "note": f"{len(runs)} machines; a score of 1 is the oracle's, 0 is hanging; "
+        "note": f"Machines: {len(runs)}; a score of 1 is the oracle's, 0 is hanging; "
         f"solved means a score of at least 0.95 in any episode so far.",
     }
 

@@ -9,7 +9,16 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 LONGEST = 12  # numbers of a list that are still printed
-_HIDDEN = ("warnings", "environment")
+# What a terminal need not repeat: the report and summary.json have it all.
+_HIDDEN = ("warnings", "versions", "animation", "figure1", "units", "tables", "command")
+_HIDDEN_COLUMNS = (
+    "combination",
+    "meaning",
+    "note",
+    "partners",
+    "prior_sd",
+    "everywhere",
+)
 
 
 def print_summary(summary: Mapping[str, Any], title: str) -> None:
@@ -25,6 +34,7 @@ def print_summary(summary: Mapping[str, Any], title: str) -> None:
         singles.add_row(key, text)
     for name, rows in _groups(summary):
         columns = list(dict.fromkeys(key for row in rows.values() for key in row))
+        columns = [c for c in columns if c not in _HIDDEN_COLUMNS.get(name, ())]
         shown = [c for c in columns if any(_is_short(r.get(c)) for r in rows.values())]
         table = Table("", *shown, title=name, title_justify="left")
         for label, row in rows.items():
@@ -33,6 +43,13 @@ def print_summary(summary: Mapping[str, Any], title: str) -> None:
         console.print(table)
     if singles.row_count:
         console.print(singles)
+    for said in summary.get("tables", ()):
+        table = Table(*said["columns"], title=said["title"], title_justify="left")
+        for row in said["rows"]:
+            table.add_row(*(_text(cell) for cell in row))
+        console.print(table)
+        if said.get("note"):
+            console.print(said["note"])
 
 
 def _singles(summary: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
