@@ -48,7 +48,7 @@ class Demo(Writes):
     """Draws the truth, the noise and the plans."""
     seeds: int = 1
     """Run this many seeds, starting at the one given."""
-    episodes: int = 4
+    episodes: int = 3
     """Real episodes of each run, 5 s each."""
 
     def run(self, progress: Progress) -> dict[str, Any]:
