@@ -57,7 +57,7 @@ CHECKS = {
         1e-6,
     ),
     "energy": Check(
-        "relative change of the energy of every machine without friction over 2 s",
+        "relative change of the energy of every machine without friction over 1 s",
         checks.energy,
         1e-6,
     ),

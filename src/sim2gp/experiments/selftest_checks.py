@@ -270,7 +270,7 @@ def energy(rng: Rng) -> float:
         values: Mapping[str, float] = system.parameters.nominal()
         values = {**values, **dict.fromkeys(zeros.split(), 0.0)}
         params = system.record({k: jnp.asarray(v, float) for k, v in values.items()})
-        step = system.bind(params, 2e-3)
+        step = system.bind(params, 1e-3)
 
         def total(
             s: Array, system: Any = system, p: Any = params, V: Any = potential
