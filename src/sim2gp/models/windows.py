@@ -39,7 +39,7 @@ from sim2gp.types import AnyArray, Key, Scalar, in_float64
 
 NOISE_ROUNDS = 5
 FREEDOM = 4.0  # degrees of freedom of the Student-t weight
-DELAY_BLUR = 2e-3  # s, of inputs that may be delayed
+DELAY_BLUR = 4e-3  # s, of inputs that may be delayed
 DESCENT = 1e-4  # tolerance of one descent; the undamped steps do the rest
 
 
@@ -203,7 +203,7 @@ class _Windowed(eqx.Module):
         J, r = jax.jacfwd(twice, has_aux=True)(jnp.concatenate([z, e]))
         own, rest = J[..., p:], jnp.concatenate([J[..., :p], r[..., None]], axis=-1)
         root = jnp.sqrt(weight)
-        data = jnp.concatenate([own, rest], axis=-1) * (root / noise)[:, None]
+        data = jnp.concatenate([own, rest], axis=-1) * (root / noise)[None, :, None]
         prior = jnp.concatenate([jnp.eye(n), jnp.zeros((n, p)), e[:, None]], axis=1)
         R = triangular(jnp.concatenate([data.reshape(-1, n + p + 1), prior]))
         R11, slope = R[:n, :n], solve_triangular(R[:n, :n], R[:n, n:])
@@ -238,7 +238,7 @@ def _fit(
     starts: Float[Array, "starts p"],
     freedom: Scalar,
 ) -> tuple[Fit, WindowsBelief]:
-    count = jnp.sum(windows.mask, axis=1)  # (W, c)
+    count = jnp.sum(windows.mask.astype(windows.y.dtype), axis=1)  # (W, c)
     N = jnp.sum(count, axis=0)
 
     def update(fit: Fit, noise: _Noise) -> _Noise:
@@ -248,7 +248,7 @@ def _fit(
         expected = noise.weights @ (squares + spread)
         sd = jnp.sqrt((2.0 * windows.floor**2 + expected) / (2.0 + N))
         # E-step of the Student-t: an infinite number of degrees of freedom gives 1.
-        misfit = jnp.sum(squares / sd**2, axis=1)
+        misfit = jnp.sum(squares / sd[None] ** 2, axis=1)
         weights = (1.0 + jnp.sum(count, 1) / freedom) / (1.0 + misfit / freedom)
         return _Noise(sd, weights, fit.z, fit.aux.e, fit.aux.slope)
 
@@ -284,6 +284,33 @@ def _fit(
         log_evidence,
     )
     return fit, belief
+
+
+def information_at(
+    belief: WindowsBelief, windows: Windows
+) -> Callable[[Float[Array, " p"]], Float[Array, "p p"]]:
+    """The factor of the data's Fisher, whitened by the prior, at any virtual vector.
+
+    The start states stay where their windows put them, the noise as it was learned.
+    """
+    prior, exact = belief.prior, jax.tree.map(jnp.asarray, windows)
+    exact = eqx.tree_at(lambda w: w.start, exact, belief.starts)
+    (W, n), p = exact.start.shape, prior.mean.size
+    held = _Noise(
+        belief.noise,
+        belief.weights,
+        jnp.zeros(p),
+        jnp.zeros((W, n)),
+        jnp.zeros((W, n, p)),
+    )
+
+    @eqx.filter_jit
+    def factor(model: _Windowed, noise: _Noise, tt: Array) -> Array:
+        z = solve_triangular(prior.scale, tt - prior.mean, lower=True)
+        return model.factor(z, noise)[0][:-1, :-1]
+
+    model = _Windowed(belief.system, prior, exact)
+    return in_float64(lambda tt: factor(model, held, jnp.asarray(tt, float)))
 
 
 @in_float64

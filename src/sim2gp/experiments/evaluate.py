@@ -1,0 +1,273 @@
+"""Evaluate: how well does a fit predict what it was not shown, and does it know?
+
+`run` holds a finished identification against other logs; `leave_one_out` fits all of a
+project's logs but one and predicts that one, in turn. The protocol is that of
+`sim2gp.models.grid`; the bands are those of `sim2gp.models.forecast`, fitted to the
+training logs alone.
+"""
+
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from sim2gp.errors import InputError
+from sim2gp.experiments.identify import PROJECT, band_of
+from sim2gp.experiments.prediction import (
+    Judged,
+    channels,
+    cut_logs,
+    drawn,
+    joined,
+    judged,
+    load,
+    recordings,
+    regression_errors,
+    rows_for,
+    scores,
+    subset,
+    trace_arrays,
+    units,
+)
+from sim2gp.experiments.record import provenance
+from sim2gp.gaussian import Gaussian
+from sim2gp.logs import Log
+from sim2gp.models.forecast import Band, fit_band, forecast
+from sim2gp.models.grid import CURVE, Grid, evaluation_windows, steps_of
+from sim2gp.models.windows import Windows, fit_windows
+from sim2gp.project import Project, load_project
+from sim2gp.runs import Progress, load_run, new_run
+from sim2gp.types import in_float64
+
+
+def run(
+    run: Path, logs: list[Path], *, horizon: float, out: Path, progress: Progress
+) -> dict[str, Any]:
+    """Predict ``logs`` by an identify run; writes and returns the summary."""
+    started = time.perf_counter()
+    _check_horizon(horizon)
+    stored = load_run(run)
+    if "belief/mean" not in stored.arrays or not (run / PROJECT).exists():
+        raise InputError(
+            "E130",
+            "not an identification",
+            where=str(run),
+            got=str(stored.summary.get("command", "a run without a belief")),
+            expected="the folder of sim2gp identify",
+            fix="run sim2gp identify first",
+        )
+    found = load_project(run / PROJECT)
+    system, x = found.system, stored.arrays
+    posterior = Gaussian(x["belief/mean"], x["belief/scale"])
+    band = Band(*(x[f"band/{k}"] for k in ("start_sd", "input_sd", "resolution")),
+                float(x["band/freedom"]))  # fmt: skip
+    tested = found.read_logs(logs)
+    with new_run(out, "evaluate") as writer, progress.task("evaluate", 2) as task:
+        rows, longest = rows_for(horizon), max(horizon, CURVE[-1])
+        grid = _windows(tested, found, longest, horizon)
+        result = forecast(system, posterior, grid.windows, rows)
+        train = _training(found, stored.summary, run)
+        linear = None
+        if train is not None:
+            known = evaluation_windows(train, system, longest=longest)
+            linear = regression_errors(known, grid, horizon)
+        task.advance("forecasts")
+        names = channels(system, grid.windows)
+        whole = judged(rows, grid, result, band, linear)
+        summary, arrays = scores(whole, names, tested, horizon)
+        picture = drawn(system, posterior, band, grid)
+        arrays |= trace_arrays(picture, grid, tested, names)
+        notes = [str(note) for log in tested for note in log.notes]
+        if train is None:
+            notes.append("the training logs were not found: no regression beside")
+        listed = " ".join(map(str, logs))
+        line = f"sim2gp evaluate {run} --logs {listed} --horizon {horizon:g}"
+        summary |= {
+            "command": "evaluate",
+            "title": f"{run.name}: prediction of logs it was not fitted to",
+            "warnings": notes,
+        }
+        _write(writer, summary, arrays, found, line, started)
+        task.advance("report")
+    return summary
+
+
+def leave_one_out(
+    project: Path, *, horizon: float, out: Path, progress: Progress
+) -> dict[str, Any]:
+    """Fit all recordings but one, predict that one, in turn; writes the summary."""
+    started = time.perf_counter()
+    _check_horizon(horizon)
+    found = load_project(project)
+    logs = load(found)
+    files = list(dict.fromkeys(recordings(logs)))
+    if len(files) < 2:
+        raise InputError(
+            "E160",
+            "one recording cannot be left out",
+            where=found.source.where("logs"),
+            got=f"{len(files)} file",
+            expected="at least two files",
+            fix="record once more, or identify and evaluate RUN --logs",
+        )
+    with new_run(out, "evaluate") as writer, progress.task("logs", len(files)) as task:
+        windows, of = cut_logs(found, logs)
+        grid = _windows(logs, found, max(horizon, CURVE[-1]), horizon)
+        names = channels(found.system, windows)
+        parts: list[Judged] = []
+        arrays: dict[str, np.ndarray] = {}
+        constants = []
+        for file in files:
+            left = [k for k, source in enumerate(recordings(logs)) if source == file]
+            part, traced, values = _fold(found, logs, windows, of, grid, left, horizon)
+            parts.append(part)
+            arrays |= traced
+            constants.append(values)
+            task.advance(f"without {logs[left[0]].name}")
+        summary, curves = scores(joined(parts), names, logs, horizon)
+        summary["tables"].append(_constants_table(found, files, logs, constants))
+        summary |= {
+            "command": "evaluate",
+            "title": f"{found.name}: each log predicted by a fit of the others",
+            "folds": len(files),
+            "warnings": [str(note) for log in logs for note in log.notes],
+        }
+        line = f"sim2gp evaluate {project} --horizon {horizon:g}"
+        _write(writer, summary, curves | arrays, found, line, started)
+    return summary
+
+
+def _fold(
+    project: Project,
+    logs: Sequence[Log],
+    windows: Windows,
+    of: np.ndarray,
+    grid: Grid,
+    left: Sequence[int],
+    horizon: float,
+) -> tuple[Judged, dict[str, np.ndarray], np.ndarray]:
+    """One fold: forecasts, traces and constants of the fit without logs ``left``.
+
+    Its windows are masked, not removed, so that all folds share one compiled fit.
+    """
+    system, rows = project.system, rows_for(horizon)
+    mask = np.asarray(windows.mask) & ~np.isin(of, left)[:, None, None]
+    kept = eqx.tree_at(lambda w: w.mask, windows, mask)
+    robust = project.spec.likelihood.robust
+    # One start: the folds are small changes of one problem.
+    belief = fit_windows(system, kept, key=jax.random.key(0), robust=robust, starts=1)
+    result = forecast(system, belief.posterior, grid.windows, rows)
+    test = np.isin(grid.log, left)
+    train, tested = subset(grid, ~test), subset(grid, test)
+    others = {source for k, source in enumerate(recordings(logs)) if k not in left}
+    curve = np.isin(rows, [steps_of(h) for h in CURVE])
+    learned = jax.tree.map(lambda x: x[~test][:, curve], result)
+    band = fit_band(learned, train, len(others))
+    linear = regression_errors(train, tested, horizon)
+    part = judged(rows, tested, result.of(test), band, linear)
+    picture = drawn(system, belief.posterior, band, grid)
+    names = channels(system, windows)
+    traced: dict[str, np.ndarray] = {}
+    for k in left:
+        traced |= trace_arrays(picture, grid, logs, names, only=k)
+    return part, traced, _constrain(system, belief.posterior)
+
+
+@in_float64
+def _constrain(system: Any, posterior: Gaussian) -> np.ndarray:
+    return np.asarray(system.parameters.constrain(posterior.mean))
+
+
+def _constants_table(
+    project: Project,
+    files: Sequence[str],
+    logs: Sequence[Log],
+    values: list[np.ndarray],
+) -> dict[str, Any]:
+    """The constants of every fold: what does not stay put was not determined."""
+    names = {log.source: log.name for log in logs}
+    return {
+        "title": "Constants of each fit (MAP)",
+        "columns": ["without", *project.system.parameters.names],
+        "rows": [
+            [names[file], *(f"{x:.3g}" for x in row)]
+            for file, row in zip(files, values, strict=True)
+        ],
+        "note": "One log fewer should not move a constant that the logs determine.",
+    }
+
+
+def _windows(
+    logs: Sequence[Log], project: Project, longest: float, horizon: float
+) -> Grid:
+    """Evaluation windows; E116 where no log is as long as the horizon."""
+    if max(log.duration for log in logs) > horizon + CURVE[0]:
+        grid = evaluation_windows(logs, project.system, longest=longest)
+        if np.asarray(grid.windows.mask)[:, steps_of(horizon)].any():
+            return grid
+    raise InputError(
+        "E116",
+        "no window to predict",
+        got=f"{max(log.duration for log in logs):.3g} s",
+        expected=f"an unmasked stretch longer than the horizon of {horizon:g} s",
+        fix="shorten --horizon, or record longer",
+    )
+
+
+def _training(
+    project: Project, summary: dict[str, Any], run: Path
+) -> tuple[Log, ...] | None:
+    """The logs that a run was fitted to, where they still stand."""
+    about = summary.get("project", {})
+    place = run / about.get("folder", "") / about.get("file", PROJECT)
+    try:
+        return replace(project, path=Path(os.path.normpath(place))).load_logs()
+    except InputError:
+        return None
+
+
+def _check_horizon(horizon: float) -> None:
+    if not 0.0 < horizon <= 60.0:
+        raise InputError(
+            "E160",
+            "horizon out of range",
+            where="--horizon",
+            got=f"{horizon:g} s",
+            expected="more than 0 and at most 60 s",
+            fix="choose some tenths of a second",
+        )
+
+
+def _write(
+    writer: Any,
+    summary: dict[str, Any],
+    arrays: dict[str, np.ndarray],
+    project: Project,
+    line: str,
+    started: float,
+) -> None:
+    """Headline, report and files of a run."""
+    unit = units(project.system)
+    error = ", ".join(
+        f"{name} {value:.3g} {unit[name]} ({100 * summary['coverage90'][name]:.0f} % "
+        "inside the 90 % band)"
+        for name, value in summary["open_loop_rmse"].items()
+    )
+    summary["headline"] = f"Open-loop error at {summary['horizon']:g} s: {error}."
+    summary["units"] = unit
+    summary["trace_note"] = (
+        "Forecasts of half a second from causal starts, of logs that the fit has not "
+        "seen; they know the recorded inputs and nothing else of the future."
+    )
+    summary |= provenance(line, started)
+    from sim2gp.report import write_report
+
+    writer.write_summary(summary)
+    writer.write_arrays("arrays.npz", arrays)
+    writer.write_text("report.html", write_report(summary, arrays))

@@ -1,0 +1,183 @@
+"""Identify: the posterior of a machine's constants from its logs.
+
+The run keeps what a later command needs to predict with it: the project file, the
+posterior over virtual values, and what the band of its forecasts is made of.
+"""
+
+import os
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from sim2gp import diagnose
+from sim2gp.experiments.prediction import (
+    channels,
+    cut_logs,
+    drawn,
+    load,
+    recordings,
+    rows_for,
+    trace_arrays,
+    units,
+)
+from sim2gp.experiments.record import provenance
+from sim2gp.logs import Log
+from sim2gp.models.forecast import Band, fit_band, forecast
+from sim2gp.models.grid import CURVE, Grid, evaluation_windows
+from sim2gp.models.windows import Windows, WindowsBelief, fit_windows, information_at
+from sim2gp.project import Project, load_project
+from sim2gp.runs import Progress, new_run
+
+PROJECT = "project.toml"  # the file's name in a run
+
+
+def run(project: Path, *, out: Path, seed: int, progress: Progress) -> dict[str, Any]:
+    """Fit the logs of a project file and write the run; returns its summary."""
+    started = time.perf_counter()
+    found = load_project(project)
+    logs = load(found)
+    with new_run(out, "identify") as writer:
+        with progress.task("identify", 4) as task:
+            windows, _ = cut_logs(found, logs)
+            task.advance(f"{len(windows)} windows")
+            key = jax.random.key(seed)
+            robust = found.spec.likelihood.robust
+            belief = fit_windows(found.system, windows, key=key, robust=robust)
+            task.advance("posterior")
+            grid = evaluation_windows(logs, found.system, longest=CURVE[-1])
+            band = band_of(belief, grid, logs)
+            names = channels(found.system, windows)
+            picture = drawn(found.system, belief.posterior, band, grid)
+            arrays = _stored(belief, band, seed)
+            arrays |= trace_arrays(picture, grid, logs, names)
+            task.advance("forecasts")
+            summary = _summarise(found, logs, windows, belief, band, seed)
+            line = f"sim2gp identify {project} --seed {seed}"
+            folder = Path(os.path.abspath(project)).parent
+            summary["project"] = {
+                "file": project.name,
+                "folder": os.path.relpath(folder, os.path.abspath(out)),
+            }
+            summary |= provenance(line, started)
+            from sim2gp.report import write_report
+
+            writer.write_summary(summary)
+            writer.write_arrays("arrays.npz", arrays)
+            writer.write_text(PROJECT, found.source.text)
+            writer.write_text("report.html", write_report(summary, arrays))
+            task.advance("report")
+    return summary
+
+
+def band_of(belief: WindowsBelief, grid: Grid, logs: Sequence[Log]) -> Band:
+    """The band of a fit, from its forecasts of the logs that it was fitted to."""
+    rows = rows_for(CURVE[0])[1:]
+    found = forecast(belief.system, belief.posterior, grid.windows, rows)
+    return fit_band(found, grid, len(set(recordings(logs))))
+
+
+def _stored(belief: WindowsBelief, band: Band, seed: int) -> dict[str, np.ndarray]:
+    table = belief.system.parameters
+    key = jax.random.fold_in(jax.random.key(seed), 1)
+    return {
+        "belief/mean": np.asarray(belief.posterior.mean),
+        "belief/scale": np.asarray(belief.posterior.scale),
+        "belief/prior_mean": np.asarray(belief.prior.mean),
+        "belief/prior_scale": np.asarray(belief.prior.scale),
+        "belief/information": np.asarray(belief.information),
+        "belief/noise": np.asarray(belief.noise),
+        "belief/weights": np.asarray(belief.weights),
+        "band/start_sd": band.start_sd,
+        "band/input_sd": band.input_sd,
+        "band/resolution": band.resolution,
+        "band/freedom": np.asarray(band.freedom),
+        **diagnose.arrays(table, belief.prior, belief.posterior, key=key),
+    }
+
+
+def _summarise(
+    project: Project,
+    logs: Sequence[Log],
+    windows: Windows,
+    belief: WindowsBelief,
+    band: Band,
+    seed: int,
+) -> dict[str, Any]:
+    system = project.system
+    names = channels(system, windows)
+    found = diagnose.summary(
+        system.parameters,
+        belief.prior,
+        belief.posterior,
+        belief.information,
+        fisher_at=information_at(belief, windows),
+    )
+    noise = dict(zip(names, np.asarray(belief.noise).tolist(), strict=True))
+    rows = sum(len(log) for log in logs)
+    actions = [channel.name for channel in system.actions]
+    return {
+        "command": "identify",
+        "title": f"{project.name}: what {_count(logs)} determine",
+        "headline": headline(found["parameters"]),
+        "seed": seed,
+        "converged": True,
+        "noise": noise,
+        "misfit": _misfit(names, noise, windows, units(system)),
+        "log_evidence": float(belief.log_evidence),
+        "n_rows": rows,
+        "n_logs": len(set(recordings(logs))),
+        "n_transitions": rows - len(logs),
+        "n_windows": len(windows),
+        "units": units(system),
+        "band": {
+            "input_sd": dict(zip(actions, band.input_sd.tolist(), strict=True)),
+            "freedom": band.freedom,
+        },
+        "warnings": [str(note) for log in logs for note in log.notes],
+        "trace_note": "Forecasts of half a second from causal starts, of the logs that "
+        "were fitted; they know the recorded inputs and nothing else of the future.",
+        **found,
+    }
+
+
+def headline(parameters: dict[str, dict[str, Any]]) -> str:
+    """How many constants the logs determine, and which they do not."""
+    sure = [n for n, entry in parameters.items() if entry["verdict"] == "identified"]
+    rest = [n for n in parameters if n not in sure]
+    text = f"{len(sure)} of {len(parameters)} constants are identified"
+    if sure:
+        text += f" ({', '.join(sure)})"
+    return (
+        f"{text}; not by these logs alone: {', '.join(rest)}." if rest else f"{text}."
+    )
+
+
+def _count(logs: Sequence[Log]) -> str:
+    count = len(set(recordings(logs)))
+    return "one log" if count == 1 else f"{count} logs"
+
+
+def _misfit(
+    names: Sequence[str],
+    noise: dict[str, float],
+    windows: Windows,
+    unit: dict[str, str],
+) -> list[str]:
+    """What the window noise holds beside the sensor's own."""
+    out = []
+    for name, floor in zip(names, np.asarray(windows.floor), strict=True):
+        times = noise[name] / float(floor)
+        out.append(
+            f"The noise of {name}, {noise[name]:.2g} {unit[name]}, is {times:.0f} "
+            "times the rounding of its sensor: the rest is error of the start and of "
+            "the model, which is not independent from sample to sample, so that the "
+            "posterior may be narrower than it should be."
+            if times > 3.0
+            else f"The noise of {name}, {noise[name]:.2g} {unit[name]}, is that of "
+            "its sensor's rounding: these windows show no other error."
+        )
+    return out

@@ -1,0 +1,366 @@
+"""What identify and evaluate share: windows of a project's logs, scores, traces.
+
+A forecast is judged at the last sample of its window, errors pooled over windows as a
+root mean square. Beside the model stand two predictors without mechanics: the state
+held, and a linear regression on start state and every input of the window. Recorded in
+closed loop, the inputs leak the future, which is how a regression can win.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from sim2gp.errors import InputError
+from sim2gp.gaussian import Gaussian
+from sim2gp.logs import Log
+from sim2gp.models.cutting import cut
+from sim2gp.models.forecast import Band, Forecast, forecast
+from sim2gp.models.grid import CURVE, PERIOD, Grid, steps_of
+from sim2gp.models.windows import Windows
+from sim2gp.project import Project
+from sim2gp.systems.base import AbstractSystem
+
+TRACE = 0.5  # s, the windows that are drawn
+_TRACE_ROWS = np.arange(0, steps_of(TRACE) + 1, 5)
+_EVERY = 5  # of the windows, 0.1 s apart, are drawn
+
+
+def load(project: Project) -> tuple[Log, ...]:
+    """The project's logs; E160 for values fixed by group, which no fit takes yet."""
+    logs = project.load_logs()
+    for group, spec in enumerate(project.spec.logs):
+        if spec.fixed:
+            raise InputError(
+                "E160",
+                "values fixed for one group of logs are not supported yet",
+                where=project.source.where("logs", group, "fixed"),
+                got=", ".join(spec.fixed),
+                expected="the same constants in all groups",
+                fix="identify the groups by a project file each",
+            )
+    return logs
+
+
+def cut_logs(project: Project, logs: Sequence[Log]) -> tuple[Windows, np.ndarray]:
+    """Training windows as the project states them, and the log of each."""
+    stated = project.spec.likelihood
+    names = [channel.name for channel in project.system.physical_states]
+    measured = [n for n in names if any(n in log.channels for log in logs)]
+    windows, places = cut(
+        logs,
+        project.system,
+        window=stated.window,
+        start_sd=_each(stated.start_sd, names),
+        floor=_each(stated.noise_floor, measured),
+        start=stated.start,
+    )
+    return windows, np.asarray([k for k, _ in places])
+
+
+def recordings(logs: Sequence[Log]) -> list[str]:
+    """The recording of each log; a file cut at its gaps is one recording."""
+    return [log.source for log in logs]
+
+
+def channels(system: AbstractSystem, windows: Windows) -> list[str]:
+    """Names of the measured states, in the windows' order."""
+    return [system.physical_states[i].name for i in windows.outputs]
+
+
+def units(system: AbstractSystem) -> dict[str, str]:
+    """Units of all channels, for the report."""
+    return {c.name: c.unit for c in (*system.physical_states, *system.actions)}
+
+
+def rows_for(horizon: float) -> Int[np.ndarray, " R"]:
+    """Grid samples to be judged: one step, the error curve, the horizon."""
+    steps = {1, steps_of(horizon), *(steps_of(h) for h in CURVE)}
+    return np.asarray(sorted(steps))
+
+
+class Judged(eqx.Module):
+    """Held-out forecasts with their bands, and the trivial predictors' errors."""
+
+    rows: Int[np.ndarray, " R"]
+    valid: Bool[np.ndarray, "W R c"]
+    error: Float[np.ndarray, "W R c"]
+    scale: Float[np.ndarray, "W R c"]
+    log_prob: Float[np.ndarray, "W R c"]
+    hold: Float[np.ndarray, "W R c"]
+    regression: Float[np.ndarray, "W c"] | None  # at the horizon
+    log: Int[np.ndarray, " W"]
+    inside90: Bool[np.ndarray, "W R c"]
+    inside95: Bool[np.ndarray, "W R c"]
+
+
+def judged(
+    rows: np.ndarray,
+    grid: Grid,
+    found: Forecast,
+    band: Band,
+    regression: np.ndarray | None,
+) -> Judged:
+    """Forecasts of ``grid``'s windows held against their band."""
+    y = np.asarray(grid.windows.y)
+    start = np.asarray(grid.windows.start)[:, list(grid.windows.outputs)]
+    scale, error = band.scale(found), np.abs(found.error)
+    return Judged(
+        rows,
+        found.valid,
+        found.error,
+        scale,
+        band.log_prob(found),
+        start[:, None] - y[:, rows],
+        regression,
+        grid.log,
+        error <= band.half_width(0.9) * scale,
+        error <= band.half_width(0.95) * scale,
+    )
+
+
+def joined(parts: Sequence[Judged]) -> Judged:
+    """The folds of a leave-one-out side by side."""
+    first = parts[0]
+    fields = {
+        name: np.concatenate([getattr(part, name) for part in parts])
+        for name in first.__dataclass_fields__
+        if name not in ("rows", "regression")
+    }
+    known = [part.regression for part in parts if part.regression is not None]
+    whole = np.concatenate(known) if len(known) == len(parts) else None
+    return Judged(rows=first.rows, regression=whole, **fields)
+
+
+def regression_errors(
+    train: Grid, test: Grid, horizon: float
+) -> Float[np.ndarray, "W c"] | None:
+    """Errors of the linear regression; None where it has more unknowns than windows."""
+    row = steps_of(horizon)
+    (x, moved, known), (x2, moved2, _) = (_features(g, row) for g in (train, test))
+    if known.sum() <= x.shape[1]:
+        return None
+    weights = np.linalg.lstsq(x[known], moved[known], rcond=None)[0]
+    return np.asarray(x2 @ weights - moved2)
+
+
+def _features(grid: Grid, row: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    w = grid.windows
+    edges = PERIOD * np.arange(row + 1)
+    inputs = [
+        np.diff(np.interp(edges, knots, column))
+        for knots, area in zip(w.knots, w.area, strict=True)
+        for column in np.asarray(area).T
+    ]
+    u = np.asarray(inputs).reshape(len(w), -1) / PERIOD
+    start = np.asarray(w.start)
+    x = np.concatenate([start, u, np.ones((len(w), 1))], axis=1)
+    moved = np.asarray(w.y)[:, row] - start[:, list(w.outputs)]
+    return x, moved, np.asarray(w.mask)[:, row].all(axis=1)
+
+
+def scores(
+    found: Judged, names: Sequence[str], logs: Sequence[Log], horizon: float
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Summary keys, tables and curves of a held-out evaluation."""
+    at = int(np.searchsorted(found.rows, steps_of(horizon)))
+    one = int(np.searchsorted(found.rows, 1))
+    model, hold = _rms(found.error, found.valid), _rms(found.hold, found.valid)
+    share90 = _share(found.inside90, found.valid)
+    share95 = _share(found.inside95, found.valid)
+    nll = _mean(-found.log_prob, found.valid)
+
+    def named(values: np.ndarray) -> dict[str, float]:
+        return dict(zip(names, map(float, values), strict=True))
+
+    summary: dict[str, Any] = {
+        "horizon": horizon,
+        "windows": int(found.valid[:, at].any(axis=1).sum()),
+        "open_loop_rmse": named(model[at]),
+        "one_step_rmse": named(model[one]),
+        "nll": named(nll[at]),
+        "coverage90": named(share90[at]),
+        "coverage95": named(share95[at]),
+        "hold_rmse": named(hold[at]),
+    }
+    if found.regression is not None:
+        summary["regression_rmse"] = named(_rms(found.regression, found.valid[:, at]))
+    curve = np.asarray([i for i in range(len(found.rows)) if i != one or at == one])
+    seconds = found.rows[curve] * PERIOD
+    summary["tables"] = [
+        _by_horizon(found, names, curve, seconds, model, hold, share90, share95),
+        _by_log(found, names, logs, at, horizon),
+    ]
+    arrays: dict[str, np.ndarray] = {"curve/horizon": seconds}
+    for c, name in enumerate(names):
+        arrays[f"curve/model/{name}"] = model[curve, c]
+        arrays[f"curve/hold/{name}"] = hold[curve, c]
+        arrays[f"curve/coverage90/{name}"] = share90[curve, c]
+    return summary, {k: v for k, v in arrays.items() if "coverage" not in k} | {
+        k.replace("curve/coverage90", "coverage90"): v
+        for k, v in arrays.items()
+        if "coverage" in k
+    }
+
+
+def _by_horizon(
+    found: Judged,
+    names: Sequence[str],
+    curve: np.ndarray,
+    seconds: np.ndarray,
+    model: np.ndarray,
+    hold: np.ndarray,
+    share90: np.ndarray,
+    share95: np.ndarray,
+) -> dict[str, Any]:
+    columns = ["horizon, s", "windows"]
+    for name in names:
+        columns += [name, f"{name}, held", f"{name} in 90 %", f"{name} in 95 %"]
+    rows = []
+    for i, s in zip(curve, seconds, strict=True):
+        row: list[Any] = [f"{s:.3g}", str(int(found.valid[:, i].any(axis=1).sum()))]
+        for c in range(len(names)):
+            row += [f"{model[i, c]:.4f}", f"{hold[i, c]:.4f}"]
+            row += [f"{share90[i, c]:.3f}", f"{share95[i, c]:.3f}"]
+        rows.append(row)
+    return {
+        "title": "Error and coverage by horizon, pooled over logs",
+        "columns": columns,
+        "rows": rows,
+        "note": "Root mean square error of the last sample of open-loop windows that "
+        "start every 0.1 s; held: the start predicted to stay; the share of samples "
+        "inside the predicted bands.",
+    }
+
+
+def _by_log(
+    found: Judged, names: Sequence[str], logs: Sequence[Log], at: int, horizon: float
+) -> dict[str, Any]:
+    columns = ["log", "windows"]
+    for name in names:
+        columns += [name, f"{name}, held", f"{name}, regression", f"{name} in 90 %"]
+    rows = []
+    for k in [*range(len(logs)), None]:
+        which = np.ones(len(found.log), bool) if k is None else found.log == k
+        valid = found.valid[which, at]
+        model, hold = (_rms(x[which, at], valid) for x in (found.error, found.hold))
+        share = _share(found.inside90[which, at], valid)
+        row = ["pooled" if k is None else logs[k].name, str(int(valid.any(1).sum()))]
+        for c in range(len(names)):
+            regression = "not enough windows"
+            if found.regression is not None:
+                regression = f"{_rms(found.regression[which], valid)[c]:.4f}"
+            row += [f"{model[c]:.4f}", f"{hold[c]:.4f}", regression, f"{share[c]:.3f}"]
+        rows.append(row)
+    return {
+        "title": f"Error at {horizon:g} s, log by log",
+        "columns": columns,
+        "rows": rows,
+        "note": "The regression sees every input of the window; recorded in closed "
+        "loop, these leak the future angle.",
+    }
+
+
+def drawn(
+    system: AbstractSystem,
+    posterior: Gaussian,
+    band: Band,
+    grid: Grid,
+) -> dict[str, tuple[np.ndarray, ...]]:
+    """Forecasts of half a second, for pictures: (which, time, measured, mean, half)."""
+    which = _pictured(grid)
+    windows = _some(grid.windows, which)
+    found = forecast(system, posterior, windows, _TRACE_ROWS)
+    half = band.half_width(0.9) * band.scale(found)
+    y = np.where(found.valid, np.asarray(windows.y)[:, _TRACE_ROWS], np.nan)
+    time = grid.since[which][:, None] + PERIOD * _TRACE_ROWS[None]
+    return {"which": (which,), "trace": (time, y, found.mean, half)}
+
+
+def trace_arrays(
+    picture: dict[str, tuple[np.ndarray, ...]],
+    grid: Grid,
+    logs: Sequence[Log],
+    names: Sequence[str],
+    only: int | None = None,
+) -> dict[str, np.ndarray]:
+    """The report's ``trace/...`` arrays; windows are parted by a NaN."""
+    (which,), (time, y, mean, half) = picture["which"], picture["trace"]
+    arrays = {}
+    for k, log in enumerate(logs):
+        rows = grid.log[which] == k
+        if (only is not None and k != only) or not rows.any():
+            continue
+        base = f"trace/{log.name}"
+        arrays[f"{base}/time"] = _flat(time[rows])
+        for c, name in enumerate(names):
+            curves = {
+                "measured": y[rows, :, c],
+                "predicted": mean[rows, :, c],
+                "low": (mean - half)[rows, :, c],
+                "high": (mean + half)[rows, :, c],
+            }
+            for kind, curve in curves.items():
+                arrays[f"{base}/{kind}/{name}"] = _flat(curve)
+    return arrays
+
+
+def _pictured(grid: Grid) -> np.ndarray:
+    """Windows that follow each other without overlap and are half a second long."""
+    row = steps_of(TRACE)
+    chosen = []
+    for k in np.unique(grid.log):
+        inside = np.flatnonzero(grid.log == k)[::_EVERY]
+        whole = np.asarray(grid.windows.mask)[inside, row].any(axis=1)
+        chosen.append(inside[whole])
+    return np.concatenate(chosen)
+
+
+def _some(windows: Windows, which: np.ndarray) -> Windows:
+    chosen: Windows = eqx.tree_at(
+        lambda w: w.floor, jax.tree.map(lambda x: x[which], _bare(windows)),
+        windows.floor, is_leaf=lambda x: x is None,
+    )  # fmt: skip
+    return chosen
+
+
+def _bare(windows: Windows) -> Windows:
+    bare: Windows = eqx.tree_at(lambda w: w.floor, windows, None)
+    return bare
+
+
+def subset(grid: Grid, which: np.ndarray) -> Grid:
+    """The evaluation windows chosen by a mask."""
+    return Grid(
+        _some(grid.windows, which), grid.log[which], grid.since[which], grid.lag[which]
+    )
+
+
+def _flat(x: np.ndarray) -> np.ndarray:
+    """Windows one after the other, each followed by a NaN."""
+    gap = np.full((len(x), 1), np.nan)
+    return np.concatenate([x, gap], axis=1).ravel()
+
+
+def _each(
+    value: float | dict[str, float] | None, names: Sequence[str]
+) -> dict[str, float] | None:
+    """A single number holds for every channel."""
+    return dict.fromkeys(names, value) if isinstance(value, float) else value
+
+
+def _mean(x: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    count = valid.sum(axis=0)
+    total = np.sum(np.where(valid, x, 0.0), axis=0)
+    return np.asarray(total / np.where(count > 0, count, 1))
+
+
+def _rms(x: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    return np.sqrt(_mean(x**2, valid))
+
+
+def _share(inside: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    return _mean(inside.astype(float), valid)

@@ -1,0 +1,165 @@
+"""Open-loop forecasts of windows, and the band that they are predicted to stay in.
+
+A forecast errs by its start, by its constants, and by what the model does not know. For
+a window's output at horizon h, to first order,
+
+    V(h) = J_s S_s J_s^T + J_d S_d J_d^T + J_z S_z J_z^T + resolution^2
+
+with S_s the second moment of (causal - centred) start states, S_z the posterior, and
+S_d one constant, unknown input disturbance per window and input, whose standard
+deviations are fitted to the training logs' own forecast errors. The band never narrows
+as the horizon grows (running maximum of V). Logs, not samples, are what replicates: the
+quantiles are Student-t with one degree of freedom less than training logs. The noise of
+the windows' likelihood is left out: it *is* those errors, averaged over horizons.
+"""
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.optimize
+import scipy.stats
+from jaxtyping import Array, Bool, Float
+
+from sim2gp.gaussian import Gaussian
+from sim2gp.models.grid import Grid
+from sim2gp.models.windows import Windows, simulate
+from sim2gp.systems.base import AbstractSystem
+from sim2gp.types import in_float64
+
+_BATCH = 128  # windows at a time: bounds the memory of sensitivities
+MIN_FREEDOM = 2.0
+
+
+class Forecast(eqx.Module):
+    """Predictions of windows at some rows, their errors and their sensitivities."""
+
+    mean: Float[np.ndarray, "W R c"]
+    error: Float[np.ndarray, "W R c"]  # prediction minus measurement
+    valid: Bool[np.ndarray, "W R c"]
+    by_start: Float[np.ndarray, "W R c n"]
+    by_input: Float[np.ndarray, "W R c m"]
+    by_constants: Float[np.ndarray, "W R c"]  # variance
+
+    def of(self, which: Bool[np.ndarray, " W"]) -> "Forecast":
+        """The forecasts of some of the windows."""
+        chosen: Forecast = jax.tree.map(lambda x: x[which], self)
+        return chosen
+
+    def rmse(self) -> Float[np.ndarray, "R c"]:
+        """Root mean square over windows; NaN where nothing was measured."""
+        count = self.valid.sum(axis=0)
+        squares = np.sum(np.where(self.valid, self.error, 0.0) ** 2, axis=0)
+        return np.sqrt(squares / np.where(count > 0, count, np.nan))
+
+
+@in_float64
+def forecast(
+    system: AbstractSystem,
+    posterior: Gaussian,
+    windows: Windows,
+    rows: Float[np.ndarray, " R"] | np.ndarray,
+) -> Forecast:
+    """Simulate every window from its start at the posterior mean."""
+    exact = jax.tree.map(lambda x: jnp.asarray(x), windows)
+    parts = _forecast(system, posterior, exact, jnp.asarray(rows, int))
+    mean, by_start, by_input, by_constants = (np.asarray(part) for part in parts)
+    y, valid = np.asarray(windows.y)[:, rows], np.asarray(windows.mask)[:, rows]
+    return Forecast(mean, mean - y, valid, by_start, by_input, by_constants)
+
+
+@eqx.filter_jit
+def _forecast(
+    system: AbstractSystem, posterior: Gaussian, windows: Windows, rows: Array
+) -> tuple[Array, Array, Array, Array]:
+    n, m = windows.start.shape[1], windows.area.shape[2]
+    k = posterior.scale.shape[1]
+    outputs = np.asarray(windows.outputs)
+
+    def predict(window: Windows, x: Array) -> tuple[Array, Array]:
+        tt = posterior.mean + posterior.scale @ x[n + m :]
+        params = system.record(system.parameters.values(tt))
+        more = window.knots[:, None] * x[n : n + m][None]
+        moved = eqx.tree_at(lambda w: w.area, window, window.area + more)
+        states = simulate(system, params, moved, window.start + x[:n])
+        out = states[rows][:, outputs]
+        return out, out
+
+    def one(window: Windows) -> tuple[Array, Array, Array, Array]:
+        zero = jnp.zeros(n + m + k)
+        J, mean = jax.jacfwd(lambda x: predict(window, x), has_aux=True)(zero)
+        rest = jnp.sum(J[..., n + m :] ** 2, axis=-1)
+        return mean, J[..., :n], J[..., n : n + m], rest
+
+    # The floor belongs to all windows; predictions do not need it.
+    each = eqx.tree_at(lambda w: w.floor, windows, None)
+    found: tuple[Array, Array, Array, Array] = jax.lax.map(
+        lambda w: one(eqx.tree_at(lambda v: v.floor, w, windows.floor, is_leaf=_none)),
+        each,
+        batch_size=_BATCH,
+    )
+    return found
+
+
+def _none(x: object) -> bool:
+    return x is None
+
+
+@dataclass(frozen=True)
+class Band:
+    """What a forecast's spread is made of, besides the posterior."""
+
+    start_sd: Float[np.ndarray, " n"]
+    input_sd: Float[np.ndarray, " m"]
+    resolution: Float[np.ndarray, " c"]
+    freedom: float
+
+    def scale(self, found: Forecast) -> Float[np.ndarray, "W R c"]:
+        """The square root of V at every row; rows in rising order of horizon."""
+        V = _variance(found, self.start_sd, self.resolution)
+        V = V + np.einsum("wrcm,m->wrc", found.by_input**2, self.input_sd**2)
+        return np.asarray(np.sqrt(np.maximum.accumulate(V, axis=1)))
+
+    def half_width(self, level: float) -> float:
+        """How many scales a central band of this probability reaches to each side."""
+        return float(scipy.stats.t.ppf(0.5 + 0.5 * level, self.freedom))
+
+    def log_prob(self, found: Forecast) -> Float[np.ndarray, "W R c"]:
+        """Log density of each measurement, nats."""
+        logpdf = scipy.stats.t.logpdf
+        return np.asarray(logpdf(found.error, self.freedom, scale=self.scale(found)))
+
+
+def fit_band(found: Forecast, grid: Grid, recordings: int) -> Band:
+    """The band of a model from its forecasts of the logs that it was fitted to.
+
+    The disturbances' standard deviations maximise the Gaussian likelihood of the
+    errors at all rows, taken as if they were independent.
+    """
+    start_sd = np.sqrt(np.nanmean(grid.lag**2, axis=0))
+    resolution = np.asarray(grid.windows.floor)
+    known = _variance(found, start_sd, resolution)
+    squares, valid = found.by_input**2, found.valid
+
+    def cost(log_sd: np.ndarray) -> float:
+        V = known + np.einsum("wrcm,m->wrc", squares, np.exp(2.0 * log_sd))
+        V = np.maximum.accumulate(V, axis=1)
+        return float(np.mean((found.error**2 / V + np.log(V))[valid]))
+
+    reach = np.sqrt(np.mean(squares, axis=(0, 1, 2)))
+    error = np.sqrt(np.mean(found.error[valid] ** 2))
+    guess = np.log(error / np.where(reach > 0.0, reach, 1.0) + 1e-300)
+    best = scipy.optimize.minimize(cost, guess, method="Nelder-Mead").x
+    freedom = max(float(recordings - 1), MIN_FREEDOM)
+    return Band(start_sd, np.exp(best), resolution, freedom)
+
+
+def _variance(
+    found: Forecast,
+    start_sd: Float[np.ndarray, " n"],
+    resolution: Float[np.ndarray, " c"],
+) -> Float[np.ndarray, "W R c"]:
+    V = np.einsum("wrcn,n->wrc", found.by_start**2, start_sd**2)
+    return np.asarray(V + found.by_constants + resolution**2)

@@ -1,0 +1,312 @@
+"""The likelihood over windows against dense algebra, one-step fits and simulated logs."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+
+from sim2gp.gaussian import Gaussian
+from sim2gp.logs import Log
+from sim2gp.models import Sim2GP
+from sim2gp.models import windows as likelihood
+from sim2gp.models.cutting import cut
+from sim2gp.models.windows import Windows, fit_windows
+from sim2gp.systems import Actuated, Furuta
+from sim2gp.systems.actuator import actuator_prior
+from sim2gp.transitions import Transitions
+from sim2gp.types import in_float64
+
+NAMES = ("theta", "alpha", "theta.velocity", "alpha.velocity")
+FREE = ("arm_damping", "motor_constant", "pendulum_length")
+
+
+def pendulum() -> Furuta:
+    """A Furuta pendulum with three unknown constants."""
+    table = Furuta().parameters
+    known = {n: v for n, v in table.nominal().items() if n not in FREE}
+    return Furuta(table.replace(**known))
+
+
+def simulated(
+    *,
+    seconds: float,
+    seed: int,
+    delay: float = 0.0,
+    jitter: float = 0.0,
+    noise: float = 0.0,
+    velocities: bool = False,
+    changes: dict[str, float] | None = None,
+) -> Log:
+    """A log by scipy's integrator: held inputs, stamps of their own, sensor noise."""
+    rng = np.random.default_rng(seed)
+    count = int(seconds / 0.002)
+    time = 0.002 * np.arange(count) + jitter * rng.uniform(0.0, 0.002, count)
+    held = np.repeat(rng.uniform(-4.0, 4.0, count // 20 + 1), 20)[:count]
+    system = Furuta()
+    with jax.enable_x64(True):
+        values = system.parameters.nominal() | (changes or {})
+        params = system.record({k: jnp.asarray(v) for k, v in values.items()})
+        ode = jax.jit(lambda s, a: system.ode(params, s, a))
+
+        def rate(t: float, s: np.ndarray) -> np.ndarray:
+            k = max(int(np.searchsorted(time, t - delay, side="right")) - 1, 0)
+            return np.asarray(ode(jnp.asarray(s), jnp.asarray(held[k : k + 1])))
+
+        s0 = np.array([0.1, 0.4, 0.0, 0.0])
+        solved = scipy.integrate.solve_ivp(
+            rate, (0.0, time[-1]), s0, t_eval=time, rtol=1e-7, atol=1e-9, max_step=2e-3
+        )
+    y = solved.y + noise * rng.standard_normal(solved.y.shape)
+    kept = NAMES if velocities else NAMES[:2]
+    return Log(
+        name=f"log{seed}",
+        source=f"log{seed}.csv",
+        time=time,
+        channels={n: y[i] for i, n in enumerate(kept)},
+        inputs={"voltage": held},
+        mask={n: np.ones(count, bool) for n in kept},
+    )
+
+
+def dropped(log: Log, rows: np.ndarray) -> Log:
+    """The log without some rows."""
+    keep = np.setdiff1d(np.arange(len(log)), rows)
+    parts = {
+        field: {n: x[keep] for n, x in getattr(log, field).items()}
+        for field in ("channels", "inputs", "mask")
+    }
+    return dataclasses.replace(log, time=log.time[keep], **parts)
+
+
+@in_float64
+def factor_at(system: Furuta, windows: Windows, z: np.ndarray, noise: np.ndarray):
+    """Factor of (z, r) after the elimination, and what it says of each window."""
+    prior = system.parameters.prior()
+    p, (W, n) = prior.mean.size, windows.start.shape
+    held = likelihood._Noise(
+        jnp.asarray(noise),
+        jnp.ones(W),
+        jnp.zeros(p),
+        jnp.zeros((W, n)),
+        jnp.zeros((W, n, p)),
+    )
+    exact = jax.tree.map(jnp.asarray, windows)
+    return likelihood._Windowed(system, prior, exact).factor(jnp.asarray(z), held)
+
+
+@pytest.fixture(scope="module")
+def short() -> Log:
+    return simulated(seconds=0.6, seed=1, noise=1e-3)
+
+
+def test_elimination_is_one_dense_system(short: Log) -> None:
+    system = pendulum()
+    windows, _ = cut([short], system, window=0.2)
+    z, noise = np.array([0.3, -0.2, 0.1]), np.array([1e-3, 2e-3])
+    factor, each = factor_at(system, windows, z, noise)
+    W, n, p = len(windows), 4, 3
+    with jax.enable_x64(True):
+        prior = system.parameters.prior()
+        exact = jax.tree.map(jnp.asarray, windows)
+        model = likelihood._Windowed(system, prior, exact)
+
+        def residuals(x: jax.Array) -> jax.Array:
+            e = x[p:].reshape(W, n)
+            r = exact.each(
+                lambda w, ei: model.residual(w, jnp.concatenate([x[:p], ei])), e
+            )
+            return (r / noise[None, None]).reshape(-1)
+
+        x = jnp.concatenate([jnp.asarray(z), jnp.zeros(W * n)])
+        J, r = np.asarray(jax.jacfwd(residuals)(x)), np.asarray(residuals(x))
+    # Posterior: one dense least-squares system in z and all start states at once.
+    whole = np.block([[J], [np.eye(p + W * n)[p:]]])
+    rhs = np.concatenate([r, np.zeros(W * n)])
+    hessian = whole.T @ whole + np.diag([1.0] * p + [0.0] * (W * n))
+    covariance = np.linalg.inv(hessian)[:p, :p]
+    R = np.asarray(factor)
+    ours = np.linalg.inv(R[:-1, :-1].T @ R[:-1, :-1] + np.eye(p))
+    np.testing.assert_allclose(ours, covariance, rtol=1e-7)
+    # The gradient and the least cost over the start states.
+    best = np.linalg.lstsq(whole[:, p:], rhs, rcond=None)[0]
+    rest = rhs - whole[:, p:] @ best
+    np.testing.assert_allclose(R[:, -1] @ R[:, -1], rest @ rest, rtol=1e-9)
+    np.testing.assert_allclose(
+        R[:-1, :-1].T @ R[:-1, -1], whole[:, :p].T @ rest, rtol=1e-6, atol=1e-6
+    )
+    # Evidence: the determinant of the start states' own block.
+    _, log_det = np.linalg.slogdet(hessian[p:, p:])
+    np.testing.assert_allclose(2 * np.sum(each.log_det), log_det, rtol=1e-10)
+
+
+def test_window_zero_is_the_one_step_fit() -> None:
+    log = simulated(seconds=0.4, seed=2, noise=1e-3, velocities=True)
+    system = pendulum()
+    windows, places = cut([log], system, window=0.0)
+    assert len(places) == len(log) - 1
+    s = np.stack([log.channels[n] for n in NAMES], axis=1)
+    a = log.inputs["voltage"][:, None]
+    with jax.enable_x64(True):
+        data = Transitions(
+            jnp.asarray(s[:-1]),
+            jnp.asarray(a[:-1]),
+            jnp.asarray(s[1:]),
+            jnp.ones(len(s) - 1, bool),
+        )
+        model = Sim2GP(system, dt=0.002)
+        key = jax.random.key(0)
+        one = model.fit(model.init(key), data, key=key)
+    ours = fit_windows(system, windows, key=key)
+    noise = np.asarray(ours.noise)
+    np.testing.assert_allclose(noise, one.noise, rtol=1e-3)
+    # At one noise and one z, the two factors are the same.
+    factor, _ = factor_at(system, windows, np.array([0.2, 0.1, -0.3]), noise)
+    with jax.enable_x64(True):
+        prior = system.parameters.prior()
+
+        def rows(z: jax.Array) -> jax.Array:
+            tt = prior.mean + prior.scale @ z
+            f = jax.vmap(lambda s, a: system.transition(tt, s, a, 0.002))
+            r = f(data.state, data.action) - data.next_state
+            return (r / noise[None]).reshape(-1)
+
+        z = jnp.array([0.2, 0.1, -0.3])
+        J = np.column_stack([jax.jacfwd(rows)(z), rows(z)])
+    np.testing.assert_allclose(
+        np.asarray(factor).T @ factor, J.T @ J, rtol=1e-8, atol=1e-8 * np.abs(J).max()
+    )
+    sd = np.asarray(one.posterior.sd())
+    np.testing.assert_allclose(
+        ours.posterior.mean, one.posterior.mean, atol=0.02 * sd.min()
+    )
+
+
+def test_masked_rows_count_as_removed_ones() -> None:
+    system = pendulum()
+    log = simulated(seconds=0.6, seed=3, noise=1e-3)
+    log = dataclasses.replace(log, inputs={"voltage": np.full(len(log), 2.0)})
+    rows = np.array([31, 47, 150, 201])  # apart: a gap of 4 ms is two steps
+    mask = {n: m.copy() for n, m in log.mask.items()}
+    for m in mask.values():
+        m[rows] = False
+    masked, _ = cut([dataclasses.replace(log, mask=mask)], system, window=0.2)
+    removed, _ = cut([dropped(log, rows)], system, window=0.2)
+    z, noise = np.array([0.3, -0.2, 0.1]), np.array([1e-3, 1e-3])
+    same = {"start": masked.start, "start_sd": masked.start_sd}
+    R1, _ = factor_at(system, masked, z, noise)
+    R2, _ = factor_at(system, dataclasses.replace(removed, **same), z, noise)
+    np.testing.assert_allclose(np.abs(R1), np.abs(R2), rtol=1e-9, atol=1e-9)
+
+
+def test_order_of_windows_and_masked_windows_do_not_matter(short: Log) -> None:
+    system = pendulum()
+    windows, _ = cut([short], system, window=0.1)
+    z, noise = np.zeros(3), np.array([1e-3, 1e-3])
+    order = np.random.default_rng(0).permutation(len(windows))
+    bare = eqx.tree_at(lambda w: w.floor, windows, None)
+    moved = eqx.tree_at(
+        lambda w: w.floor,
+        jax.tree.map(lambda x: x[order], bare),
+        windows.floor,
+        is_leaf=lambda x: x is None,
+    )
+    R1, _ = factor_at(system, windows, z, noise)
+    R2, _ = factor_at(system, moved, z, noise)
+    np.testing.assert_allclose(np.abs(R1), np.abs(R2), rtol=1e-10, atol=1e-10)
+    # A fold of a leave-one-out masks windows: the same as leaving them out.
+    mask = windows.mask.copy()
+    mask[2:] = False
+    part = jax.tree.map(lambda x: x[:2], bare)
+    part = eqx.tree_at(
+        lambda w: w.floor, part, windows.floor, is_leaf=lambda x: x is None
+    )
+    R1, _ = factor_at(system, dataclasses.replace(windows, mask=mask), z, noise)
+    R2, _ = factor_at(system, part, z, noise)
+    np.testing.assert_allclose(np.abs(R1), np.abs(R2), rtol=1e-10, atol=1e-10)
+
+
+def test_memory_is_linear_in_the_data() -> None:
+    system = pendulum()
+    log = simulated(seconds=0.6, seed=4, noise=1e-3)
+    windows, _ = cut([log], system, window=0.02)
+
+    def bytes_of(copies: int) -> int:
+        bare = eqx.tree_at(lambda w: w.floor, windows, None)
+        many = jax.tree.map(lambda x: jnp.concatenate([jnp.asarray(x)] * copies), bare)
+        with jax.enable_x64(True):
+            many = eqx.tree_at(
+                lambda w: w.floor, many, jnp.asarray(windows.floor), is_leaf=_none
+            )
+            f = jax.jit(lambda w: factor_at(system, w, np.zeros(3), np.ones(2)))
+            analysis = f.lower(many).compile().memory_analysis()
+        return int(analysis.temp_size_in_bytes)
+
+    assert bytes_of(8) <= 2.1 * bytes_of(4)
+
+
+def _none(x: object) -> bool:
+    return x is None
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.4])
+def test_delay_is_recovered_without_velocities(jitter: float) -> None:
+    truth = 0.0063
+    free = actuator_prior(pendulum().actions[0], "delay")
+    system = Actuated(pendulum(), {"voltage.delay": free})
+    logs = [
+        simulated(seconds=1.0, seed=s, delay=truth, jitter=jitter, noise=5e-4)
+        for s in (5, 6)
+    ]
+    windows, _ = cut(logs, system, window=0.2)
+    belief = fit_windows(system, windows, key=jax.random.key(0))
+    table = system.parameters
+    with jax.enable_x64(True):
+        theta = np.asarray(table.constrain(belief.posterior.mean))
+        slope = jax.jvp(
+            table.constrain, (belief.posterior.mean,), (jnp.ones(len(table)),)
+        )[1]
+        sd = np.asarray(slope * belief.posterior.sd())
+    found = dict(zip(table.names, theta, strict=True))
+    spread = dict(zip(table.names, sd, strict=True))
+    assert abs(found["voltage.delay"] - truth) < 3 * spread["voltage.delay"] + 1e-4
+    assert spread["voltage.delay"] < 5e-4
+    for name in FREE:
+        assert abs(found[name] - table.nominal()[name]) < 3.5 * spread[name]
+    np.testing.assert_allclose(belief.noise, 5e-4, rtol=0.15)
+
+
+def test_delayed_inputs_are_smooth_in_the_delay(short: Log) -> None:
+    """No kink where the delay is a whole number of samples."""
+    free = actuator_prior(pendulum().actions[0], "delay")
+    system = Actuated(pendulum(), {"voltage.delay": free})
+    windows, _ = cut([short], system, window=0.1)
+    with jax.enable_x64(True):
+        one = jax.tree.map(lambda x: jnp.asarray(x[0]), eqx.tree_at(
+            lambda w: w.floor, windows, None))  # fmt: skip
+        one = eqx.tree_at(lambda w: w.floor, one, jnp.ones(2), is_leaf=_none)
+        blur = likelihood.DELAY_BLUR
+
+        def mean(delay: float, width: float) -> jax.Array:
+            return likelihood.inputs_of(one, jnp.asarray([delay]), width)[1:]
+
+        slope = jax.jacfwd(mean)
+        h = 1e-7
+        jump = np.abs(slope(0.004 + h, blur) - slope(0.004 - h, blur)).max()
+        kink = np.abs(slope(0.004 + h, 0.0) - slope(0.004 - h, 0.0)).max()
+        assert jump < 1e-3 * kink
+        # Far from a change of the input the blur does nothing, and never in the mean.
+        total = np.sum(mean(0.004, blur)) - np.sum(mean(0.004, 0.0))
+        assert abs(total) < 4.0
+
+
+def test_gaussian_prior_comes_back_without_data(short: Log) -> None:
+    system = pendulum()
+    windows, _ = cut([short], system, window=0.2)
+    blank = dataclasses.replace(windows, mask=np.zeros_like(windows.mask))
+    factor, _ = factor_at(system, blank, np.zeros(3), np.ones(2))
+    assert isinstance(system.parameters.prior(), Gaussian)
+    np.testing.assert_array_equal(np.asarray(factor)[:, :], 0.0)
