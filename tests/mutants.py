@@ -26,7 +26,10 @@ PACKAGE = ROOT / "src" / "sim2gp"
 Hunt = tuple[str, str]
 ORACLE = ("test_linear_posterior.py", "degenerate or no_rows or order_and_splitting")
 DESCENT = ("test_least_squares.py", "finite or polish or noise or laplace")
-MODEL = ("test_sim2gp.py", "regression or expectation or predictive or rows_that")
+MODEL = (
+    "test_sim2gp.py",
+    "regression or expectation or predictive or function_space or rows",
+)
 UPDATE = ("test_sim2gp.py", "update")
 GAIN = ("test_sim2gp.py", "information_gain")
 DRAWS = ("test_sim2gp.py", "draws")

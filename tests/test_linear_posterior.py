@@ -285,6 +285,7 @@ def test_degenerate_data(case):
     ref = q.exact()
     assert ref.mean_error(posterior.mean) <= 1e-10
     assert exact.cov_error(ref.cov, cov) <= 1e-10
+    assert float(evidence) == pytest.approx(ref.log_evidence, rel=1e-9, abs=1e-9)
 
 
 def test_more_parameters_than_rows():

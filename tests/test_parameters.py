@@ -30,8 +30,8 @@ SOFTPLUS = Parameter("k", "N", "softplus", "softplus", -1.5)
 LOG = Parameter("k", "N", "log", "log", 0.0)
 IDENTITY = Parameter("k", "N", "identity", "identity")
 EVERY = [BOX, LOG_BOX, SOFTPLUS, LOG, IDENTITY]
-# A box whose ends round: 0.1 + (0.7 - 0.1) is not 0.7.
-ROUNDED = Parameter("k", "N", "box", "box", 0.1, 0.7)
+# Boxes where low + (high - low) > high, in double and in single precision.
+ROUNDED = [Parameter("k", "N", "box", "box", *b) for b in ((0.3, 0.9), (0.7, 1.9))]
 
 
 @pytest.fixture(autouse=True)
@@ -55,7 +55,7 @@ def virtual_values(dtype):
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
-@pytest.mark.parametrize("p", [*EVERY, ROUNDED], ids=ids)
+@pytest.mark.parametrize("p", [*EVERY, *ROUNDED], ids=ids)
 def test_physical_values_stay_inside(p, dtype):
     """S3: in the box and finite for any virtual value, and never decreasing."""
     tt = np.sort(virtual_values(dtype))
