@@ -9,7 +9,6 @@ which shares no code with the package), the held state and a linear regression.
 
 import argparse
 import math
-import sys
 from pathlib import Path
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""The likelihood over windows against dense algebra, one-step fits and simulated logs."""
+"""The likelihood over windows: dense algebra, one-step fits, simulated logs."""
 
 import dataclasses
 
@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.integrate
 
 from sim2gp.gaussian import Gaussian
 from sim2gp.logs import Log
@@ -19,57 +18,7 @@ from sim2gp.systems import Actuated, Furuta
 from sim2gp.systems.actuator import actuator_prior
 from sim2gp.transitions import Transitions
 from sim2gp.types import in_float64
-
-NAMES = ("theta", "alpha", "theta.velocity", "alpha.velocity")
-FREE = ("arm_damping", "motor_constant", "pendulum_length")
-
-
-def pendulum() -> Furuta:
-    """A Furuta pendulum with three unknown constants."""
-    table = Furuta().parameters
-    known = {n: v for n, v in table.nominal().items() if n not in FREE}
-    return Furuta(table.replace(**known))
-
-
-def simulated(
-    *,
-    seconds: float,
-    seed: int,
-    delay: float = 0.0,
-    jitter: float = 0.0,
-    noise: float = 0.0,
-    velocities: bool = False,
-    changes: dict[str, float] | None = None,
-) -> Log:
-    """A log by scipy's integrator: held inputs, stamps of their own, sensor noise."""
-    rng = np.random.default_rng(seed)
-    count = int(seconds / 0.002)
-    time = 0.002 * np.arange(count) + jitter * rng.uniform(0.0, 0.002, count)
-    held = np.repeat(rng.uniform(-4.0, 4.0, count // 20 + 1), 20)[:count]
-    system = Furuta()
-    with jax.enable_x64(True):
-        values = system.parameters.nominal() | (changes or {})
-        params = system.record({k: jnp.asarray(v) for k, v in values.items()})
-        ode = jax.jit(lambda s, a: system.ode(params, s, a))
-
-        def rate(t: float, s: np.ndarray) -> np.ndarray:
-            k = max(int(np.searchsorted(time, t - delay, side="right")) - 1, 0)
-            return np.asarray(ode(jnp.asarray(s), jnp.asarray(held[k : k + 1])))
-
-        s0 = np.array([0.1, 0.4, 0.0, 0.0])
-        solved = scipy.integrate.solve_ivp(
-            rate, (0.0, time[-1]), s0, t_eval=time, rtol=1e-7, atol=1e-9, max_step=2e-3
-        )
-    y = solved.y + noise * rng.standard_normal(solved.y.shape)
-    kept = NAMES if velocities else NAMES[:2]
-    return Log(
-        name=f"log{seed}",
-        source=f"log{seed}.csv",
-        time=time,
-        channels={n: y[i] for i, n in enumerate(kept)},
-        inputs={"voltage": held},
-        mask={n: np.ones(count, bool) for n in kept},
-    )
+from simulated_logs import FREE, NAMES, pendulum, simulated
 
 
 def dropped(log: Log, rows: np.ndarray) -> Log:

@@ -15,10 +15,11 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from sim2gp.errors import InputError
-from sim2gp.experiments.identify import PROJECT, band_of
+from sim2gp.experiments.identify import PROJECT
 from sim2gp.experiments.prediction import (
     Judged,
     channels,
@@ -64,9 +65,13 @@ def run(
         )
     found = load_project(run / PROJECT)
     system, x = found.system, stored.arrays
-    posterior = Gaussian(x["belief/mean"], x["belief/scale"])
-    band = Band(*(x[f"band/{k}"] for k in ("start_sd", "input_sd", "resolution")),
-                float(x["band/freedom"]))  # fmt: skip
+    posterior = _gaussian(x["belief/mean"], x["belief/scale"])
+    band = Band(
+        x["band/start_sd"],
+        x["band/input_sd"],
+        x["band/resolution"],
+        float(x["band/inflation"]),
+    )
     tested = found.read_logs(logs)
     with new_run(out, "evaluate") as writer, progress.task("evaluate", 2) as task:
         rows, longest = rows_for(horizon), max(horizon, CURVE[-1])
@@ -177,6 +182,11 @@ def _fold(
     for k in left:
         traced |= trace_arrays(picture, grid, logs, names, only=k)
     return part, traced, _constrain(system, belief.posterior)
+
+
+@in_float64
+def _gaussian(mean: np.ndarray, scale: np.ndarray) -> Gaussian:
+    return Gaussian(jnp.asarray(mean), jnp.asarray(scale))
 
 
 @in_float64

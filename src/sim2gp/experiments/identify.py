@@ -40,36 +40,35 @@ def run(project: Path, *, out: Path, seed: int, progress: Progress) -> dict[str,
     started = time.perf_counter()
     found = load_project(project)
     logs = load(found)
-    with new_run(out, "identify") as writer:
-        with progress.task("identify", 4) as task:
-            windows, _ = cut_logs(found, logs)
-            task.advance(f"{len(windows)} windows")
-            key = jax.random.key(seed)
-            robust = found.spec.likelihood.robust
-            belief = fit_windows(found.system, windows, key=key, robust=robust)
-            task.advance("posterior")
-            grid = evaluation_windows(logs, found.system, longest=CURVE[-1])
-            band = band_of(belief, grid, logs)
-            names = channels(found.system, windows)
-            picture = drawn(found.system, belief.posterior, band, grid)
-            arrays = _stored(belief, band, seed)
-            arrays |= trace_arrays(picture, grid, logs, names)
-            task.advance("forecasts")
-            summary = _summarise(found, logs, windows, belief, band, seed)
-            line = f"sim2gp identify {project} --seed {seed}"
-            folder = Path(os.path.abspath(project)).parent
-            summary["project"] = {
-                "file": project.name,
-                "folder": os.path.relpath(folder, os.path.abspath(out)),
-            }
-            summary |= provenance(line, started)
-            from sim2gp.report import write_report
+    with new_run(out, "identify") as writer, progress.task("identify", 4) as task:
+        windows, _ = cut_logs(found, logs)
+        task.advance(f"{len(windows)} windows")
+        key = jax.random.key(seed)
+        robust = found.spec.likelihood.robust
+        belief = fit_windows(found.system, windows, key=key, robust=robust)
+        task.advance("posterior")
+        grid = evaluation_windows(logs, found.system, longest=CURVE[-1])
+        band = band_of(belief, grid, logs)
+        names = channels(found.system, windows)
+        picture = drawn(found.system, belief.posterior, band, grid)
+        arrays = _stored(belief, band, seed)
+        arrays |= trace_arrays(picture, grid, logs, names)
+        task.advance("forecasts")
+        summary = _summarise(found, logs, windows, belief, band, seed)
+        line = f"sim2gp identify {project} --seed {seed}"
+        folder = Path(os.path.abspath(project)).parent
+        summary["project"] = {
+            "file": project.name,
+            "folder": os.path.relpath(folder, os.path.abspath(out)),
+        }
+        summary |= provenance(line, started)
+        from sim2gp.report import write_report
 
-            writer.write_summary(summary)
-            writer.write_arrays("arrays.npz", arrays)
-            writer.write_text(PROJECT, found.source.text)
-            writer.write_text("report.html", write_report(summary, arrays))
-            task.advance("report")
+        writer.write_summary(summary)
+        writer.write_arrays("arrays.npz", arrays)
+        writer.write_text(PROJECT, found.source.text)
+        writer.write_text("report.html", write_report(summary, arrays))
+        task.advance("report")
     return summary
 
 
@@ -94,7 +93,7 @@ def _stored(belief: WindowsBelief, band: Band, seed: int) -> dict[str, np.ndarra
         "band/start_sd": band.start_sd,
         "band/input_sd": band.input_sd,
         "band/resolution": band.resolution,
-        "band/freedom": np.asarray(band.freedom),
+        "band/inflation": np.asarray(band.inflation),
         **diagnose.arrays(table, belief.prior, belief.posterior, key=key),
     }
 
@@ -135,7 +134,7 @@ def _summarise(
         "units": units(system),
         "band": {
             "input_sd": dict(zip(actions, band.input_sd.tolist(), strict=True)),
-            "freedom": band.freedom,
+            "inflation": band.inflation,
         },
         "warnings": [str(note) for log in logs for note in log.notes],
         "trace_note": "Forecasts of half a second from causal starts, of the logs that "

@@ -159,7 +159,7 @@ def _features(grid: Grid, row: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     start = np.asarray(w.start)
     x = np.concatenate([start, u, np.ones((len(w), 1))], axis=1)
     moved = np.asarray(w.y)[:, row] - start[:, list(w.outputs)]
-    return x, moved, np.asarray(w.mask)[:, row].all(axis=1)
+    return x, moved, np.all(np.asarray(w.mask)[:, row], axis=1, keepdims=False).ravel()
 
 
 def scores(

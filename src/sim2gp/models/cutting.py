@@ -107,7 +107,7 @@ def assemble(
     """
     actions = [channel.name for channel in system.actions]
     names = [channel.name for channel in system.physical_states]
-    W, c, m = len(pieces), len(measured), len(actions)
+    W, c = len(pieces), len(measured)
     held = [knots_of(log, actions, system.longest_delay) for log in logs]
     guesses = [_local_parabolas(log, measured, start) for log in logs]
     steps = [_steps(log.time) for log in logs]

@@ -8,9 +8,9 @@ a window's output at horizon h, to first order,
 with S_s the second moment of (causal - centred) start states, S_z the posterior, and
 S_d one constant, unknown input disturbance per window and input, whose standard
 deviations are fitted to the training logs' own forecast errors. The band never narrows
-as the horizon grows (running maximum of V). Logs, not samples, are what replicates: the
-quantiles are Student-t with one degree of freedom less than training logs. The noise of
-the windows' likelihood is left out: it *is* those errors, averaged over horizons.
+as the horizon grows (running maximum of V), and V is raised by 1 + 1/m for m training
+logs: logs, not samples, are what replicates. The noise of the windows' likelihood is
+left out: it *is* those errors, averaged over horizons.
 """
 
 from dataclasses import dataclass
@@ -30,7 +30,6 @@ from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import in_float64
 
 _BATCH = 128  # windows at a time: bounds the memory of sensitivities
-MIN_FREEDOM = 2.0
 
 
 class Forecast(eqx.Module):
@@ -114,22 +113,22 @@ class Band:
     start_sd: Float[np.ndarray, " n"]
     input_sd: Float[np.ndarray, " m"]
     resolution: Float[np.ndarray, " c"]
-    freedom: float
+    inflation: float
 
     def scale(self, found: Forecast) -> Float[np.ndarray, "W R c"]:
-        """The square root of V at every row; rows in rising order of horizon."""
+        """The square root of V, raised, at every row; rows in rising order of horizon."""
         V = _variance(found, self.start_sd, self.resolution)
         V = V + np.einsum("wrcm,m->wrc", found.by_input**2, self.input_sd**2)
-        return np.asarray(np.sqrt(np.maximum.accumulate(V, axis=1)))
+        return np.sqrt(self.inflation * np.maximum.accumulate(V, axis=1))
 
     def half_width(self, level: float) -> float:
         """How many scales a central band of this probability reaches to each side."""
-        return float(scipy.stats.t.ppf(0.5 + 0.5 * level, self.freedom))
+        return float(scipy.stats.norm.ppf(0.5 + 0.5 * level))
 
     def log_prob(self, found: Forecast) -> Float[np.ndarray, "W R c"]:
         """Log density of each measurement, nats."""
-        logpdf = scipy.stats.t.logpdf
-        return np.asarray(logpdf(found.error, self.freedom, scale=self.scale(found)))
+        scale = self.scale(found)
+        return np.asarray(scipy.stats.norm.logpdf(found.error, scale=scale))
 
 
 def fit_band(found: Forecast, grid: Grid, recordings: int) -> Band:
@@ -152,8 +151,7 @@ def fit_band(found: Forecast, grid: Grid, recordings: int) -> Band:
     error = np.sqrt(np.mean(found.error[valid] ** 2))
     guess = np.log(error / np.where(reach > 0.0, reach, 1.0) + 1e-300)
     best = scipy.optimize.minimize(cost, guess, method="Nelder-Mead").x
-    freedom = max(float(recordings - 1), MIN_FREEDOM)
-    return Band(start_sd, np.exp(best), resolution, freedom)
+    return Band(start_sd, np.exp(best), resolution, 1.0 + 1.0 / recordings)
 
 
 def _variance(

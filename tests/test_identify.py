@@ -1,0 +1,175 @@
+"""identify and evaluate from end to end, on logs whose machine is known."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sim2gp.errors import InputError
+from sim2gp.experiments import evaluate, identify
+from sim2gp.logs import Log
+from sim2gp.project import load_project
+from sim2gp.runs import Progress, load_run
+from sim2gp.systems import Furuta, Perturbed
+from simulated_logs import FREE, simulated
+
+QUIET = Progress(quiet=True)
+PROJECT = """system = "furuta"
+
+[parameters]
+{fixed}
+
+[[logs]]
+files = ["logs/*.csv"]
+
+[logs.columns]
+theta = "theta"
+alpha = "alpha"
+voltage = "u"
+
+[likelihood]
+window = 0.2
+start = "causal"
+start_sd = 0.01
+"""
+
+
+def write(log: Log, path: Path) -> None:
+    """The log as a robot would have written it."""
+    columns = [log.time, *(log.channels[n] for n in ("theta", "alpha"))]
+    table = np.column_stack([*columns, log.inputs["voltage"]])
+    path.parent.mkdir(exist_ok=True)
+    np.savetxt(path, table, "%.12g", ",", header="time,theta,alpha,u", comments="")
+
+
+def project_in(folder: Path, extra: str = "") -> Path:
+    nominal = Furuta().parameters.nominal()
+    fixed = "\n".join(f"{n} = {v}" for n, v in nominal.items() if n not in FREE)
+    path = folder / "machine.toml"
+    path.write_text(PROJECT.format(fixed=fixed) + extra)
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("identify")
+    for seed in (1, 2):
+        log = simulated(seconds=1.3, seed=seed, noise=5e-4)
+        write(log, folder / "logs" / f"log{seed}.csv")
+    write(simulated(seconds=1.3, seed=3, noise=5e-4), folder / "held" / "log3.csv")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(folder: Path) -> Path:
+    identify.run(project_in(folder), out=folder / "run", seed=0, progress=QUIET)
+    return folder / "run"
+
+
+def test_identify_finds_the_constants(run: Path) -> None:
+    summary = load_run(run).summary
+    nominal = Furuta().parameters.nominal()
+    assert list(summary["parameters"]) == sorted(FREE, key=list(nominal).index)
+    for name, entry in summary["parameters"].items():
+        # A causal start lags: its error is in the noise, and pulls a little.
+        assert entry["mean"] == pytest.approx(nominal[name], rel=0.3)
+        for key in ("unit", "prior_mean", "prior_sd", "q025", "q975", "verdict"):
+            assert key in entry
+    for key in ("log_evidence", "directions", "misfit", "n_transitions", "n_rows"):
+        assert key in summary
+    assert summary["n_rows"] == 1300
+    assert set(summary["noise"]) == {"theta", "alpha"}
+    assert summary["project"] == {"file": "machine.toml", "folder": ".."}
+
+
+def test_identify_writes_a_report_with_traces(run: Path) -> None:
+    text = (run / "report.html").read_text()
+    assert 'id="traces"' in text
+    assert "nan" not in text.lower().replace("nanos", "")
+    arrays = load_run(run).arrays
+    assert np.isnan(arrays["trace/log1/time"]).any()  # gaps between windows
+    assert arrays["trace/log1/low/theta"].shape == arrays["trace/log1/time"].shape
+
+
+def test_evaluate_predicts_a_log_from_anywhere(
+    run: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    summary = evaluate.run(
+        run,
+        [folder / "held" / "log3.csv"],
+        horizon=0.2,
+        out=tmp_path / "out",
+        progress=QUIET,
+    )
+    json.dumps(summary, allow_nan=False)
+    for key in ("open_loop_rmse", "one_step_rmse", "nll", "coverage90", "coverage95"):
+        assert set(summary[key]) == {"theta", "alpha"}
+    assert summary["windows"] == 10
+    assert summary["open_loop_rmse"]["alpha"] < 0.2 * summary["hold_rmse"]["alpha"]
+    assert summary["one_step_rmse"]["alpha"] < 0.01
+    assert [row[0] for row in summary["tables"][1]["rows"]] == ["log3", "pooled"]
+    assert "training logs" not in " ".join(summary["warnings"])
+
+
+def test_leave_one_out_predicts_every_log(folder: Path, tmp_path: Path) -> None:
+    path = project_in(folder)
+    out = tmp_path / "out"
+    summary = evaluate.leave_one_out(path, horizon=0.2, out=out, progress=QUIET)
+    rows = summary["tables"][1]["rows"]
+    assert [row[0] for row in rows] == ["log1", "log2", "pooled"]
+    one, two, pooled = (float(row[2]) for row in rows)
+    assert min(one, two) <= pooled <= max(one, two)
+    assert [row[0] for row in summary["tables"][2]["rows"]] == ["log1", "log2"]
+
+
+def test_no_horizon_longer_than_the_log(run: Path, folder: Path) -> None:
+    for horizon, code in ((5.0, "E116"), (0.0, "E160"), (float("nan"), "E160")):
+        with pytest.raises(InputError) as caught:
+            evaluate.run(
+                run,
+                [folder / "held" / "log3.csv"],
+                horizon=horizon,
+                out=folder / "none",
+                progress=QUIET,
+            )
+        assert caught.value.code == code
+    assert not (folder / "none").exists()
+
+
+def test_values_fixed_by_group_are_refused(folder: Path, tmp_path: Path) -> None:
+    path = project_in(folder, "\n[[logs]]\nfiles = ['held/log3.csv']\n"
+        "columns = {theta = 'theta', alpha = 'alpha', voltage = 'u'}\n"
+        "fixed = {pendulum_mass = 0.03}\n")  # fmt: skip
+    with pytest.raises(InputError, match="not supported yet"):
+        identify.run(path, out=tmp_path / "run", seed=0, progress=QUIET)
+    assert not (tmp_path / "run").exists()
+
+
+def test_effects_are_constants_of_the_machine(folder: Path) -> None:
+    effect = "[effects.theta.coulomb]\nmean = 5e-4\nsd = 5e-4\nmap = 'log'\n"
+    path = project_in(folder, f"\n{effect}width = 0.02\n[effects.alpha]\ndrag = 0.1\n")
+    system = load_project(path).build_system()
+    assert isinstance(system, Perturbed)
+    assert [e.name for e in system.effects] == ["theta.coulomb", "alpha.drag"]
+    assert system.effects[0].width == 0.02
+    assert system.parameters["theta.coulomb"].map == "log"
+    assert dict(system.parameters.fixed)["alpha.drag"] == 0.1
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[effects.theta]\ncoulom = 1.0", "did you mean coulomb"),
+        ("[effects.thetta]\ncoulomb = 1.0", "did you mean theta"),
+        ("[effects.theta]\ndrag = {value = 1.0, width = 0.1}", "unknown option"),
+        ("[effects.theta.coulomb]\nmean = 1.0", "state mean and sd"),
+        ("[effects.theta.coulomb]\nwidth = -1.0\nvalue = 1.0", "width"),
+    ],
+)
+def test_a_wrong_effect_is_one_line(folder: Path, text: str, words: str) -> None:
+    with pytest.raises(InputError) as caught:
+        load_project(project_in(folder, f"\n{text}\n"))
+    assert words in str(caught.value)
+    assert "machine.toml:line" in str(caught.value)
