@@ -11,14 +11,11 @@ from typing import Any
 LONGEST = 12  # numbers of a list that are still printed
 # What a terminal need not repeat: the report and summary.json have it all.
 _HIDDEN = ("warnings", "versions", "animation", "figure1", "units", "tables", "command")
-_HIDDEN_COLUMNS = (
-    "combination",
-    "meaning",
-    "note",
-    "partners",
-    "prior_sd",
-    "everywhere",
-)
+_HIDDEN_COLUMNS = {
+    "parameters": ("meaning", "note", "partners", "low", "high"),
+    "directions": ("combination", "flat"),
+    "base_parameters": ("prior_sd", "everywhere"),
+}
 
 
 def print_summary(summary: Mapping[str, Any], title: str) -> None:
