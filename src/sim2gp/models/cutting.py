@@ -45,7 +45,7 @@ def cut(
     for k, log in enumerate(logs):
         if window == 0.0:
             _, mask = log.measured(measured)
-            whole = mask.all(axis=1)
+            whole = np.asarray(mask.all(axis=1))
             rows = np.flatnonzero(whole[:-1] & whole[1:])
             pieces += [(k, int(i), int(i) + 2) for i in rows]
         else:
