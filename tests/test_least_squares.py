@@ -152,3 +152,14 @@ def test_noise_rounds_follow_their_update():
         v = float(jnp.mean((z - y) ** 2)) + s
     assert float(noise) == pytest.approx(np.sqrt(v), rel=1e-8)
     assert float(fit.z[0]) == pytest.approx(z, rel=1e-8)
+
+
+def test_slow_convergence_is_awaited():
+    """Where the Gauss-Newton step contracts by 0.93 only, thirty steps do not do."""
+
+    def residual(z):
+        return 0.93 * 0.5 * z**2 - 1.0  # Hessian 0.07, Gauss-Newton 1, at z = 0
+
+    fit = ls.polish(factor_of(residual), jnp.asarray([1e-2]), jnp.zeros((), int))
+    assert int(fit.status) == ls.CONVERGED
+    assert float(fit.gradient) <= 1e-8
