@@ -269,7 +269,7 @@ def multi_start(
     count = len(starts)
     schedule = jnp.concatenate([starts, jnp.zeros((rounds, starts.shape[1]))])
     turns = jnp.arange(count + rounds)
-    plan = (schedule, turns < count, turns == count + rounds - 1)
+    plan = (schedule, turns < count, (turns == count + rounds - 1) | (rounds == 0))
     (fit, noise), costs = jax.lax.scan(turn, (best, noise), plan)
     return fit, noise, costs[:count]
 
