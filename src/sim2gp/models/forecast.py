@@ -116,7 +116,7 @@ class Band:
     inflation: float
 
     def scale(self, found: Forecast) -> Float[np.ndarray, "W R c"]:
-        """The square root of V, raised, at every row; rows in rising order of horizon."""
+        """The square root of V, raised, at every row; rows in rising order."""
         V = _variance(found, self.start_sd, self.resolution)
         V = V + np.einsum("wrcm,m->wrc", found.by_input**2, self.input_sd**2)
         return np.sqrt(self.inflation * np.maximum.accumulate(V, axis=1))
