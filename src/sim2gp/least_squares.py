@@ -147,12 +147,14 @@ def minimise(
     *,
     max_steps: int = 60,
     tolerance: float = 1e-10,
+    search: bool | Bool[Array, ""] = True,
     exact: bool | Bool[Array, ""] = True,
 ) -> Fit:
     """One Levenberg-Marquardt descent, finished by undamped QR steps.
 
     ``factor_of(z)`` is the factor of the whitened data residual and its Jacobian, and
-    whatever the caller wants back at the MAP. ``exact`` asks for a zero gradient.
+    whatever the caller wants back at the MAP. Without ``search`` the QR steps start at
+    once, which is enough near the MAP; ``exact`` asks for a zero gradient.
     """
 
     def full_of(z: Array) -> Factor:
@@ -169,15 +171,23 @@ def minimise(
         full = full_of(primals[0])
         return full[:, -1], full[:, :-1] @ tangents[0]
 
-    solution: Any = optx.least_squares(
-        lambda z, _: compressed(z),
-        optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance),
-        z,
-        max_steps=max_steps,
-        throw=False,
-    )
-    steps = solution.stats["num_steps"]
-    return polish(factor_of, solution.value, steps, exact=exact)
+    def descend(z: Array) -> tuple[Array, Array]:
+        solution: Any = optx.least_squares(
+            lambda z, _: compressed(z),
+            optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance),
+            z,
+            max_steps=max_steps,
+            throw=False,
+        )
+        return solution.value, solution.stats["num_steps"]
+
+    none = jax.eval_shape(descend, z)[1]
+
+    def stay(z: Array) -> tuple[Array, Array]:
+        return z, jnp.zeros(none.shape, none.dtype)
+
+    z, steps = jax.lax.cond(search, descend, stay, z)
+    return polish(factor_of, z, steps, exact=exact)
 
 
 def polish(
@@ -242,12 +252,17 @@ def multi_start(
     Returns the fit, its noise, and the cost that each start reached.
     """
 
-    def descend(z: Array, noise: Any, exact: Array) -> Fit:
+    def descend(z: Array, noise: Any, search: Array, exact: Array) -> Fit:
         return minimise(
-            lambda z: factor_of(z, noise), z, tolerance=tolerance, exact=exact
+            lambda z: factor_of(z, noise),
+            z,
+            tolerance=tolerance,
+            search=search,
+            exact=exact,
         )
 
-    shapes = jax.eval_shape(descend, starts[0], noise, jnp.asarray(True))
+    yes = jnp.asarray(True)
+    shapes = jax.eval_shape(descend, starts[0], noise, yes, yes)
     best = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
     nothing = (jnp.asarray(jnp.inf), jnp.full_like(best.status, NOT_FINITE))
     best = eqx.tree_at(lambda f: (f.cost, f.status), best, nothing)
@@ -260,7 +275,8 @@ def multi_start(
             return jax.tree.map(lambda y, n: jnp.where(searching, y, n), yes, no)
 
         noise = pick(noise, update(best, noise))
-        fit = descend(jnp.where(searching, start, best.z), noise, last)
+        z = jnp.where(searching, start, best.z)
+        fit = descend(z, noise, searching, last)
         # A cost that is not finite never wins; a comparison with NaN is false.
         better = jnp.where(searching, fit.cost < best.cost, True)
         best = jax.tree.map(lambda new, old: jnp.where(better, new, old), fit, best)

@@ -37,7 +37,7 @@ from sim2gp.least_squares import Factor, Fit, multi_start, triangular
 from sim2gp.systems.base import AbstractSystem, rk4
 from sim2gp.types import AnyArray, Key, Scalar, in_float64
 
-NOISE_ROUNDS = 12  # fewer leave noise and starts of real logs short of a fixed point
+NOISE_ROUNDS = 8  # fewer leave noise and starts of real logs short of a fixed point
 FREEDOM = 4.0  # degrees of freedom of the Student-t weight
 DELAY_BLUR = 4e-3  # s, of inputs that may be delayed
 DESCENT = 1e-4  # tolerance of one descent; the undamped steps do the rest
