@@ -158,13 +158,15 @@ def test_band_covers_what_it_says() -> None:
         grid.windows, grid.log[train], grid.since[train], grid.lag[train]
     )
     band = fit_band(found.of(train), known, 6)
-    # Torques change every half second, so that the longest windows see their mean.
-    np.testing.assert_allclose(band.input_sd, 0.15, rtol=0.6)
+    # One joint's disturbance may explain both joints' errors: the sum is what counts.
+    assert 0.03 < np.linalg.norm(band.input_sd) < 0.4
     test = found.of(~train)
     inside = np.abs(test.error) <= band.half_width(0.9) * band.scale(test)
     share = np.sum(inside & test.valid, axis=0) / test.valid.sum(axis=0)
-    assert share.min() > 0.8
-    assert np.mean(share) > 0.85
+    # Two logs hold 12 disturbances: a share of .9 has a standard error of .087, and
+    # the least of twenty lies some 2.5 of them below.
+    assert share.min() > 0.68
+    assert 0.82 < np.mean(share) < 0.98
     scale = band.scale(test)
     assert (np.diff(scale, axis=1) >= 0.0).all()
 
@@ -182,7 +184,7 @@ def test_published_models_score_as_known(
     shared_data: Path, model: str, pooled: tuple[float, float]
 ) -> None:
     """The figures that the recordings come with, through the package's own path."""
-    from sim2gp.logs import read_csv
+    from sim2gp.logs import Column, read_csv
 
     arm_folder = shared_data / "double_pendulum"
     text = (arm_folder / "published_parameters" / f"c1_model_{model}.yml").read_text()
@@ -193,8 +195,8 @@ def test_published_models_score_as_known(
     rest = [v[k] for k in ("b1", "b2", "cf1", "cf2", "Ir")]
     numbers = [first, v["I1"], v["m2"], second, v["I2"], *rest]
     system = arm(numbers)
-    columns = {"q1": "pos_meas1", "q2": "pos_meas2"}
-    columns |= {"torque1": "tau_con1", "torque2": "tau_con2"}
+    columns = {"q1": Column("pos_meas1"), "q2": Column("pos_meas2")}
+    columns |= {"torque1": Column("tau_con1"), "torque2": Column("tau_con2")}
     logs = [
         log
         for file in sorted((arm_folder / "excitation").glob("*.csv"))
