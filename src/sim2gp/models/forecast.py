@@ -61,21 +61,31 @@ def forecast(
     windows: Windows,
     rows: Float[np.ndarray, " R"] | np.ndarray,
 ) -> Forecast:
-    """Simulate every window from its start at the posterior mean."""
-    exact = jax.tree.map(lambda x: jnp.asarray(x), windows)
-    parts = _forecast(system, posterior, exact, jnp.asarray(rows, int))
-    mean, by_start, by_input, by_constants = (np.asarray(part) for part in parts)
+    """Simulate every window from its start at the posterior mean.
+
+    Batches of one size, the last one filled up: all forecasts of a run share one
+    compilation, and memory is bounded however long the logs are.
+    """
+    rows, W = np.asarray(rows, int), len(windows)
+    parts = []
+    for first in range(0, W, _BATCH):
+        which = np.minimum(np.arange(first, first + _BATCH), W - 1)
+        found = _forecast(system, posterior, _some(windows, which))
+        parts.append([np.asarray(x)[: W - first, rows] for x in found])
+    mean, by_start, by_input, by_constants = map(
+        np.concatenate, zip(*parts, strict=True)
+    )
     y, valid = np.asarray(windows.y)[:, rows], np.asarray(windows.mask)[:, rows]
     return Forecast(mean, mean - y, valid, by_start, by_input, by_constants)
 
 
 @eqx.filter_jit
 def _forecast(
-    system: AbstractSystem, posterior: Gaussian, windows: Windows, rows: Array
+    system: AbstractSystem, posterior: Gaussian, windows: Windows
 ) -> tuple[Array, Array, Array, Array]:
+    """Outputs at all rows, their slopes in start and input, variance by constants."""
     n, m = windows.start.shape[1], windows.area.shape[2]
     k = posterior.scale.shape[1]
-    outputs = np.asarray(windows.outputs)
 
     def predict(window: Windows, x: Array) -> tuple[Array, Array]:
         tt = posterior.mean + posterior.scale @ x[n + m :]
@@ -83,7 +93,7 @@ def _forecast(
         more = window.knots[:, None] * x[n : n + m][None]
         moved = eqx.tree_at(lambda w: w.area, window, window.area + more)
         states = simulate(system, params, moved, window.start + x[:n])
-        out = states[rows][:, outputs]
+        out = states[:, np.asarray(windows.outputs)]
         return out, out
 
     def one(window: Windows) -> tuple[Array, Array, Array, Array]:
@@ -92,18 +102,16 @@ def _forecast(
         rest = jnp.sum(J[..., n + m :] ** 2, axis=-1)
         return mean, J[..., :n], J[..., n : n + m], rest
 
-    # The floor belongs to all windows; predictions do not need it.
-    each = eqx.tree_at(lambda w: w.floor, windows, None)
-    found: tuple[Array, Array, Array, Array] = jax.lax.map(
-        lambda w: one(eqx.tree_at(lambda v: v.floor, w, windows.floor, is_leaf=_none)),
-        each,
-        batch_size=_BATCH,
-    )
+    found: tuple[Array, Array, Array, Array] = windows.each(one)
     return found
 
 
-def _none(x: object) -> bool:
-    return x is None
+def _some(windows: Windows, which: np.ndarray) -> Windows:
+    """Some of the windows, as JAX arrays; the sensors' floor belongs to all."""
+    floor = jnp.asarray(windows.floor)
+    rest = eqx.tree_at(lambda w: w.floor, windows, None)
+    chosen = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[which]), rest)
+    return eqx.tree_at(lambda w: w.floor, chosen, floor, is_leaf=lambda x: x is None)
 
 
 @dataclass(frozen=True)
