@@ -37,6 +37,14 @@ def published(path: Path) -> list[float]:
     return [first, v["I1"], v["m2"], second, v["I2"], *rest]
 
 
+def errors_of(models: list[np.ndarray], logs: list[Any], horizon: float) -> list[Any]:
+    """Errors of each log under its own model, by the tests' protocol."""
+    return [
+        protocol.errors(plain.bound(plain.arm_acceleration, p), log, horizon)
+        for p, log in zip(models, logs, strict=True)
+    ]
+
+
 def ours(horizon: float, folder: Path) -> dict[str, Any]:
     """Leave one log out by the package's own command."""
     from sim2gp.experiments.evaluate import leave_one_out
@@ -78,18 +86,10 @@ def main() -> None:
     files = sorted((arm / "excitation").glob("*.csv"))
     logs = [protocol.on_grid(protocol.read_arm(f)) for f in files]
     fits = [plain.fit_arm(logs[:k] + logs[k + 1 :]) for k in range(len(logs))]
-    errors = {
-        "least squares": [
-            protocol.errors(plain.bound(plain.arm_acceleration, p), log, horizon)
-            for p, log in zip(fits, logs, strict=True)
-        ]
-    }
+    errors = {"least squares": errors_of(fits, logs, horizon)}
     for file in sorted((arm / "published_parameters").glob("*.yml")):
-        p = np.asarray(published(file))
-        errors[file.stem.removeprefix("c1_")] = [
-            protocol.errors(plain.bound(plain.arm_acceleration, p), log, horizon)
-            for log in logs
-        ]
+        same = [np.asarray(published(file))] * len(logs)
+        errors[file.stem.removeprefix("c1_")] = errors_of(same, logs, horizon)
     summary = ours(horizon, options.run)
     by_log = table(summary, "Error at")
     mine = {j: column(by_log, j) for j in JOINTS}
