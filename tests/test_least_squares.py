@@ -77,6 +77,7 @@ def multi_start(residual, starts, rounds=0, update=no_update, noise=1.0):
         jnp.asarray(noise),
         update,
         rounds=rounds,
+        searches=rounds,
     )
 
 

@@ -244,12 +244,15 @@ def multi_start(
     update: Callable[[Fit, Any], Any],
     *,
     rounds: int,
+    searches: int,
     tolerance: float = 1e-10,
 ) -> tuple[Fit, Any, Float[Array, " starts"]]:
     """The best of several descents; then ``rounds`` of noise update and descent (EM).
 
-    Every descent is one turn of the same scan, so that the likelihood is compiled once.
-    Returns the fit, its noise, and the cost that each start reached.
+    The first ``searches`` rounds descend as the starts do, because the noise falls far
+    there; later ones only take QR steps. Every descent is one turn of the same scan, so
+    that the likelihood is compiled once. Returns the fit, its noise, and the cost that
+    each start reached.
     """
 
     def descend(z: Array, noise: Any, search: Array, exact: Array) -> Fit:
@@ -269,14 +272,14 @@ def multi_start(
 
     def turn(carry: tuple[Fit, Any], x: tuple[Array, ...]) -> tuple[tuple, Array]:
         best, noise = carry
-        start, searching, last = x
+        start, searching, far, last = x
 
         def pick(yes: Any, no: Any) -> Any:
             return jax.tree.map(lambda y, n: jnp.where(searching, y, n), yes, no)
 
         noise = pick(noise, update(best, noise))
         z = jnp.where(searching, start, best.z)
-        fit = descend(z, noise, searching, last)
+        fit = descend(z, noise, far, last)
         # A cost that is not finite never wins; a comparison with NaN is false.
         better = jnp.where(searching, fit.cost < best.cost, True)
         best = jax.tree.map(lambda new, old: jnp.where(better, new, old), fit, best)
@@ -285,7 +288,8 @@ def multi_start(
     count = len(starts)
     schedule = jnp.concatenate([starts, jnp.zeros((rounds, starts.shape[1]))])
     turns = jnp.arange(count + rounds)
-    plan = (schedule, turns < count, (turns == count + rounds - 1) | (rounds == 0))
+    far = turns < count + searches
+    plan = (schedule, turns < count, far, (turns == count + rounds - 1) | (rounds == 0))
     (fit, noise), costs = jax.lax.scan(turn, (best, noise), plan)
     return fit, noise, costs[:count]
 

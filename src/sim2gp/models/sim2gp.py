@@ -255,6 +255,7 @@ def _fit(
         change,
         update,
         rounds=NOISE_ROUNDS,
+        searches=NOISE_ROUNDS,
         tolerance=DESCENT,
     )
     normaliser = N * jnp.sum(jnp.log(noise) + 0.5 * LOG_2PI)

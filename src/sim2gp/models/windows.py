@@ -38,6 +38,7 @@ from sim2gp.systems.base import AbstractSystem, rk4
 from sim2gp.types import AnyArray, Key, Scalar, in_float64
 
 NOISE_ROUNDS = 8  # fewer leave noise and starts of real logs short of a fixed point
+SEARCHES = 2  # of these, rounds with a full descent
 FREEDOM = 4.0  # degrees of freedom of the Student-t weight
 DELAY_BLUR = 4e-3  # s, of inputs that may be delayed
 DESCENT = 1e-4  # tolerance of one descent; the undamped steps do the rest
@@ -265,6 +266,7 @@ def _fit(
         _Noise(sd, weights, jnp.zeros(p), e, slope),
         update,
         rounds=NOISE_ROUNDS,
+        searches=SEARCHES,
         tolerance=DESCENT,
     )
     log_evidence = (
