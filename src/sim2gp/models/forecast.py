@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Float
 
 from sim2gp.gaussian import Gaussian
 from sim2gp.models.grid import Grid
+from sim2gp.models.linearized import value_and_jacobian
 from sim2gp.models.windows import Windows, simulate
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import in_float64
@@ -87,18 +88,17 @@ def _forecast(
     n, m = windows.start.shape[1], windows.area.shape[2]
     k = posterior.scale.shape[1]
 
-    def predict(window: Windows, x: Array) -> tuple[Array, Array]:
+    def predict(window: Windows, x: Array) -> Array:
         tt = posterior.mean + posterior.scale @ x[n + m :]
         params = system.record(system.parameters.values(tt))
         more = window.knots[:, None] * x[n : n + m][None]
         moved = eqx.tree_at(lambda w: w.area, window, window.area + more)
         states = simulate(system, params, moved, window.start + x[:n])
-        out = states[:, np.asarray(windows.outputs)]
-        return out, out
+        return states[:, np.asarray(windows.outputs)]
 
     def one(window: Windows) -> tuple[Array, Array, Array, Array]:
         zero = jnp.zeros(n + m + k)
-        J, mean = jax.jacfwd(lambda x: predict(window, x), has_aux=True)(zero)
+        mean, J = value_and_jacobian(lambda x: predict(window, x), zero)
         rest = jnp.sum(J[..., n + m :] ** 2, axis=-1)
         return mean, J[..., :n], J[..., n : n + m], rest
 

@@ -52,7 +52,7 @@ class NonlinearDraw(eqx.Module):
 
 def value_and_jacobian(
     f: Callable[[Array], Array], tt: Float[Array, " p"]
-) -> tuple[Float[Array, " d"], Float[Array, "d p"]]:
+) -> tuple[Float[Array, "*d"], Float[Array, "*d p"]]:
     """``f(tt)`` and its Jacobian, by forward mode (p is small, rollouts are long)."""
 
     def twice(tt: Array) -> tuple[Array, Array]:

@@ -34,6 +34,7 @@ from jaxtyping import Array, Bool, Float
 
 from sim2gp.gaussian import LOG_2PI, Gaussian
 from sim2gp.least_squares import Factor, Fit, multi_start, triangular
+from sim2gp.models.linearized import value_and_jacobian
 from sim2gp.systems.base import AbstractSystem, rk4
 from sim2gp.types import AnyArray, Key, Scalar, in_float64
 
@@ -197,11 +198,9 @@ class _Windowed(eqx.Module):
         """The QR of the module's equation, for one window."""
         p, n, c = z.size, e.size, noise.size
 
-        def twice(x: Array) -> tuple[Array, Array]:
-            r = self.residual(window, x)
-            return r, r
-
-        J, r = jax.jacfwd(twice, has_aux=True)(jnp.concatenate([z, e]))
+        r, J = value_and_jacobian(
+            lambda x: self.residual(window, x), jnp.concatenate([z, e])
+        )
         own, rest = J[..., p:], jnp.concatenate([J[..., :p], r[..., None]], axis=-1)
         root = jnp.sqrt(weight)
         data = jnp.concatenate([own, rest], axis=-1) * (root / noise)[None, :, None]
