@@ -29,6 +29,7 @@ _CONTENTS = {
     "AbstractModel": "models",
     "AbstractBelief": "models",
     "Sim2GP": "models",
+    "NLM": "models",
     "PointEstimate": "models",
     "PriorMean": "models",
     "Windows": "models",

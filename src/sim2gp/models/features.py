@@ -1,0 +1,238 @@
+"""Features for neural linear models: encoded inputs, a small network, its optimiser.
+
+    phi(x) = [tanh(... tanh(enc(x) A + a) ...) ; 1] / sqrt(m)
+
+Weights and training are in float32; `Network` computes in the precision of its input,
+so that posteriors on top of it are exact in float64. Bounded smooth units: outside the
+data a feature goes flat, it does not extrapolate along a line.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from sim2gp.errors import InputError, nearest
+from sim2gp.systems.base import AbstractSystem
+from sim2gp.transitions import Transitions
+from sim2gp.types import Action, Key, Scalar, State
+
+#: Half-width of a channel without limits, by its unit: how far a small machine moves.
+REACH = {"rad": math.pi, "rad/s": 20.0, "m": 1.0, "m/s": 2.0}
+HELD_OUT = 5  # one chunk of rows in so many
+CHUNK = 5  # rows; neighbours in time are too alike to judge each other
+SPLIT = 0  # names the split; another number is another split
+WEIGHT_DECAY = 1e-4
+
+
+class Encoding(eqx.Module):
+    """``(s, a)`` as network inputs of order one: angles as (sin, cos), the rest scaled.
+
+    ``low`` and ``high`` are also the box in which a prior over functions is compared.
+    """
+
+    angle: tuple[bool, ...] = eqx.field(static=True)
+    low: tuple[float, ...] = eqx.field(static=True)
+    high: tuple[float, ...] = eqx.field(static=True)
+    outputs: int = eqx.field(static=True)  # physical states
+
+    @classmethod
+    def of(cls, system: AbstractSystem, reach: Mapping[str, float]) -> "Encoding":
+        """From the channels' limits; ``reach`` gives half-widths for some by name.
+
+        A channel with neither takes `REACH` of its unit, or 1. Raises `InputError`
+        E103 for an unknown name.
+        """
+        channels = (*system.states, *system.actions)
+        names = [channel.name for channel in channels]
+        for name in reach:
+            if name not in names:
+                close = nearest(name, names)
+                raise InputError(
+                    "E103",
+                    "unknown channel",
+                    where="reach",
+                    got=name,
+                    expected=f"one of {', '.join(names)}",
+                    fix=f"did you mean {close}?" if close else "",
+                )
+        low, high = [], []
+        for channel in channels:
+            half = reach.get(channel.name, REACH.get(channel.unit, 1.0))
+            limited = math.isfinite(channel.low) and math.isfinite(channel.high)
+            given = channel.name in reach or not limited
+            low.append(-half if given else channel.low)
+            high.append(half if given else channel.high)
+        angles = tuple(channel.angle for channel in channels)
+        return cls(angles, tuple(low), tuple(high), len(system.physical_states))
+
+    @property
+    def size(self) -> int:
+        """Number of encoded inputs."""
+        return len(self.angle) + sum(self.angle)
+
+    def __call__(self, s: State, a: Action) -> Float[Array, " e"]:
+        parts = []
+        for i, x in enumerate([*s, *a]):
+            if self.angle[i]:
+                parts += [jnp.sin(x), jnp.cos(x)]
+            else:
+                middle = 0.5 * (self.low[i] + self.high[i])
+                parts.append((x - middle) / (0.5 * (self.high[i] - self.low[i])))
+        return jnp.stack(parts)
+
+    def half_widths(self) -> Float[Array, " d"]:
+        """Half the box of each physical state."""
+        pairs = zip(self.low, self.high, strict=True)
+        return jnp.asarray([0.5 * (high - low) for low, high in pairs])[: self.outputs]
+
+
+class Network(eqx.Module):
+    """The feature map: tanh layers, then a constant, so that ``|phi| <= 1``."""
+
+    weights: tuple[Float[Array, "_ _"], ...]
+    biases: tuple[Float[Array, " _"], ...]
+
+    @classmethod
+    def random(cls, key: Key, inputs: int, hidden: tuple[int, ...]) -> "Network":
+        """Float32 weights of variance 2 / inputs, biases of sd 1/2: varied features."""
+        weights, biases = [], []
+        for width in hidden:
+            key, a, b = jax.random.split(key, 3)
+            W = jax.random.normal(a, (inputs, width), jnp.float32)
+            weights.append(W * math.sqrt(2.0 / inputs))
+            biases.append(0.5 * jax.random.normal(b, (width,), jnp.float32))
+            inputs = width
+        return cls(tuple(weights), tuple(biases))
+
+    @property
+    def features(self) -> int:
+        """Number of features, the constant included."""
+        return self.biases[-1].size + 1
+
+    def __call__(self, x: Float[Array, " e"]) -> Float[Array, " m"]:
+        for W, b in zip(self.weights, self.biases, strict=True):
+            x = jnp.tanh(x @ W.astype(x.dtype) + b.astype(x.dtype))
+        return jnp.concatenate([x, jnp.ones(1, x.dtype)]) / math.sqrt(self.features)
+
+
+def stepped(s: State, a: Action, delta: Float[Array, " d"]) -> State:
+    """``s + delta`` on the physical states; carried past actions move one place on."""
+    d = delta.size
+    past = jnp.concatenate([a, s[d:]])[: s.size - d]
+    return jnp.concatenate([s[:d] + delta, past])
+
+
+def held_out_rows(mask: Bool[Array, " N"]) -> Bool[Array, " N"]:
+    """One chunk of `CHUNK` successive rows in every `HELD_OUT`, at random places.
+
+    A row stays where it is when data grow, whatever the capacity: a warm start has
+    seen the training rows, so a new split would leak them. Of fewer rows than a chunk
+    one is held out, of one none.
+    """
+    row = jnp.arange(len(mask))
+    chunk = row // CHUNK
+    places = jax.vmap(
+        lambda group: jax.random.randint(
+            jax.random.fold_in(jax.random.key(SPLIT), group), (), 0, HELD_OUT
+        )
+    )(chunk // HELD_OUT)
+    out = mask & (chunk % HELD_OUT == places)
+    enough = jnp.any(out) & jnp.any(mask & ~out)
+    return jnp.where(enough, out, mask & (row == 0) & (jnp.sum(mask) > 1))
+
+
+def encoded(
+    encoding: Encoding, data: Transitions
+) -> tuple[Float[Array, "N e"], Float[Array, "N d"]]:
+    """Encoded inputs and increments of the physical states, masked rows zero."""
+    mask = data.mask[:, None]
+    X = jax.vmap(encoding)(data.state, data.action)
+    y = data.delta()[:, : encoding.outputs]
+    return jnp.where(mask, X, 0.0), jnp.where(mask, y, 0.0)
+
+
+class Minibatches(eqx.Module):
+    """Rows in a random order; a batch is a window of it, and all of few data."""
+
+    order: Int[Array, " N"]
+    count: Int[Array, ""]
+
+    @classmethod
+    def shuffled(cls, key: Key, rows: Bool[Array, " N"]) -> "Minibatches":
+        """A new order of the chosen rows."""
+        keys = jnp.where(rows, jax.random.uniform(key, rows.shape), 2.0)
+        return cls(jnp.argsort(keys), jnp.sum(rows))
+
+    def batch(self, t: Int[Array, ""], size: int) -> tuple[Array, Array]:
+        """Indices and validity of batch ``t``; no row appears twice in it."""
+        size = min(size, self.order.size)
+        places = jnp.arange(size)
+        start = jnp.where(self.count > size, t * size, 0)
+        wrapped = (start + places) % jnp.maximum(self.count, 1)
+        return self.order[wrapped], places < self.count
+
+
+#: ``(parameters, t, key) -> gradient`` of what is minimised.
+Gradient = Callable[[Any, Array, Key], Any]
+#: First and second moment of the gradients so far.
+Moments = tuple[Any, Any]
+
+
+def adam(parameters: Any) -> Moments:
+    """The optimiser before its first step."""
+    zeros = jax.tree.map(jnp.zeros_like, parameters)
+    return zeros, zeros
+
+
+def descend(
+    gradient: Gradient,
+    parameters: Any,
+    state: Moments,
+    rates: Any,
+    *,
+    steps: int,
+    start: Int[Array, ""],
+    total: Int[Array, ""],
+    key: Key,
+) -> tuple[Any, Moments]:
+    """``steps`` of Adam (Kingma & Ba 2015) from step ``start`` of ``total``; one scan.
+
+    The rate falls along a half cosine to a tenth, weights decay apart from the
+    moments. A gradient that is not finite changes nothing: one bad batch does not end
+    a training.
+    """
+
+    def step(carry: tuple[Any, Moments], i: Array) -> tuple[tuple, None]:
+        parameters, (first, second) = carry
+        t = start + i
+        grads = gradient(parameters, t, jax.random.fold_in(key, t))
+        finite = [jnp.all(jnp.isfinite(g)) for g in jax.tree.leaves(grads)]
+        new = (
+            jax.tree.map(lambda m, g: 0.9 * m + 0.1 * g, first, grads),
+            jax.tree.map(lambda v, g: 0.999 * v + 0.001 * g**2, second, grads),
+        )
+        done = (t + 1).astype(jnp.float32)
+        unbiased = jnp.sqrt(1.0 - 0.999**done) / (1.0 - 0.9**done)
+        share = jnp.minimum(t / jnp.maximum(total, 1), 1.0).astype(jnp.float32)
+        fall = 0.55 + 0.45 * jnp.cos(jnp.pi * share)
+
+        def move(p: Array, m: Array, v: Array, rate: float) -> Array:
+            towards = unbiased.astype(p.dtype) * m / (jnp.sqrt(v) + 1e-8)
+            return p - rate * fall.astype(p.dtype) * (towards + WEIGHT_DECAY * p)
+
+        moved = jax.tree.map(move, parameters, *new, rates)
+        good = jnp.all(jnp.stack(finite))
+        return chosen(good, (moved, new), carry), None
+
+    (parameters, state), _ = jax.lax.scan(step, (parameters, state), jnp.arange(steps))
+    return parameters, state
+
+
+def chosen(condition: Scalar | Array, new: Any, old: Any) -> Any:
+    """``new`` where the condition holds, leaf by leaf."""
+    return jax.tree.map(lambda n, o: jnp.where(condition, n, o), new, old)
