@@ -30,6 +30,7 @@ _CONTENTS = {
     "AbstractBelief": "models",
     "Sim2GP": "models",
     "NLM": "models",
+    "Residual": "models",
     "PointEstimate": "models",
     "PriorMean": "models",
     "Windows": "models",
