@@ -31,6 +31,8 @@ _CONTENTS = {
     "Sim2GP": "models",
     "NLM": "models",
     "Residual": "models",
+    "FunctionSpace": "models",
+    "ResidualFunctionSpace": "models",
     "PointEstimate": "models",
     "PriorMean": "models",
     "Windows": "models",

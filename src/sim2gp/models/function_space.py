@@ -1,0 +1,207 @@
+"""FS: a network alone, whose prior over functions is the simulator's (eq. 4).
+
+    f(x) = c (.) W^T phi(x),     q(W) trained as in `matching`
+
+Its target is the simulator's Gaussian process: mean ``f(x, tt*)``, covariance
+``J Sq J^T + Se_sim``. At the first fit the network is first distilled from it, without
+data; how well that succeeds bounds how well it predicts far from the data. Before any
+data the belief is the simulator's prior itself.
+"""
+
+from collections.abc import Mapping
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sim2gp.gaussian import Gaussian, lower_factor
+from sim2gp.models import features, hybrid, matching, nlm
+from sim2gp.models.base import AbstractBelief, AbstractModel
+from sim2gp.models.features import Encoding
+from sim2gp.models.hybrid import HybridBelief
+from sim2gp.models.last_layer import LastLayer
+from sim2gp.models.matching import OBJECTIVES, Budget, Objective, Variational
+from sim2gp.models.sim2gp import Sim2GP, Sim2GPBelief
+from sim2gp.transitions import Transitions
+from sim2gp.types import Action, Key, State, in_float64
+
+FS_PRIORS = ("posterior", "prior")
+SCALE_SEED = 0  # of the inputs that set the outputs' scale, alike in all runs
+
+
+class FunctionSpace(AbstractModel):
+    """A network with the simulator as its prior over functions.
+
+    objective: ``"recommended"``, or ``"literal"`` as the paper prints it: weight 1,
+        marginals, the noise learned in the comparison, no distillation.
+    fs_prior: compare with the simulator fitted to all data, or with its ``"prior"``.
+    pretrain: steps of distillation before the first fit (none for ``"literal"``).
+    steps, refit_steps: as in `ResidualFunctionSpace`; other options as in `NLM`.
+    """
+
+    sim: Sim2GP
+    encoding: Encoding
+    objective: Objective
+    hidden: tuple[int, ...] = eqx.field(static=True)
+    pretrain: int = eqx.field(static=True)
+    steps: int = eqx.field(static=True)
+    refit_steps: int = eqx.field(static=True)
+    fs_prior: str = eqx.field(static=True)
+
+    def __init__(
+        self,
+        sim: Sim2GP,
+        *,
+        objective: str = "recommended",
+        fs_prior: str = "posterior",
+        hidden: tuple[int, ...] = (128, 128),
+        pretrain: int = 4000,
+        steps: int = 2000,
+        refit_steps: int = 1000,
+        reach: Mapping[str, float] | None = None,
+    ) -> None:
+        if fs_prior not in FS_PRIORS:
+            names = ", ".join(FS_PRIORS)
+            raise ValueError(f"fs_prior is {fs_prior!r}, not one of {names}")
+        self.sim = sim
+        self.encoding = Encoding.of(sim.system, reach or {})
+        self.objective = objective_of(objective)
+        self.hidden = tuple(hidden)
+        self.pretrain = 0 if objective == "literal" else pretrain
+        self.steps = steps
+        self.refit_steps = refit_steps
+        self.fs_prior = fs_prior
+
+    @in_float64
+    def init(self, key: Key) -> HybridBelief:
+        """The simulator's prior; the network adds nothing yet."""
+        return hybrid.before_data(self.sim, self.encoding, self.hidden, key)
+
+    @in_float64
+    def fit(
+        self, belief: AbstractBelief, data: Transitions, *, key: Key
+    ) -> HybridBelief:
+        """SIM2GP, then the network. Raises what SIM2GP's fit raises, `NotFinite`."""
+        assert isinstance(belief, HybridBelief)
+        if data.count == 0:
+            return belief
+        first, second = jax.random.split(key)
+        sim = self.sim.fit(belief.sim, data, key=first)
+        again = int(belief.count) > 0
+        data = jax.tree.map(jnp.asarray, data)
+        budget = (
+            budget_of(0, self.refit_steps)
+            if again
+            else budget_of(self.pretrain, self.steps)
+        )
+        target = self.sim.prior if self.fs_prior == "prior" else sim.posterior
+        towards = eqx.tree_at(lambda b: b.posterior, sim, target)
+        fitted = _fit(belief, sim, towards, data, second, budget, self.objective)
+        return nlm.checked(fitted, data)
+
+    def update(
+        self, belief: AbstractBelief, s: State, a: Action, s2: State
+    ) -> HybridBelief:
+        """Condition the layer on one transition; call in float64."""
+        assert isinstance(belief, HybridBelief)
+        return hybrid.conditioned(self.sim, belief, s, a, s2)
+
+
+@eqx.filter_jit
+def _fit(
+    belief: HybridBelief,
+    sim: Sim2GPBelief,
+    towards: Sim2GPBelief,
+    data: Transitions,
+    key: Key,
+    budget: Budget,
+    objective: Objective,
+) -> HybridBelief:
+    pool, training = jax.random.split(key)
+    head, mask = belief.head, data.mask
+    X, y = features.encoded(head.encoding, data)
+    S, A = matching.inputs(pool, head.encoding, data, matching.POOL)
+    every, tt = jnp.ones(len(S), bool), towards.posterior.mean
+    f, J = hybrid.physics_rows(towards, tt, S, A, every)
+    # Once and for all from the simulator's prior, so that the scales never jump.
+    some = matching.inputs(
+        jax.random.key(SCALE_SEED), head.encoding, data, matching.POOL
+    )
+    g, _ = hybrid.physics_rows(towards, sim.prior.mean, *some, every)
+    c = jnp.where(belief.count > 0, head.output_scale, jnp.std(g, axis=0))
+    c = jnp.where(c > 0.0, c, sim.noise)
+    target = matching.targets(
+        jax.vmap(head.encoding)(S, A),
+        f / c[None],
+        (J @ towards.posterior.scale) / c[None, :, None],
+        sim.noise / c,
+        objective.sets,
+    )
+    q, noise = matching.train(
+        start(belief, sim, c),
+        X,
+        y / c[None],
+        mask,
+        target,
+        objective,
+        budget,
+        training,
+    )
+    head = head_of(belief, q, noise, c)
+    replaced = jnp.zeros(())
+    return HybridBelief(sim, at_map(sim), replaced, head, noise * c, jnp.sum(mask))
+
+
+def objective_of(name: str) -> Objective:
+    """The named objective; ValueError lists what there is."""
+    if name not in OBJECTIVES:
+        names = ", ".join(OBJECTIVES)
+        raise ValueError(f"objective is {name!r}, not one of {names}")
+    return OBJECTIVES[name]
+
+
+def budget_of(alone: int, steps: int) -> Budget:
+    """The last third of ``steps`` is on all data, rounded down to whole blocks."""
+    last = steps // 3 // matching.BLOCK * matching.BLOCK
+    return Budget(*(jnp.asarray(n) for n in (alone, steps - last, last)))
+
+
+def start(
+    belief: HybridBelief, sim: Sim2GPBelief, c: Float[Array, " d"]
+) -> Variational:
+    """Where training begins: at nothing, or at the last posterior in the new units."""
+    head, first = belief.head, belief.count == 0
+    ratio = jnp.where(first, 0.0, head.output_scale / c)
+    # Updates leave scales that are no longer triangular.
+    kept = jax.vmap(lower_factor)(head.layer.scale) * ratio[:, None, None]
+    eye = matching.INITIAL_SCALE * jnp.eye(kept.shape[1])
+    factor = jnp.where(first, eye[None], kept)
+    noise = jnp.where(first, sim.noise, belief.noise) / c
+    mean = head.layer.mean * ratio[:, None]
+    return Variational(
+        head.trained.network,
+        mean.astype(jnp.float32),
+        factor.astype(jnp.float32),
+        jnp.log(noise),
+    )
+
+
+def head_of(
+    belief: HybridBelief,
+    q: Variational,
+    noise: Float[Array, " d"],
+    c: Float[Array, " d"],
+) -> nlm.Head:
+    """The trained posterior, in float64, as a layer that shares nothing with ``tt``."""
+    old = belief.head
+    trained = nlm.Trained(q.network, old.trained.log_alpha, jnp.log(noise))
+    mean, factor = q.mean.astype(noise.dtype), jnp.tril(q.factor).astype(noise.dtype)
+    layer = LastLayer(mean, jnp.zeros_like(old.layer.shared), factor)
+    return nlm.Head(trained, layer, c, old.encoding)
+
+
+def at_map(sim: Sim2GPBelief) -> Gaussian:
+    """The constants' MAP without spread: the layer's variance speaks for it."""
+    nothing = jnp.zeros_like(sim.posterior.scale)
+    return eqx.tree_at(lambda g: g.scale, sim.posterior, nothing)

@@ -1,0 +1,132 @@
+"""RES-FS: physics plus a residual that is told where it has no business.
+
+    f(x) = f(x, tt*) + c (.) W^T phi(x),        c = 3 sig_sim
+
+The residual is trained as in `matching`, with mean zero and covariance
+``J Sq J^T + Se_sim`` as its target: far from the data it returns to the simulator, with
+the simulator's uncertainty and its fitted discrepancy as *epistemic* variance. That
+variance is the layer's, so a draw varies ``W`` alone.
+"""
+
+from collections.abc import Mapping
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from sim2gp.models import features, hybrid, matching, nlm
+from sim2gp.models.base import AbstractBelief, AbstractModel
+from sim2gp.models.features import Encoding
+from sim2gp.models.function_space import (
+    at_map,
+    budget_of,
+    head_of,
+    objective_of,
+    start,
+)
+from sim2gp.models.hybrid import HybridBelief
+from sim2gp.models.matching import Budget, Objective
+from sim2gp.models.residual import SCALE
+from sim2gp.models.sim2gp import Sim2GP, Sim2GPBelief
+from sim2gp.transitions import Transitions
+from sim2gp.types import Action, Key, State, in_float64
+
+
+class ResidualFunctionSpace(AbstractModel):
+    """Simulator plus residual, matched to the simulator where there are no data.
+
+    steps, refit_steps: Adam steps of the first fit and of later ones; the last third
+    is on all data, after the noise has been fitted to the held-out fifth.
+    Other options as in `NLM`.
+    """
+
+    sim: Sim2GP
+    encoding: Encoding
+    objective: Objective
+    hidden: tuple[int, ...] = eqx.field(static=True)
+    steps: int = eqx.field(static=True)
+    refit_steps: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        sim: Sim2GP,
+        *,
+        objective: str = "recommended",
+        hidden: tuple[int, ...] = (64, 64),
+        steps: int = 2000,
+        refit_steps: int = 1000,
+        reach: Mapping[str, float] | None = None,
+    ) -> None:
+        self.sim = sim
+        self.encoding = Encoding.of(sim.system, reach or {})
+        self.objective = objective_of(objective)
+        self.hidden = tuple(hidden)
+        self.steps = steps
+        self.refit_steps = refit_steps
+
+    @in_float64
+    def init(self, key: Key) -> HybridBelief:
+        """The simulator's prior, and no residual."""
+        return hybrid.before_data(self.sim, self.encoding, self.hidden, key)
+
+    @in_float64
+    def fit(
+        self, belief: AbstractBelief, data: Transitions, *, key: Key
+    ) -> HybridBelief:
+        """SIM2GP, then the residual. Raises what SIM2GP's fit raises, `NotFinite`."""
+        assert isinstance(belief, HybridBelief)
+        if data.count == 0:
+            return belief
+        first, second = jax.random.split(key)
+        sim = self.sim.fit(belief.sim, data, key=first)
+        steps = self.refit_steps if int(belief.count) else self.steps
+        data = jax.tree.map(jnp.asarray, data)
+        budget = budget_of(0, steps)
+        fitted = _fit(belief, sim, data, second, budget, self.objective)
+        return nlm.checked(fitted, data)
+
+    def update(
+        self, belief: AbstractBelief, s: State, a: Action, s2: State
+    ) -> HybridBelief:
+        """Condition the layer on one transition; call in float64."""
+        assert isinstance(belief, HybridBelief)
+        return hybrid.conditioned(self.sim, belief, s, a, s2)
+
+
+@eqx.filter_jit
+def _fit(
+    belief: HybridBelief,
+    sim: Sim2GPBelief,
+    data: Transitions,
+    key: Key,
+    budget: Budget,
+    objective: Objective,
+) -> HybridBelief:
+    pool, training = jax.random.split(key)
+    head, mask = belief.head, data.mask
+    X, y = features.encoded(head.encoding, data)
+    r, _, _ = hybrid.residuals(sim, data, y)
+    c = SCALE * sim.noise
+    S, A = matching.inputs(pool, head.encoding, data, matching.POOL)
+    every = jnp.ones(len(S), bool)
+    _, J = hybrid.physics_rows(sim, sim.posterior.mean, S, A, every)
+    target = matching.targets(
+        jax.vmap(head.encoding)(S, A),
+        jnp.zeros((len(S), c.size)),
+        (J @ sim.posterior.scale) / c[None, :, None],
+        sim.noise / c,
+        objective.sets,
+    )
+    q, noise = matching.train(
+        start(belief, sim, c),
+        X,
+        r / c[None],
+        mask,
+        target,
+        objective,
+        budget,
+        training,
+    )
+    head = head_of(belief, q, noise, c)
+    kept = jnp.ones(())
+    return HybridBelief(sim, at_map(sim), kept, head, noise * c, jnp.sum(mask))
