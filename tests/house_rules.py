@@ -10,7 +10,8 @@ from collections.abc import Iterator
 #: Imports point down; rooms of one layer do not see each other, but for SIBLINGS.
 LAYERS: tuple[frozenset[str], ...] = (
     frozenset(
-        {"types", "errors", "gaussian", "least_squares", "parameters", "transitions"}
+        "types errors gaussian least_squares arrowhead laplace parameters "
+        "transitions".split()
     ),
     frozenset({"systems", "logs"}),
     frozenset({"models", "tasks", "planning"}),
@@ -32,6 +33,13 @@ SIBLINGS: frozenset[tuple[str, str]] = frozenset(
         ("parameters", "gaussian"),
         ("transitions", "types"),
         ("transitions", "errors"),
+        ("laplace", "types"),
+        ("laplace", "errors"),
+        ("laplace", "gaussian"),
+        ("laplace", "least_squares"),
+        ("laplace", "arrowhead"),
+        ("arrowhead", "types"),
+        ("arrowhead", "least_squares"),
         ("least_squares", "types"),
         ("least_squares", "errors"),
         ("least_squares", "gaussian"),

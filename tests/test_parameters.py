@@ -12,6 +12,7 @@ import scipy.integrate
 import scipy.stats
 
 from sim2gp.errors import InputError
+from sim2gp.gaussian import Gaussian
 from sim2gp.parameters import (
     MAPS,
     Parameter,
@@ -253,3 +254,27 @@ def test_a_table_without_free_constants():
     assert len(table) == 0
     assert table.constrain(jnp.zeros(0)).shape == (0,)
     assert set(table.values(jnp.zeros(0))) == set(TABLE.names)
+
+
+def test_curvature_is_what_the_maps_add_to_a_hessian():
+    """A function linear in theta has no other: autodiff's Hessian, any prior scale."""
+    kinds = ("box", "log_box", "softplus", "log", "identity")
+    free = tuple(
+        Parameter(f"{kind}{k}", "kg", "", kind, low=0.5, high=4.0, mean=0.2 * k)
+        for k, kind in enumerate(kinds)
+    )
+    table = Parameters(free)
+    with jax.enable_x64(True):
+        rng = np.random.default_rng(0)
+        scale = jnp.asarray(np.tril(rng.standard_normal((5, 5))) + 2.0 * np.eye(5))
+        prior = Gaussian(jnp.asarray(rng.standard_normal(5)), scale)
+        z = jnp.asarray(0.3 * rng.standard_normal(5))
+        weight = jnp.asarray(rng.standard_normal(5))
+
+        def f(z):
+            return weight @ table.constrain(prior.mean + prior.scale @ z)
+
+        found = table.curvature(prior, z, jax.grad(f)(z))
+        np.testing.assert_allclose(found, jax.hessian(f)(z), rtol=1e-10, atol=1e-12)
+        far = table.curvature(prior, 1e4 * z, jnp.ones(5))
+        assert np.all(np.isfinite(np.asarray(far)))

@@ -266,6 +266,25 @@ class Parameters(eqx.Module):
             out.append(_unconstrain(kind, theta[index], low, high))
         return _scatter(out, self._groups(theta.dtype), theta)
 
+    def curvature(
+        self, prior: Gaussian, z: Float[Array, " p"], gradient: Float[Array, " p"]
+    ) -> Float[Array, "p p"]:
+        """What the bounded maps add to the Hessian of a function of ``theta``.
+
+        At ``tt = mu0 + L0 z``, with the function's ``gradient`` in ``z``. Each map
+        contributes ``dF/dtt map''/map'``: at a bound, as much as it takes to push the
+        constant there.
+        """
+
+        def slope(tt: Array) -> Array:
+            return jax.jvp(self.constrain, (tt,), (jnp.ones_like(tt),))[1]
+
+        tt = prior.mean + prior.scale @ z
+        first, second = jax.jvp(slope, (tt,), (jnp.ones_like(tt),))
+        bend = jnp.where(first > 0.0, second / first, 0.0)
+        by_tt = jnp.linalg.solve(prior.scale.T, gradient)
+        return prior.scale.T @ ((by_tt * bend)[:, None] * prior.scale)
+
     def values(self, tt: Float[Array, " p"]) -> dict[str, Scalar]:
         """Every constant by name, in physical units: the free ones and the fixed."""
         theta = self.constrain(tt)

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 from sim2gp.logs import Log
 from sim2gp.models.cutting import (
+    SPACING,
     inputs_since,
     knots_of,
     measured_states,
@@ -24,7 +25,6 @@ from sim2gp.models.windows import Windows
 from sim2gp.systems.base import AbstractSystem
 
 PERIOD = 2e-3  # s
-SPACING = 50  # samples between starts: 0.1 s
 SAMPLES = 25  # of the filter
 ORDER = 2
 CURVE = tuple(round(0.1 * k, 1) for k in range(1, 11))  # s, horizons of the error curve
@@ -126,7 +126,8 @@ def slopes(
 
 def _starts(valid: Bool[np.ndarray, "N c"]) -> Int[np.ndarray, " W"]:
     """Samples at multiples of 0.1 s with a whole past and some future."""
-    first = np.arange(SPACING, len(valid) - steps_of(CURVE[0]), SPACING)
+    every = steps_of(SPACING)
+    first = np.arange(every, len(valid) - steps_of(CURVE[0]), every)
     past = first[:, None] + np.arange(1 - SAMPLES, 1)
     return first[valid[past].all(axis=(1, 2))]
 

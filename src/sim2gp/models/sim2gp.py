@@ -14,16 +14,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from sim2gp.arrowhead import Blocks, Noise
 from sim2gp.gaussian import LOG_2PI, Gaussian
-from sim2gp.least_squares import (
-    Factor,
-    Fit,
-    factor,
-    gauss_newton_step,
-    multi_start,
-    stack,
-    triangular,
-)
+from sim2gp.laplace import AbstractLikelihood, Fit, expectation, multi_start
+from sim2gp.least_squares import factor, gauss_newton_step, stack, triangular
 from sim2gp.models import linearized
 from sim2gp.models.base import AbstractBelief, AbstractModel
 from sim2gp.systems.base import AbstractSystem
@@ -32,7 +26,6 @@ from sim2gp.types import Action, Dynamics, Key, Scalar, State, in_float64
 
 NOISE_ROUNDS = 5  # EM; the last change of sig is below 1e-3 relative from here on
 STARTS = 4
-DESCENT = 1e-4  # tolerance of one descent; the undamped steps do the rest
 FLOOR = 1e-3  # prior guess of the noise, relative to each channel's rms change
 
 
@@ -196,7 +189,7 @@ def _trajectory_information_gain(
     return linearized.information_gain(scaled.reshape(-1, scaled.shape[-1]))
 
 
-class _OneStep(eqx.Module):
+class _OneStep(AbstractLikelihood):
     """The one-step likelihood: exact states, independent noise on each increment."""
 
     model: Sim2GP
@@ -219,16 +212,18 @@ class _OneStep(eqx.Module):
         data = self.data
         return jax.vmap(one)(data.state, data.action, data.next_state, data.mask)
 
-    def factor(
-        self, z: Float[Array, " p"], noise: Float[Array, " d"]
-    ) -> tuple[Factor, Float[Array, "d p1 p1"]]:
-        """Factor of the whitened residual, and each channel's own, not whitened.
-
-        The noise only scales the channels' factors, so EM needs no other pass.
-        """
+    def blocks(self, z: Float[Array, " p"], e: Float[Array, "1 0"]) -> Blocks:
+        """All data as one window; a step of exact states has no nuisances ``e``."""
+        del e
         r, J = self.rows(z)
-        channels = jax.vmap(factor, in_axes=1)(J, r)
-        return stack(*(channels / noise[:, None, None])), channels
+        return jax.vmap(factor, in_axes=1)(J, r)[None]
+
+    def curvature(
+        self, z: Float[Array, " p"], gradient: Float[Array, " p"]
+    ) -> Float[Array, "p p"]:
+        """Of the table's maps."""
+        model = self.model
+        return model.system.parameters.curvature(model.prior, z, gradient)
 
 
 @eqx.filter_jit
@@ -240,30 +235,21 @@ def _fit(
     change = jnp.sqrt(jnp.sum(y**2, axis=0) / jnp.maximum(N, 1.0))
     change = jnp.where(change > 0.0, change, 1.0)
 
-    def update(fit: Fit, _: Array) -> Array:
-        # The expected squares under the posterior; the prior on the noise counts as
-        # two observations at the floor.
-        r, J = fit.aux[:, :, -1], fit.aux[:, :, :-1]
-        squares = jnp.sum(r**2, axis=1) + jnp.sum((J @ fit.scale()) ** 2, axis=(1, 2))
-        return jnp.sqrt((2.0 * (FLOOR * change) ** 2 + squares) / (2.0 + N))
-
     # Start from a large noise, so that the first MAP is not trapped.
-    likelihood = _OneStep(model, data)
     fit, noise, _ = multi_start(
-        likelihood.factor,
+        _OneStep(model, data),
         starts,
-        change,
-        update,
+        jnp.zeros((1, 0)),
+        Noise(change, jnp.ones(1)),
+        expectation(jnp.full((1, d), N), FLOOR * change),
         rounds=NOISE_ROUNDS,
-        searches=NOISE_ROUNDS,
-        tolerance=DESCENT,
     )
-    normaliser = N * jnp.sum(jnp.log(noise) + 0.5 * LOG_2PI)
+    normaliser = N * jnp.sum(jnp.log(noise.sd) + 0.5 * LOG_2PI)
     belief = Sim2GPBelief(
         model.system,
         model.prior,
         fit.posterior(model.prior),
-        noise,
+        noise.sd,
         fit.data[:-1, :-1],
         fit.log_joint() - normaliser,
         jnp.sum(data.mask),

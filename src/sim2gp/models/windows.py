@@ -8,18 +8,9 @@ once with the simulation at its own time stamp:
     x0  = m0 + S0 e,                        e ~ N(0, I)
 
 Velocities need not be measured, rates need not be known, rows may be missing. The start
-states are eliminated window by window (the arrowhead's arrows), so memory and time are
-linear in the data: with whitened rows,
-
-    [ J_e  J_z  r ]       [ R11  R12  c1 ]
-    [ I    0    e ]  = Q  [ 0    R22  c2 ]
-
-and the ``R22`` of all windows stack into the factor of ``z`` alone, exactly the Schur
-complement, without forming it. Each window's ``e`` is linearised along its own optimum,
-``e(z) = e* - R11^-1 R12 (z - z*)``, about the last descent's result; the elimination
-is one more Gauss-Newton step, so at a fixed point both are at their optimum. ``w`` is
-one Student-t weight per window (1 if off). ``window = 0`` is the paper's one-step
-likelihood: two rows, and ``S0 = 0``.
+states are the nuisances that `sim2gp.arrowhead` eliminates window by window, so memory
+and time are linear in the data. ``w`` is one Student-t weight per window (1 if off).
+``window = 0`` is the paper's one-step likelihood: two rows, and ``S0 = 0``.
 """
 
 from collections.abc import Callable
@@ -32,17 +23,17 @@ import numpy as np
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
+from sim2gp.arrowhead import Blocks, Noise, eliminate
 from sim2gp.gaussian import LOG_2PI, Gaussian
-from sim2gp.least_squares import Factor, Fit, multi_start, triangular
+from sim2gp.laplace import AbstractLikelihood, Fit, expectation, multi_start
+from sim2gp.least_squares import factor
 from sim2gp.models.linearized import value_and_jacobian
 from sim2gp.systems.base import AbstractSystem, rk4
 from sim2gp.types import AnyArray, Key, Scalar, in_float64
 
 NOISE_ROUNDS = 8  # fewer leave noise and starts of real logs short of a fixed point
-SEARCHES = 2  # of these, rounds with a full descent
 FREEDOM = 4.0  # degrees of freedom of the Student-t weight
 DELAY_BLUR = 4e-3  # s, of inputs that may be delayed
-DESCENT = 1e-4  # tolerance of one descent; the undamped steps do the rest
 
 
 class Windows(eqx.Module):
@@ -149,28 +140,7 @@ class WindowsBelief(eqx.Module):
     log_evidence: Scalar
 
 
-class _Noise(eqx.Module):
-    """What a descent holds fixed: noise, weights, and the starts' linearisation."""
-
-    sd: Float[Array, " c"]
-    weights: Float[Array, " W"]
-    z: Float[Array, " p"]
-    e: Float[Array, "W n"]
-    slope: Float[Array, "W n p"]  # de/dz along each window's optimum
-
-
-class _Elimination(eqx.Module):
-    """What remains of one window after its start state is eliminated."""
-
-    data: Factor  # of z
-    reduced: Float[Array, "L c p1"]  # rows of (z, r) with the start at its best
-    spread: Float[Array, " c"]  # squares that the start state's own spread adds
-    log_det: Scalar
-    e: Float[Array, " n"]
-    slope: Float[Array, "n p"]
-
-
-class _Windowed(eqx.Module):
+class _Windowed(AbstractLikelihood):
     """The likelihood as least squares: per-window functions, vmapped at the edge."""
 
     system: AbstractSystem
@@ -187,47 +157,23 @@ class _Windowed(eqx.Module):
         r = states[:, np.asarray(window.outputs)] - window.y
         return jnp.where(window.mask, r, 0.0)
 
-    def eliminate(
-        self,
-        window: Windows,
-        weight: Scalar,
-        z: Float[Array, " p"],
-        e: Float[Array, " n"],
-        noise: Float[Array, " c"],
-    ) -> _Elimination:
-        """The QR of the module's equation, for one window."""
-        p, n, c = z.size, e.size, noise.size
+    def blocks(self, z: Float[Array, " p"], e: Float[Array, "W n"]) -> Blocks:
+        """Factors of every window's and output's ``[J_e J_z r]``."""
 
-        r, J = value_and_jacobian(
-            lambda x: self.residual(window, x), jnp.concatenate([z, e])
-        )
-        own, rest = J[..., p:], jnp.concatenate([J[..., :p], r[..., None]], axis=-1)
-        root = jnp.sqrt(weight)
-        data = jnp.concatenate([own, rest], axis=-1) * (root / noise)[None, :, None]
-        prior = jnp.concatenate([jnp.eye(n), jnp.zeros((n, p)), e[:, None]], axis=1)
-        R = triangular(jnp.concatenate([data.reshape(-1, n + p + 1), prior]))
-        R11, slope = R[:n, :n], solve_triangular(R[:n, :n], R[:n, n:])
-        reduced = rest - own @ slope
-        spread = solve_triangular(R11, own.reshape(-1, n).T, trans="T")
-        return _Elimination(
-            data=R[n:, n:],
-            reduced=reduced,
-            spread=jnp.sum(spread.reshape(n, -1, c) ** 2, axis=(0, 1)),
-            log_det=jnp.sum(jnp.log(jnp.diag(R11))),
-            e=e - slope[:, -1],
-            slope=-slope[:, :-1],
-        )
+        def one(window: Windows, e: Array) -> Array:
+            x = jnp.concatenate([z, e])
+            r, J = value_and_jacobian(lambda x: self.residual(window, x), x)
+            J = jnp.roll(J, e.size, axis=-1)  # the start's columns first
+            return jax.vmap(factor, in_axes=1)(J, r)
 
-    def factor(
-        self, z: Float[Array, " p"], noise: _Noise
-    ) -> tuple[Factor, _Elimination]:
-        """Factor of all windows together, and what EM needs of each."""
-        each = self.windows.each(
-            lambda window, weight, e: self.eliminate(window, weight, z, e, noise.sd),
-            noise.weights,
-            noise.e + noise.slope @ (z - noise.z),
-        )
-        return triangular(each.data.reshape(-1, z.size + 1)), each
+        found: Array = self.windows.each(one, e)
+        return found
+
+    def curvature(
+        self, z: Float[Array, " p"], gradient: Float[Array, " p"]
+    ) -> Float[Array, "p p"]:
+        """Of the table's maps."""
+        return self.system.parameters.curvature(self.prior, z, gradient)
 
 
 @eqx.filter_jit
@@ -240,37 +186,22 @@ def _fit(
 ) -> tuple[Fit, WindowsBelief]:
     count = jnp.sum(windows.mask.astype(windows.y.dtype), axis=1)  # (W, c)
     N = jnp.sum(count, axis=0)
-
-    def update(fit: Fit, noise: _Noise) -> _Noise:
-        J, r = fit.aux.reduced[..., :-1], fit.aux.reduced[..., -1]
-        squares = jnp.sum(r**2, axis=1)  # of each window and channel, as the next two
-        spread = fit.aux.spread + jnp.sum((J @ fit.scale()) ** 2, axis=(1, 3))
-        expected = noise.weights @ (squares + spread)
-        sd = jnp.sqrt((2.0 * windows.floor**2 + expected) / (2.0 + N))
-        # E-step of the Student-t: an infinite number of degrees of freedom gives 1.
-        misfit = jnp.sum(squares / sd[None] ** 2, axis=1)
-        weights = (1.0 + jnp.sum(count, 1) / freedom) / (1.0 + misfit / freedom)
-        return _Noise(sd, weights, fit.z, fit.aux.e, fit.aux.slope)
-
     # Start from a large noise, so that the first MAP is not trapped.
     mean = jnp.sum(jnp.where(windows.mask, windows.y, 0.0), axis=1)
     mean = mean / jnp.maximum(count, 1)
     away = jnp.where(windows.mask, windows.y - mean[:, None], 0.0)
     sd = jnp.sqrt(jnp.sum(away**2, axis=(0, 1)) / jnp.maximum(N, 1)) + windows.floor
-    (W, n), p = windows.start.shape, prior.mean.size
-    weights, e, slope = jnp.ones(W), jnp.zeros((W, n)), jnp.zeros((W, n, p))
+    W, n = windows.start.shape
     fit, noise, _ = multi_start(
-        _Windowed(system, prior, windows).factor,
+        _Windowed(system, prior, windows),
         starts,
-        _Noise(sd, weights, jnp.zeros(p), e, slope),
-        update,
+        jnp.zeros((W, n)),
+        Noise(sd, jnp.ones(W)),
+        expectation(count, windows.floor, freedom),
         rounds=NOISE_ROUNDS,
-        searches=SEARCHES,
-        tolerance=DESCENT,
     )
     log_evidence = (
         fit.log_joint()
-        - jnp.sum(fit.aux.log_det)
         - jnp.sum(N * (jnp.log(noise.sd) + 0.5 * LOG_2PI))
         + 0.5 * jnp.sum(jnp.sum(count, axis=1) * jnp.log(noise.weights))
     )
@@ -281,7 +212,7 @@ def _fit(
         noise.sd,
         fit.data[:-1, :-1],
         noise.weights,
-        windows.start + windows.start_sd * fit.aux.e,
+        windows.start + windows.start_sd * fit.e,
         log_evidence,
     )
     return fit, belief
@@ -296,22 +227,16 @@ def information_at(
     """
     prior, exact = belief.prior, jax.tree.map(jnp.asarray, windows)
     exact = eqx.tree_at(lambda w: w.start, exact, belief.starts)
-    (W, n), p = exact.start.shape, prior.mean.size
-    held = _Noise(
-        belief.noise,
-        belief.weights,
-        jnp.zeros(p),
-        jnp.zeros((W, n)),
-        jnp.zeros((W, n, p)),
-    )
+    noise = Noise(belief.noise, belief.weights)
 
     @eqx.filter_jit
-    def factor(model: _Windowed, noise: _Noise, tt: Array) -> Array:
+    def information(model: _Windowed, noise: Noise, tt: Array) -> Array:
         z = solve_triangular(prior.scale, tt - prior.mean, lower=True)
-        return model.factor(z, noise)[0][:-1, :-1]
+        e = jnp.zeros_like(model.windows.start)
+        return eliminate(model.blocks(z, e), e, noise).data[:-1, :-1]
 
     model = _Windowed(belief.system, prior, exact)
-    return in_float64(lambda tt: factor(model, held, jnp.asarray(tt, float)))
+    return in_float64(lambda tt: information(model, noise, jnp.asarray(tt, float)))
 
 
 @in_float64

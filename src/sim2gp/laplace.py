@@ -1,0 +1,370 @@
+"""MAP and Laplace posterior of least squares whose data have nuisance unknowns.
+
+Windows ``w`` of data share the whitened unknowns ``z`` (p), each has its own ``e_w``
+(n, possibly none), and each channel ``c`` its noise:
+
+    L(z, e) = 1/2 sum_w [ w_w sum_c ||r_wc(z, e_w)||^2 / sig_c^2 + ||e_w||^2 ]
+              + 1/2 ||z||^2
+
+Levenberg-Marquardt adds ``sqrt(mu) I`` to both parts of the eliminated system
+(`sim2gp.arrowhead`), so its step is the damped step of the whole problem; memory and
+time are linear in the data. One copy of the likelihood is compiled, in the one loop
+that descends.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, Bool, Float, Int
+
+from sim2gp.arrowhead import Blocks, Elimination, Noise, eliminate
+from sim2gp.errors import DeadParameters, NotConverged, NotFinite
+from sim2gp.gaussian import Gaussian
+from sim2gp.least_squares import (
+    Factor,
+    log_joint,
+    posterior,
+    stack,
+    with_prior,
+)
+from sim2gp.types import Scalar
+
+CONVERGED, STALLED, NOT_FINITE = 0, 1, 2
+GRADIENT_TOLERANCE = 1e-8
+#: Steps of the last descent. Under misfit, and where a bound saturates (measured: by
+#: 0.9 a step), Gauss-Newton converges linearly, not in two.
+MAX_STEPS = 300
+FIRST_DAMPING = 1.0  # the prior's own precision: trust one prior standard deviation
+AGAIN_DAMPING = 1e-2  # of a descent that follows another
+LEAST_DAMPING = 1e-5  # below this the step is undamped
+MOST_DAMPING = 1e14
+LEAST_CURVATURE = 0.1  # of Gauss-Newton's, in any direction
+
+
+class AbstractLikelihood(eqx.Module):
+    """What a descent asks of data and simulator; both whitened by the prior."""
+
+    @abstractmethod
+    def blocks(self, z: Float[Array, " p"], e: Float[Array, "W n"]) -> Blocks:
+        """The factors at a point, of residuals in the channels' own units."""
+
+    @abstractmethod
+    def curvature(
+        self, z: Float[Array, " p"], gradient: Float[Array, " p"]
+    ) -> Float[Array, "p p"]:
+        """The Hessian that the parameters' maps add, given the data's gradient.
+
+        It shapes steps only, never the posterior: where a bound saturates it is several
+        times Gauss-Newton's, and steps without it zigzag or crawl.
+        """
+
+
+class Point(eqx.Module):
+    """One linearisation, and how good it is under some noise."""
+
+    z: Float[Array, " p"]
+    e: Float[Array, "W n"]
+    blocks: Blocks
+    cost: Scalar
+    by_z: Float[Array, " p"]  # gradient of the cost
+    by_e: Float[Array, "W n"]
+
+    @property
+    def gradient(self) -> Scalar:
+        """``||g||_inf / (1 + cost)``; zero for a problem without unknowns."""
+        largest = jnp.maximum(
+            jnp.max(jnp.abs(self.by_z), initial=0.0),
+            jnp.max(jnp.abs(self.by_e), initial=0.0),
+        )
+        return largest / (1.0 + self.cost)
+
+
+class Fit(eqx.Module):
+    """A MAP in whitened coordinates, with everything that follows from its factor."""
+
+    at: Point
+    arrow: Elimination
+    full: Factor  # of data and prior
+    status: Int[Array, ""]
+    steps: Int[Array, ""]
+
+    @property
+    def z(self) -> Float[Array, " p"]:
+        """The MAP."""
+        return self.at.z
+
+    @property
+    def e(self) -> Float[Array, "W n"]:
+        """The nuisances at the MAP."""
+        return self.at.e
+
+    @property
+    def cost(self) -> Scalar:
+        """The negative log joint that was minimised, without constants."""
+        return self.at.cost
+
+    @property
+    def gradient(self) -> Scalar:
+        """What remains of the gradient, relative to 1 + cost."""
+        return self.at.gradient
+
+    @property
+    def data(self) -> Factor:
+        """Factor of the data alone."""
+        return self.arrow.data
+
+    @property
+    def R(self) -> Float[Array, "p p"]:
+        """Factor of the posterior precision: ``R^T R = Sigma_z^-1``."""
+        return self.full[:-1, :-1]
+
+    @property
+    def dead(self) -> Bool[Array, " p"]:
+        """Parameters that the data do not depend on at all."""
+        return jnp.all(self.data[:, :-1] == 0.0, axis=0)
+
+    def scale(self) -> Float[Array, "p p"]:
+        """Square root of ``Sigma_z``: ``R^-1``."""
+        return solve_triangular(self.R, jnp.eye(self.z.size, dtype=self.z.dtype))
+
+    def posterior(self, prior: Gaussian) -> Gaussian:
+        """``N(tt*, Sigma_q)`` by a triangular solve: scale ``L0 R^-1``."""
+        return posterior(self.full, self.z, prior)
+
+    def log_joint(self) -> Scalar:
+        """``-L - 1/2 logdet(S0 Sq^-1)``, nats, over ``z`` and the nuisances.
+
+        The Laplace evidence, but for the normalisation of the noise.
+        """
+        pivots = jnp.diagonal(self.arrow.R11, axis1=1, axis2=2)
+        return log_joint(self.full) - jnp.sum(jnp.log(pivots))
+
+    def squares(self) -> tuple[Float[Array, "W c"], Float[Array, "W c"]]:
+        """Squared residuals, and squares that the posterior's own spread adds."""
+        n = self.e.shape[1]
+        own, rest = self.at.blocks[..., :n], self.at.blocks[..., n:]
+        # Rows of (z, r) with the nuisances at their best.
+        reduced = rest - own @ self.arrow.slope[:, None]
+        identity = jnp.broadcast_to(jnp.eye(n), (len(own), n, n))
+        root = solve_triangular(self.arrow.R11, identity)
+        spread = jnp.sum((reduced[..., :-1] @ self.scale()) ** 2, axis=(2, 3))
+        spread = spread + jnp.sum((own @ root[:, None]) ** 2, axis=(2, 3))
+        return jnp.sum(reduced[..., -1] ** 2, axis=2), spread
+
+    def raise_unless_converged(self, names: tuple[str, ...], where: str) -> None:
+        """Raise a typed error on the host, naming what to look at."""
+        status = int(self.status)
+        if status == NOT_FINITE:
+            raise NotFinite(
+                "E203",
+                "the simulation is not finite at any start of the fit",
+                where=where,
+                fix="narrow the priors, or shorten the step",
+            )
+        dead = [name for name, d in zip(names, self.dead.tolist(), strict=True) if d]
+        if len(dead) == len(names) and bool(jnp.any(self.data[:, -1] != 0.0)):
+            raise DeadParameters(
+                "E146",
+                "no parameter reaches the data",
+                where=where,
+                got=f"zero sensitivity to {', '.join(dead)}",
+                fix="check the columns, the excitation and what is fixed",
+            )
+        if status == STALLED:
+            raise NotConverged(
+                "E201",
+                "the MAP did not converge",
+                where=where,
+                got=f"scaled gradient {float(self.gradient):.1e} "
+                f"after {int(self.steps)} steps",
+                expected=f"at most {GRADIENT_TOLERANCE:.0e}",
+                fix="check units and bounds, or add starts",
+            )
+
+
+def expectation(
+    count: Float[Array, "W c"],
+    floor: Float[Array, " c"],
+    freedom: float | Scalar = jnp.inf,
+) -> Callable[[Fit, Noise], Noise]:
+    """EM's update of noise and weights, from squares expected under the posterior.
+
+        sig_c^2 = (2 floor_c^2 + sum_w w_w E||r_wc||^2) / (2 + count_c)
+        w_w     = (1 + count_w / freedom) / (1 + ||r_w||^2 / freedom)
+
+    The prior on the noise counts as two samples at the floor. Weights are Student-t's;
+    an infinite number of degrees of ``freedom`` makes them 1.
+    """
+
+    def update(fit: Fit, noise: Noise) -> Noise:
+        squares, spread = fit.squares()
+        expected = noise.weights @ (squares + spread)
+        sd = jnp.sqrt((2.0 * floor**2 + expected) / (2.0 + jnp.sum(count, axis=0)))
+        misfit = jnp.sum(squares / sd[None] ** 2, axis=1)
+        weights = (1.0 + jnp.sum(count, axis=1) / freedom) / (1.0 + misfit / freedom)
+        return Noise(sd, weights)
+
+    return update
+
+
+def minimise(
+    likelihood: AbstractLikelihood,
+    start: Float[Array, " p"],
+    e: Float[Array, "W n"],
+    noise: Noise,
+) -> Fit:
+    """One Levenberg-Marquardt descent to a zero gradient, and its verdict."""
+    one = start[None]
+    return multi_start(likelihood, one, e, noise, lambda _, noise: noise, rounds=0)[0]
+
+
+def multi_start(
+    likelihood: AbstractLikelihood,
+    starts: Float[Array, "starts p"],
+    e: Float[Array, "W n"],
+    noise: Noise,
+    update: Callable[[Fit, Noise], Noise],
+    *,
+    rounds: int,
+    tolerance: float = 1e-4,
+) -> tuple[Fit, Noise, Float[Array, " starts"]]:
+    """The best of several descents; then ``rounds`` of noise update and descent (EM).
+
+    A descent ends where a step improves the cost by less than ``tolerance`` relative;
+    one more turn, the last, goes on to a zero gradient. Every descent is a turn of the
+    same scan, so that the likelihood is compiled once. Returns the fit, its noise, and
+    the cost that each start reached.
+    """
+    p = starts.shape[1]
+    blank = jax.eval_shape(likelihood.blocks, starts[0], e)
+    infinite = jnp.asarray(jnp.inf, starts.dtype)
+    # No number: where nothing finite is ever found, nothing must look like a fit.
+    unknown = jnp.full(blank.shape, jnp.nan, blank.dtype)
+    nowhere = Point(jnp.zeros(p), e, unknown, infinite, jnp.zeros(p), jnp.zeros_like(e))
+    count = len(starts)
+    turns = jnp.arange(count + rounds + 1)
+    schedule = jnp.concatenate([starts, jnp.zeros((rounds + 1, p))])
+
+    def turn(carry: tuple, x: tuple[Array, ...]) -> tuple[tuple, Array]:
+        best, noise, steps = carry
+        start, index = x
+        searching, last = index < count, index == count + rounds
+        # The last turn only finishes the one before it.
+        settled = update(_verdict(best, noise, steps), noise)
+        stay = searching | last
+        noise = jax.tree.map(lambda new, old: jnp.where(stay, old, new), settled, noise)
+        again = _point(best.z, best.e, best.blocks, noise)
+        here = _select(searching, nowhere, again)
+        damping = jnp.where(last, 0.0, AGAIN_DAMPING)
+        damping = jnp.where(searching, FIRST_DAMPING, damping)
+        dz, de, gain = _step(likelihood, again, noise, damping)
+        z = jnp.where(searching, start, again.z + dz)
+        trial = (z, jnp.where(searching, e, again.e + de), gain)
+        found, taken = _descend(
+            likelihood, here, trial, damping, noise, tolerance, last
+        )
+        # A cost that is not finite never wins; a comparison with NaN is false.
+        better = jnp.where(searching, found.cost < best.cost, True)
+        best = _select(better, found, best)
+        return (best, noise, jnp.where(last, taken, steps + taken)), found.cost
+
+    carry = (nowhere, noise, jnp.zeros((), int))
+    (best, noise, steps), costs = jax.lax.scan(turn, carry, (schedule, turns))
+    return _verdict(best, noise, steps), noise, costs[:count]
+
+
+def _descend(
+    likelihood: AbstractLikelihood,
+    here: Point,
+    trial: tuple[Array, Array, Array],
+    damping: Scalar,
+    noise: Noise,
+    tolerance: float,
+    exact: Bool[Array, ""],
+) -> tuple[Point, Int[Array, ""]]:
+    """Levenberg-Marquardt from ``here``, whose first step and promise are ``trial``.
+
+    The damping follows the ratio of gained to promised cost (Nielsen 1999).
+    """
+
+    def improve(carry: tuple) -> tuple:
+        here, (z, e, promise), damping, count, _ = carry
+        there = _point(z, e, likelihood.blocks(z, e), noise)
+        gained = here.cost - there.cost
+        # Rounding in the cost must not refuse the last, gradient-only digits.
+        slack = 1e-12 * (1.0 + there.cost)
+        lost_in_rounding = (jnp.abs(gained) <= slack) & (there.gradient < here.gradient)
+        keep = (gained > slack) | lost_in_rounding
+        settled = keep & (gained <= tolerance * (1.0 + there.cost))
+        ratio = jnp.where(lost_in_rounding, 1.0, gained / promise)
+        lowered = damping * jnp.clip(1.0 - (2.0 * ratio - 1.0) ** 3, 0.1, 2.0)
+        raised = 4.0 * jnp.maximum(damping, LEAST_DAMPING)
+        damping = jnp.where(keep, lowered, raised)
+        here = _select(keep, there, here)
+        dz, de, promise = _step(likelihood, here, noise, damping)
+        trial = (here.z + dz, here.e + de, promise)
+        return here, trial, damping, count + 1, settled
+
+    def unfinished(carry: tuple) -> Array:
+        here, _, damping, count, settled = carry
+        finite = jnp.isfinite(here.cost)
+        small = finite & (here.gradient <= 0.1 * GRADIENT_TOLERANCE)
+        hopeless = ~finite | ~(damping < MOST_DAMPING) | (count > MAX_STEPS)
+        hopeless = (count > 0) & hopeless
+        # Two steps at least: a gradient that is small beside a large cost is not zero.
+        done = jnp.where(exact, small & (count >= 2), settled | small)
+        return ~done & ~hopeless
+
+    start = (here, trial, damping, jnp.zeros((), int), jnp.zeros((), bool))
+    here, _, _, count, _ = jax.lax.while_loop(unfinished, improve, start)
+    return here, count
+
+
+def _step(
+    likelihood: AbstractLikelihood, here: Point, noise: Noise, damping: Scalar
+) -> tuple[Float[Array, " p"], Float[Array, "W n"], Scalar]:
+    """The damped step of the whole problem, and what it should gain."""
+    damping = jnp.where(damping < LEAST_DAMPING, 0.0, damping)
+    arrow = eliminate(here.blocks, here.e, noise, damping)
+    damped = jnp.sqrt(damping) * jnp.eye(here.z.size, here.z.size + 1)
+    full = stack(with_prior(arrow.data, here.z), damped)
+    # Whitened by R, the maps' curvature is a change of the identity. It is bounded from
+    # below: every step is one of descent, and where it is zero that of the QR.
+    R, c = full[:-1, :-1], full[:-1, -1]
+    S = likelihood.curvature(here.z, here.by_z - here.z)
+    left = solve_triangular(R, S, trans="T")
+    values, vectors = jnp.linalg.eigh(solve_triangular(R, left.T, trans="T"))
+    c = vectors @ ((vectors.T @ c) / jnp.maximum(1.0 + values, LEAST_CURVATURE))
+    dz = -solve_triangular(R, c)
+    de = -(arrow.slope[..., -1] + arrow.slope[..., :-1] @ dz)
+    promise = damping * (dz @ dz + jnp.sum(de**2))
+    promise = 0.5 * (promise - here.by_z @ dz - jnp.sum(here.by_e * de))
+    return dz, de, promise
+
+
+def _point(
+    z: Float[Array, " p"], e: Float[Array, "W n"], blocks: Blocks, noise: Noise
+) -> Point:
+    white, n = noise.scale(blocks), e.shape[1]
+    r = white[..., -1]
+    cost = 0.5 * (jnp.sum(r**2) + jnp.sum(e**2) + z @ z)
+    g = jnp.einsum("wckj,wck->wj", white[..., :-1], r)
+    return Point(z, e, blocks, cost, jnp.sum(g[:, n:], axis=0) + z, g[:, :n] + e)
+
+
+def _verdict(best: Point, noise: Noise, steps: Int[Array, ""]) -> Fit:
+    arrow = eliminate(best.blocks, best.e, noise)
+    full = with_prior(arrow.data, best.z)
+    finite = jnp.isfinite(best.cost) & jnp.all(jnp.isfinite(full))
+    status = jnp.where(best.gradient <= GRADIENT_TOLERANCE, CONVERGED, STALLED)
+    status = jnp.where(finite, status, NOT_FINITE)
+    return Fit(best, arrow, full, status, steps)
+
+
+def _select(yes: Bool[Array, ""], new: Point, old: Point) -> Point:
+    chosen: Point = jax.tree.map(lambda a, b: jnp.where(yes, a, b), new, old)
+    return chosen

@@ -1,0 +1,296 @@
+"""Descents: stationary points, the best of several starts, and typed verdicts (S14)."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.optimize
+
+from sim2gp import arrowhead, laplace
+from sim2gp import least_squares as ls
+from sim2gp.errors import DeadParameters, NotConverged, NotFinite
+from sim2gp.gaussian import Gaussian
+
+
+@pytest.fixture(autouse=True)
+def float64():
+    with jax.enable_x64(True):
+        yield
+
+
+def rosenbrock(z):
+    """Residuals with a curved valley; the prior's own rows come on top."""
+    return jnp.stack([10.0 * (z[1] - z[0] ** 2), 1.0 - z[0]]) / 0.05
+
+
+class Whitened(laplace.AbstractLikelihood):
+    """Residuals of unit noise without nuisances: one window, one channel."""
+
+    residual: Callable = eqx.field(static=True)
+
+    def blocks(self, z, e):
+        J, r = jax.jacfwd(self.residual)(z), self.residual(z)
+        return ls.factor(J, r)[None, None]
+
+    def curvature(self, z, gradient):
+        return jnp.zeros((z.size, z.size))
+
+
+def minimise(residual, start):
+    """A descent without nuisances, of residuals that are already whitened."""
+    nothing, unit = jnp.zeros((1, 0)), arrowhead.Noise(jnp.ones(1), jnp.ones(1))
+    return laplace.minimise(Whitened(residual), start, nothing, unit)
+
+
+def test_the_map_is_a_stationary_point():
+    residual = rosenbrock
+    start = jnp.asarray([-1.2, 1.0])
+    fit = jax.jit(lambda z: minimise(residual, z))(start)
+    gradient = jax.grad(lambda z: 0.5 * jnp.sum(residual(z) ** 2) + 0.5 * z @ z)(fit.z)
+    cost = 0.5 * float(jnp.sum(residual(fit.z) ** 2) + fit.z @ fit.z)
+    assert int(fit.status) == laplace.CONVERGED
+    assert float(jnp.max(jnp.abs(gradient))) <= 1e-8 * (1.0 + cost)
+    assert float(fit.cost) == pytest.approx(cost, rel=1e-12)
+    assert float(fit.gradient) <= laplace.GRADIENT_TOLERANCE
+    # Gauss-Newton, not the full Hessian, is the precision.
+    J = jax.jacfwd(residual)(fit.z)
+    np.testing.assert_allclose(fit.R.T @ fit.R, J.T @ J + jnp.eye(2), rtol=1e-10)
+    np.testing.assert_allclose(
+        fit.scale() @ fit.scale().T, np.linalg.inv(J.T @ J + np.eye(2)), rtol=1e-9
+    )
+
+
+def test_laplace_terms_of_the_evidence():
+    """log_joint = -1/2 |r|^2 - 1/2 |z|^2 - 1/2 logdet(I + J^T J)."""
+    fit = minimise(rosenbrock, jnp.asarray([0.5, 0.2]))
+    r, J = rosenbrock(fit.z), jax.jacfwd(rosenbrock)(fit.z)
+    expected = -0.5 * (r @ r + fit.z @ fit.z)
+    expected -= 0.5 * jnp.linalg.slogdet(jnp.eye(2) + J.T @ J)[1]
+    assert float(fit.log_joint()) == pytest.approx(float(expected), rel=1e-10)
+
+
+def test_the_last_turn_goes_on_to_a_zero_gradient():
+    """A coarse descent stops where it gains little; undamped steps do the rest."""
+
+    def residual(z):
+        return 30.0 * jnp.stack([jnp.sin(z[0]) - 0.3, z[0] * z[1] - 0.1, z[1] - 0.4])
+
+    fit, _, costs = multi_start(residual, [[0.0, 0.0]], tolerance=0.3)
+    assert float(costs[0]) > float(fit.cost) * (1.0 + 1e-9)
+    assert float(fit.gradient) <= 1e-8
+    assert int(fit.status) == laplace.CONVERGED
+    again = minimise(residual, fit.z + 1e-3)
+    assert float(jnp.max(jnp.abs(again.z - fit.z))) <= 1e-8
+
+
+def no_update(fit, noise):
+    return noise
+
+
+def multi_start(residual, starts, rounds=0, update=no_update, tolerance=1e-10):
+    return laplace.multi_start(
+        Whitened(residual),
+        jnp.asarray(starts),
+        jnp.zeros((1, 0)),
+        arrowhead.Noise(jnp.ones(1), jnp.ones(1)),
+        update,
+        rounds=rounds,
+        tolerance=tolerance,
+    )
+
+
+def test_a_start_that_is_not_finite_never_wins():
+    def residual(z):
+        return jnp.where(z > 3.0, jnp.nan, 5.0 * (z - 1.0))
+
+    fit, _, costs = multi_start(residual, [[4.0], [0.0], [5.0]])
+    assert float(fit.z[0]) == pytest.approx(25.0 / 26.0)
+    assert not np.isfinite(costs[0])
+    assert int(fit.status) == laplace.CONVERGED
+    fit.raise_unless_converged(("k",), "here")
+
+
+def test_nothing_finite_is_a_typed_error():
+    fit, _, _ = multi_start(lambda z: z * jnp.nan, [[0.0], [1.0]])
+    assert int(fit.status) == laplace.NOT_FINITE
+    with pytest.raises(NotFinite, match="E203"):
+        fit.raise_unless_converged(("k",), "here")
+
+
+def test_the_best_of_several_descents_wins():
+    def residual(z):
+        return jnp.stack([20.0 * (z[0] ** 2 - 4.0), 1.0 * (z[0] - 2.0)])
+
+    fit, _, costs = multi_start(residual, [[-3.0], [3.0], [-1.0]])
+    assert float(fit.z[0]) == pytest.approx(2.0, abs=0.01)
+    assert float(fit.cost) == pytest.approx(float(jnp.min(costs)), rel=1e-12)
+
+
+def test_dead_parameters_are_named():
+    """mujoco#3286: zero iterations at a zero gradient is no success."""
+    fit, _, _ = multi_start(lambda z: jnp.stack([0.0 * z @ z - 1.0]), [[1.0, 1.0]])
+    assert bool(jnp.all(fit.dead))
+    with pytest.raises(DeadParameters, match=r"E146.*mass, length"):
+        fit.raise_unless_converged(("mass", "length"), "here")
+
+
+def test_one_dead_parameter_keeps_its_prior():
+    fit, _, _ = multi_start(lambda z: jnp.stack([4.0 * z[0] - 1.0]), [[1.0, 1.0]])
+    np.testing.assert_array_equal(fit.dead, [False, True])
+    fit.raise_unless_converged(("mass", "length"), "here")
+    prior = Gaussian(jnp.asarray([0.0, 3.0]), jnp.diag(jnp.asarray([1.0, 2.0])))
+    posterior = fit.posterior(prior)
+    assert float(posterior.mean[1]) == pytest.approx(3.0, abs=1e-10)
+    assert float(posterior.sd()[1]) == pytest.approx(2.0, rel=1e-10)
+
+
+def test_a_stalled_descent_is_a_typed_error():
+    # A kink: no stationary point exists where the descent ends.
+    fit = minimise(lambda z: 100.0 * jnp.abs(z - 0.3) ** 0.6, jnp.ones(1))
+    assert int(fit.status) != laplace.CONVERGED
+    with pytest.raises((NotConverged, NotFinite)):
+        fit.raise_unless_converged(("k",), "here")
+
+
+def test_noise_rounds_follow_their_update():
+    """EM: after every update the descent starts from the best point so far."""
+    y = jnp.asarray([1.0, 1.4, 0.7, 1.2])
+
+    def update(fit, noise):
+        r = fit.z[0] - y
+        sd = jnp.sqrt(jnp.mean(r**2) + fit.scale()[0, 0] ** 2)
+        return arrowhead.Noise(sd[None], noise.weights)
+
+    fit, noise, _ = multi_start(
+        lambda z: z[0] - y, [[0.0], [1.0]], rounds=60, update=update
+    )
+    # The fixed point, by scalar iteration.
+    v = 1.0
+    for _ in range(500):
+        s = 1.0 / (1.0 + 4.0 / v)
+        z = s * float(jnp.sum(y)) / v
+        v = float(jnp.mean((z - y) ** 2)) + s
+    assert float(noise.sd[0]) == pytest.approx(np.sqrt(v), rel=1e-8)
+    assert float(fit.z[0]) == pytest.approx(z, rel=1e-8)
+
+
+def test_slow_convergence_is_awaited():
+    """Where the Gauss-Newton step contracts by 0.93 only, thirty steps do not do."""
+
+    def residual(z):
+        return 0.93 * 0.5 * z**2 - 1.0  # Hessian 0.07, Gauss-Newton 1, at z = 0
+
+    fit = minimise(residual, jnp.asarray([1e-2]))
+    assert int(fit.status) == laplace.CONVERGED
+    assert float(fit.gradient) <= 1e-8
+
+
+def test_a_step_too_long_is_shortened():
+    """Under misfit the Hessian may be nine times Gauss-Newton's: undamped steps fly."""
+
+    def residual(z):
+        return jnp.stack([jnp.exp(z[0] + 8.0) - 1.0, 4.0 + jnp.exp(z[0])])
+
+    fit = minimise(residual, jnp.zeros(1))
+    gradient = jax.grad(lambda z: 0.5 * jnp.sum(residual(z) ** 2) + 0.5 * z @ z)(fit.z)
+    assert int(fit.status) == laplace.CONVERGED
+    assert float(jnp.max(jnp.abs(gradient))) <= 1e-7
+    assert int(fit.steps) < 60
+
+
+# Nuisances
+
+
+def curves(z, e):
+    """Three windows, two channels, four samples: nonlinear in ``z`` and each ``e``."""
+    t = jnp.linspace(0.0, 1.0, 4)[None] + 0.3 * jnp.arange(3.0)[:, None]
+    first = jnp.sin(z[0] * t + e[:, :1]) * jnp.exp(0.3 * e[:, 1:])
+    second = z[1] * t**2 + e[:, 1:] ** 2 * t - z[0]
+    target = jnp.stack([jnp.cos(3.0 * t), t], axis=-1)
+    return jnp.stack([first, second], axis=-1) - target
+
+
+def some_noise():
+    return arrowhead.Noise(jnp.asarray([0.2, 0.05]), jnp.asarray([1.0, 0.6, 2.0]))
+
+
+class Curves(laplace.AbstractLikelihood):
+    def blocks(self, z, e):
+        def one(w):
+            r = lambda z, own: curves(z, e.at[w].set(own))[w]  # noqa: E731
+            by_z, by_e = jax.jacfwd(r, argnums=(0, 1))(z, e[w])
+            J = jnp.concatenate([by_e, by_z], axis=-1)
+            return jax.vmap(ls.factor, in_axes=1)(J, r(z, e[w]))
+
+        return jnp.stack([one(w) for w in range(3)])
+
+    def curvature(self, z, gradient):
+        return jnp.zeros((z.size, z.size))
+
+
+def stacked(x):
+    """All whitened rows, priors included, of ``x = (z, e)``: one dense problem."""
+    z, e = x[:2], x[2:].reshape(3, 2)
+    noise = some_noise()
+    weight = jnp.sqrt(noise.weights)[:, None, None] / noise.sd[None, None]
+    return jnp.concatenate([(curves(z, e) * weight).reshape(-1), x])
+
+
+def fit_of_curves():
+    start = jnp.asarray([0.3, 0.2]), jnp.zeros((3, 2))
+    return laplace.minimise(Curves(), *start, some_noise())
+
+
+def test_nuisances_are_eliminated_exactly():
+    """MAP, posterior and evidence against scipy's dense solver of the whole problem."""
+    fit = fit_of_curves()
+    x = jnp.concatenate([fit.z, fit.e.reshape(-1)])
+    dense = scipy.optimize.least_squares(
+        lambda x: np.asarray(stacked(jnp.asarray(x))),
+        np.asarray(x) + 0.01,
+        jac=lambda x: np.asarray(jax.jacfwd(stacked)(jnp.asarray(x))),
+        xtol=1e-15,
+        ftol=1e-15,
+        gtol=1e-14,
+    )
+    np.testing.assert_allclose(x, dense.x, atol=1e-7)
+    assert float(fit.cost) == pytest.approx(dense.cost, rel=1e-12)
+    assert int(fit.status) == laplace.CONVERGED
+    J = np.asarray(jax.jacfwd(stacked)(x))
+    covariance = np.linalg.inv(J.T @ J)
+    np.testing.assert_allclose(
+        fit.scale() @ fit.scale().T, covariance[:2, :2], rtol=1e-8
+    )
+    _, log_det = np.linalg.slogdet(J.T @ J)
+    assert float(fit.log_joint()) == pytest.approx(-dense.cost - 0.5 * log_det)
+
+
+def test_expected_squares_are_those_of_the_joint_posterior():
+    """E||r||^2 per window and channel: at the MAP, plus J Sigma J^T of all unknowns."""
+    fit = fit_of_curves()
+    x = jnp.concatenate([fit.z, fit.e.reshape(-1)])
+    whole = np.asarray(jax.jacfwd(stacked)(x))
+    covariance = np.linalg.inv(whole.T @ whole)
+    J = np.asarray(jax.jacfwd(lambda x: curves(x[:2], x[2:].reshape(3, 2)))(x))
+    r = np.asarray(curves(fit.z, fit.e))
+    squares, spread = fit.squares()
+    np.testing.assert_allclose(squares, np.sum(r**2, axis=1), rtol=1e-6)
+    each = np.einsum("wtci,ij,wtcj->wc", J, covariance, J)
+    np.testing.assert_allclose(spread, each, rtol=1e-8)
+
+
+def test_weights_of_outlying_windows_fall():
+    """Student-t: (1 + n / nu) / (1 + |r|^2 / nu), by hand."""
+    fit, noise = fit_of_curves(), some_noise()
+    count, floor = jnp.full((3, 2), 4.0), jnp.asarray([0.01, 0.02])
+    new = laplace.expectation(count, floor, 4.0)(fit, noise)
+    squares, spread = map(np.asarray, fit.squares())
+    variance = np.asarray(noise.weights) @ (squares + spread) + 2.0 * floor**2
+    np.testing.assert_allclose(new.sd**2, variance / 14.0, rtol=1e-12)
+    misfit = np.sum(squares / np.asarray(new.sd) ** 2, axis=1)
+    np.testing.assert_allclose(new.weights, 3.0 / (1.0 + misfit / 4.0), rtol=1e-12)
+    off = laplace.expectation(count, floor)(fit, noise)
+    np.testing.assert_array_equal(off.weights, 1.0)
