@@ -70,6 +70,8 @@ def run(
         x["band/start_sd"],
         x["band/input_sd"],
         x["band/resolution"],
+        x["band/rows"],
+        x["band/shape"],
         float(x["band/inflation"]),
     )
     tested = found.read_logs(logs)
@@ -172,8 +174,7 @@ def _fold(
     train, tested = subset(grid, ~test), subset(grid, test)
     others = {source for k, source in enumerate(recordings(logs)) if k not in left}
     curve = np.isin(rows, [steps_of(h) for h in CURVE])
-    learned = jax.tree.map(lambda x: x[~test][:, curve], result)
-    band = fit_band(learned, train, len(others))
+    band = fit_band(result.of(~test).only(curve), train, len(others))
     linear = regression_errors(train, tested, horizon)
     part = judged(rows, tested, result.of(test), band, linear)
     picture = drawn(system, belief.posterior, band, grid)

@@ -93,6 +93,8 @@ def _stored(belief: WindowsBelief, band: Band, seed: int) -> dict[str, np.ndarra
         "band/start_sd": band.start_sd,
         "band/input_sd": band.input_sd,
         "band/resolution": band.resolution,
+        "band/rows": band.rows,
+        "band/shape": band.shape,
         "band/inflation": np.asarray(band.inflation),
         **diagnose.arrays(table, belief.prior, belief.posterior, key=key),
     }

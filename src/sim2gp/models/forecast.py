@@ -3,16 +3,22 @@
 A forecast errs by its start, by its constants, and by what the model does not know. For
 a window's output at horizon h, to first order,
 
-    V(h) = J_s S_s J_s^T + J_d S_d J_d^T + J_z S_z J_z^T + resolution^2
+    V(h) = max over h' <= h of
+           J_s S_s J_s^T + J_d S_d J_d^T + J_z S_z J_z^T + resolution^2
 
 with S_s the second moment of (causal - centred) start states, S_z the posterior, and
 S_d one constant, unknown input disturbance per window and input, whose standard
-deviations are fitted to the training logs' own forecast errors. The band never narrows
-as the horizon grows (running maximum of V), and V is raised by 1 + 1/m for m training
-logs: logs, not samples, are what replicates. The noise of the windows' likelihood is
+deviations are fitted to the training logs' own forecast errors. The machine's errors
+need not grow like that (a pendulum's swing back): at each horizon V is scaled to the
+training errors' own mean square (`Band.shape`). The noise of the windows' likelihood is
 left out: it *is* those errors, averaged over horizons.
+
+What replicates is the log, not the sample. A mean square over m training logs is made
+unbiased by m / (m - 1), and a new log adds its own deviation, 1 + 1/m: together the
+variance is raised by (m + 1) / (m - 1).
 """
 
+import dataclasses
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -42,11 +48,18 @@ class Forecast(eqx.Module):
     by_start: Float[np.ndarray, "W R c n"]
     by_input: Float[np.ndarray, "W R c m"]
     by_constants: Float[np.ndarray, "W R c"]  # variance
+    rows: tuple[int, ...] = eqx.field(static=True)  # of the grid
 
     def of(self, which: Bool[np.ndarray, " W"]) -> "Forecast":
         """The forecasts of some of the windows."""
         chosen: Forecast = jax.tree.map(lambda x: x[which], self)
         return chosen
+
+    def only(self, rows: Bool[np.ndarray, " R"]) -> "Forecast":
+        """The forecasts at some of the rows."""
+        chosen: Forecast = jax.tree.map(lambda x: x[:, rows], self)
+        at = tuple(np.asarray(self.rows)[rows].tolist())
+        return dataclasses.replace(chosen, rows=at)
 
     def rmse(self) -> Float[np.ndarray, "R c"]:
         """Root mean square over windows; NaN where nothing was measured."""
@@ -77,7 +90,8 @@ def forecast(
         np.concatenate, zip(*parts, strict=True)
     )
     y, valid = np.asarray(windows.y)[:, rows], np.asarray(windows.mask)[:, rows]
-    return Forecast(mean, mean - y, valid, by_start, by_input, by_constants)
+    at = tuple(rows.tolist())
+    return Forecast(mean, mean - y, valid, by_start, by_input, by_constants, at)
 
 
 @eqx.filter_jit
@@ -121,13 +135,19 @@ class Band:
     start_sd: Float[np.ndarray, " n"]
     input_sd: Float[np.ndarray, " m"]
     resolution: Float[np.ndarray, " c"]
+    rows: Float[np.ndarray, " R"]  # of the grid, where the shape was learned
+    shape: Float[np.ndarray, "R c"]  # observed over modelled variance
     inflation: float
 
     def scale(self, found: Forecast) -> Float[np.ndarray, "W R c"]:
-        """The square root of V, raised, at every row; rows in rising order."""
-        V = _variance(found, self.start_sd, self.resolution)
-        V = V + np.einsum("wrcm,m->wrc", found.by_input**2, self.input_sd**2)
-        return np.sqrt(self.inflation * np.maximum.accumulate(V, axis=1))
+        """The square root of V, shaped and raised, at every row; rows in rising order.
+
+        Between its rows the shape is interpolated, beyond them it stays; at the start
+        it is 1, for the start's own variance is known.
+        """
+        V = _variance(found, self.start_sd, self.resolution, self.input_sd)
+        shape = [np.interp(found.rows, self.rows, column) for column in self.shape.T]
+        return np.sqrt(self.inflation * np.stack(shape, axis=1) * V)
 
     def half_width(self, level: float) -> float:
         """How many scales a central band of this probability reaches to each side."""
@@ -147,25 +167,36 @@ def fit_band(found: Forecast, grid: Grid, recordings: int) -> Band:
     """
     start_sd = np.sqrt(np.nanmean(grid.lag**2, axis=0))
     resolution = np.asarray(grid.windows.floor)
-    known = _variance(found, start_sd, resolution)
-    squares, valid = found.by_input**2, found.valid
+    valid, m = found.valid, recordings
+
+    def variance(log_sd: np.ndarray) -> np.ndarray:
+        return _variance(found, start_sd, resolution, np.exp(log_sd))
 
     def cost(log_sd: np.ndarray) -> float:
-        V = known + np.einsum("wrcm,m->wrc", squares, np.exp(2.0 * log_sd))
-        V = np.maximum.accumulate(V, axis=1)
+        V = variance(log_sd)
         return float(np.mean((found.error**2 / V + np.log(V))[valid]))
 
-    reach = np.sqrt(np.mean(squares, axis=(0, 1, 2)))
+    reach = np.sqrt(np.mean(found.by_input**2, axis=(0, 1, 2)))
     error = np.sqrt(np.mean(found.error[valid] ** 2))
     guess = np.log(error / np.where(reach > 0.0, reach, 1.0) + 1e-300)
     best = scipy.optimize.minimize(cost, guess, method="Nelder-Mead").x
-    return Band(start_sd, np.exp(best), resolution, 1.0 + 1.0 / recordings)
+    squares = np.where(valid, found.error**2 / variance(best), 0.0).sum(axis=0)
+    count = valid.sum(axis=0)
+    shape = np.where(count > 0, squares / np.maximum(count, 1), 1.0)
+    # One log says nothing of another: then twice the sd is as good as any.
+    inflation = (m + 1) / (m - 1) if m > 1 else 4.0
+    rows = np.asarray((0.0, *found.rows))
+    shape = np.concatenate([np.ones_like(shape[:1]), shape])
+    return Band(start_sd, np.exp(best), resolution, rows, shape, inflation)
 
 
 def _variance(
     found: Forecast,
     start_sd: Float[np.ndarray, " n"],
     resolution: Float[np.ndarray, " c"],
+    input_sd: Float[np.ndarray, " m"],
 ) -> Float[np.ndarray, "W R c"]:
     V = np.einsum("wrcn,n->wrc", found.by_start**2, start_sd**2)
-    return np.asarray(V + found.by_constants + resolution**2)
+    V = V + np.einsum("wrcm,m->wrc", found.by_input**2, input_sd**2)
+    V = V + found.by_constants + resolution**2
+    return np.asarray(np.maximum.accumulate(V, axis=1))
