@@ -141,7 +141,7 @@ def test_gradients_against_differences(objective):
     assert bool(jnp.all(slope == 0.0)) is not objective.own_noise
 
     leaves, tree = jax.tree.flatten(q)
-    for function in (loss, alone):
+    for function in (jax.jit(loss), jax.jit(alone)):
         grads = jax.tree.leaves(jax.grad(function)(q))
         steps = [1e-5 * rng.standard_normal(leaf.shape) for leaf in leaves]
         if not objective.own_noise:
@@ -218,7 +218,10 @@ def fitted(request):
     with jax.enable_x64(True):
         recipe = model(request.param)
         data = padded(*make(400))
-        return recipe, data, recipe.fit(recipe.init(KEY), data, key=KEY)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(module, "POOL", 2048)
+            fitted = recipe.fit(recipe.init(KEY), data, key=KEY)
+        return recipe, data, fitted
 
 
 def test_before_data_it_is_the_simulators_prior(fitted):
@@ -302,7 +305,7 @@ def test_update_conditions_the_layer(fitted):
     np.testing.assert_allclose(got.mean, expected, rtol=1e-8)
     np.testing.assert_allclose(np.diag(got.covariance()), var, rtol=1e-8)
     # A later fit starts from that posterior in its own coordinates.
-    q = module.start(later, later.sim, later.head.output_scale)
+    q = module.start(later, later.sim, later.head.output_scale, 0.3)
     L, S = np.asarray(q.factor, float), np.asarray(later.head.layer.scale)
     np.testing.assert_allclose(
         L @ L.swapaxes(1, 2), S @ S.swapaxes(1, 2), rtol=1e-4, atol=1e-6

@@ -91,6 +91,7 @@ def test_training_follows_the_evidence():
     data = jax.tree.map(jnp.asarray, some_data(20, 24))
     X, Y = features.encoded(model.encoding, data)
 
+    @eqx.filter_jit
     def evidence(trained):
         R = last_layer.data_factor(trained.features(X), Y, data.mask)
         count = jnp.asarray(20.0)
@@ -98,7 +99,7 @@ def test_training_follows_the_evidence():
         return -jnp.sum(each) / count
 
     loss = module.evidence_loss
-    got = jax.grad(loss)(trained, X, Y, data.mask)
+    got = jax.jit(jax.grad(loss))(trained, X, Y, data.mask)
     # Central differences: QR with fewer rows than columns has no derivative in JAX.
     leaves, tree = jax.tree.flatten(trained)
     rng = np.random.default_rng(1)

@@ -28,13 +28,10 @@ from sim2gp.types import Key, Scalar
 
 BLOCK = 100
 BATCH = 256
-RATE = 2e-3
 NOISE_FLOOR = 3e-3  # while training, in units of the output's scale
 POINTS = 64  # inputs compared at each step
-POOL = 4096  # inputs whose targets are computed, once a fit
 REPLAY = 3  # one input in so many is near the data, the others fill the box
 JITTER = 0.1  # of the half-width of the box, about replayed inputs
-INITIAL_SCALE = 0.3
 
 
 class Objective(eqx.Module):
@@ -180,6 +177,7 @@ class Budget(eqx.Module):
     alone: Int[Array, ""]
     most: Int[Array, ""]
     all: Int[Array, ""]
+    rate: float = eqx.field(static=True)
 
 
 def train(
@@ -197,8 +195,8 @@ def train(
     X32, N = X.astype(jnp.float32), jnp.sum(mask, dtype=Y.dtype)
     first, second = budget.alone // BLOCK, (budget.alone + budget.most) // BLOCK
     last = second + budget.all // BLOCK
-    rates = jax.tree.map(lambda _: RATE, q)
-    rates = eqx.tree_at(lambda q: q.log_noise, rates, 5.0 * RATE)
+    rates = jax.tree.map(lambda _: budget.rate, q)
+    rates = eqx.tree_at(lambda q: q.log_noise, rates, 5.0 * budget.rate)
 
     def block(i: Array, carry: tuple) -> tuple:
         q, moments, noise = carry
