@@ -178,3 +178,29 @@ def test_a_truth_of_another_machine_is_refused() -> None:
     values.pop("arm_mass")
     with pytest.raises(InputError, match="E145"):
         tasks.furuta_swingup(values)
+
+
+@pytest.mark.parametrize("system", [Furuta(), CartPole()])
+@pytest.mark.parametrize(("word", "away"), [("2sd", 2.0), ("3sd", 3.0)])
+def test_displaced_truths_are_as_far_as_they_say(system, word, away):
+    table = system.parameters
+    record = tasks.draw_truth(system, KEY, word)
+    with jax.enable_x64(True):
+        theta = jnp.asarray([float(getattr(record, n)) for n in table.names])
+        z = (table.unconstrain(theta) - table.prior().mean) / table.prior().sd()
+    np.testing.assert_allclose(np.abs(z), away, rtol=1e-4)
+    assert len(set(np.sign(z))) == 2  # not one corner for all constants
+
+
+@pytest.mark.parametrize("system", [Furuta(), CartPole()])
+def test_truths_outside_lie_beyond_their_bounds(system):
+    record = tasks.draw_truth(system, KEY, "outside")
+    for p in system.parameters.free:
+        value = float(getattr(record, p.name))
+        beyond = max(value / p.high, p.low / value)
+        assert beyond == pytest.approx(1.2, rel=1e-6), p.name
+
+
+def test_an_unknown_truth_is_refused():
+    with pytest.raises(ValueError, match="4sd"):
+        tasks.draw_truth(Furuta(), KEY, "4sd")

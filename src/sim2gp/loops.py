@@ -329,16 +329,17 @@ def accept_truth(
     planner: AbstractPlanner,
     *,
     key: Key,
+    truth: str = "prior",
     attempts: int = 100,
 ) -> AcceptedTruth:
-    """Draw truths from the prior of ``system`` until the oracle swings one up.
+    """Draw truths (`tasks.draw_truth`) until the oracle swings one up.
 
     ``preset`` makes a task of a record of constants (`tasks.furuta_swingup`). Raises
     `NotFinite` as `episode`, `Sim2GPError` E204 when ``attempts`` draws all fail.
     """
     for attempt in range(attempts):
-        truth = draw_truth(system, key_for(key, attempt, Purpose.TRUTH))
-        task = preset(truth)
+        record = draw_truth(system, key_for(key, attempt, Purpose.TRUTH), truth)
+        task = preset(record)
         key_a = jax.random.fold_in(key, attempt)
         oracle = fly_oracle(task, planner, key=key_a)
         if oracle.swings_up:
@@ -346,7 +347,7 @@ def accept_truth(
     raise Sim2GPError(
         "E204",
         f"no truth that {type(planner).__name__} can swing up",
-        got=f"{attempts} draws from the prior",
+        got=f"{attempts} draws ({truth})",
         expected="at least one",
         fix="narrow the prior or give the planner more samples",
     )

@@ -28,6 +28,9 @@ from sim2gp.types import Action, Box, Dynamics, Key, Reward, Scalar, State, in_f
 UPRIGHT_COSINE = -0.9
 #: The solved band of the score.
 SOLVED = 0.95
+#: How hidden constants are drawn: as believed, further away, or beyond the bounds.
+TRUTHS = ("prior", "2sd", "3sd", "outside")
+BEYOND = 1.2
 
 
 class Task(eqx.Module):
@@ -164,10 +167,28 @@ def cartpole_swingup(
 
 
 @in_float64
-def draw_truth(system: AbstractSystem, key: Key) -> Any:
-    """A record of hidden constants from the system's own prior, in float32."""
-    tt = system.parameters.prior().sample(key)
-    values = system.parameters.values(tt)
+def draw_truth(system: AbstractSystem, key: Key, truth: str = "prior") -> Any:
+    """A record of hidden constants, in float32.
+
+    ``truth`` is one of `TRUTHS`: from the system's own prior, or with every constant 2
+    or 3 prior sd from its mean (in virtual space), or a fifth beyond its bounds, each
+    on a random side. Raises ValueError for another word, E142 where a constant has no
+    bounds to be beyond.
+    """
+    if truth not in TRUTHS:
+        raise ValueError(f"truth is {truth!r}, not one of {', '.join(TRUTHS)}")
+    table = system.parameters
+    side = jnp.where(jax.random.bernoulli(key, shape=(len(table),)), 1.0, -1.0)
+    prior = table.prior()
+    away = {"2sd": 2.0, "3sd": 3.0}.get(truth)
+    tt = prior.sample(key) if away is None else prior.mean + away * prior.sd() * side
+    values = table.values(tt)
+    if truth == "outside":
+        for p, s in zip(table.free, side.tolist(), strict=True):
+            if not (p.low > 0.0 and math.isfinite(p.high)):
+                raise InputError("E142", f"no bounds beyond which {p.name} could lie")
+            beyond = BEYOND * p.high if s > 0.0 else p.low / BEYOND
+            values[p.name] = jnp.asarray(beyond)
     return system.record({k: v.astype(jnp.float32) for k, v in values.items()})
 
 

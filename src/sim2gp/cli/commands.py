@@ -50,6 +50,8 @@ class Demo(Writes):
     """Run this many seeds, starting at the one given."""
     episodes: int = 3
     """Real episodes of each run, 5 s each."""
+    truth: Literal["prior", "2sd", "3sd", "outside"] = "prior"
+    """Hidden constants: as believed, each so far off, or beyond its bounds."""
 
     def run(self, progress: Progress) -> dict[str, Any]:
         return _experiment("demo")(
@@ -58,6 +60,7 @@ class Demo(Writes):
             seed=self.seed,
             seeds=self.seeds,
             episodes=self.episodes,
+            truth=self.truth,
             progress=progress,
         )
 

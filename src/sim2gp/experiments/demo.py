@@ -64,6 +64,7 @@ def run(
     seed: int,
     seeds: int,
     episodes: int,
+    truth: str,
     progress: Progress,
 ) -> dict[str, Any]:
     """Fly ``seeds`` machines and write the run; returns its summary."""
@@ -82,14 +83,15 @@ def run(
         with progress.task("demo", seeds * parts) as task:
             for s in range(seed, seed + seeds):
                 key = jax.random.key(s)
-                accepted = accept_truth(preset, system, MPC(), key=key)
+                accepted = accept_truth(preset, system, MPC(), key=key, truth=truth)
                 task.advance(f"seed {s}: oracle {accepted.oracle.oracle_return:.0f}")
                 histories = _race(accepted.task, learners, episodes, key, task.advance)
                 runs.append(SeedRun(accepted, hanging_return(accepted.task), histories))
         summary, arrays = _summarise(system, machine, runs, seed, episodes)
+        summary["truth"] = truth
         summary |= provenance(
             f"sim2gp demo --machine {machine} --seed {seed} --seeds {seeds} "
-            f"--episodes {episodes}",
+            f"--episodes {episodes} --truth {truth}",
             started,
         )
         from sim2gp.report import write_report
