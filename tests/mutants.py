@@ -3,7 +3,7 @@
     python tests/mutants.py            all of them, a table, exit code 1 if one survives
     python tests/mutants.py prior      those whose name contains "prior"
 
-The list is in `mutant_list.py`.
+The lists are in `mutant_list.py` and `mutant_networks.py`.
 """
 
 import os
@@ -15,7 +15,11 @@ import time
 from collections.abc import Iterable
 from pathlib import Path
 
-from mutant_list import MUTANTS, Hunt, Mutant
+from mutant_list import MUTANTS as PHYSICS
+from mutant_list import Hunt, Mutant
+from mutant_networks import NETWORKS
+
+MUTANTS = (*PHYSICS, *NETWORKS)
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "src" / "sim2gp"

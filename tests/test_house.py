@@ -201,7 +201,7 @@ def run_python(code: str) -> str:
 
 IMPORT_PROBE = """
 import json, sys, time
-import equinox, jax, jax.monitoring, optax, optimistix, scipy.linalg
+import equinox, jax, jax.monitoring, optax, scipy.linalg
 compiled = []
 jax.monitoring.register_event_duration_secs_listener(
     lambda name, seconds, **_: compiled.append(name) if "compile" in name else None)

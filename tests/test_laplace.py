@@ -201,6 +201,13 @@ def test_a_step_too_long_is_shortened():
     assert int(fit.steps) < 60
 
 
+def test_a_step_that_gains_nothing_is_not_taken():
+    """Gauss-Newton on an arctangent overshoots by more each time."""
+    fit = minimise(lambda z: 1000.0 * jnp.arctan(z - 1.0), jnp.asarray([-4.0]))
+    assert int(fit.status) == laplace.CONVERGED
+    assert float(fit.z[0]) == pytest.approx(1.0, abs=1e-5)
+
+
 # Nuisances
 
 

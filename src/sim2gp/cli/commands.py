@@ -15,7 +15,8 @@ from sim2gp.cli.arguments import usage_error
 from sim2gp.runs import Progress, load_run
 from sim2gp.runs.store import check_target
 
-FIGURES = {"fig1": "two_link"}  # figure -> module of sim2gp.experiments
+#: Figure, and the module of `sim2gp.experiments` that makes it.
+FIGURES = {"fig1": "two_link", "fig2": "figure2"}
 
 
 @dataclass(kw_only=True)
@@ -150,8 +151,8 @@ class Selftest(Common):
 class Reproduce(Writes):
     """A figure of the paper: its data, the picture, and the claims checked."""
 
-    figure: Annotated[Positional[Literal["fig1"]], arg(metavar="FIGURE")]
-    """Which figure: fig1."""
+    figure: Annotated[Positional[Literal["fig1", "fig2"]], arg(metavar="FIGURE")]
+    """Which figure."""
     seed: int = 0
     """Draws the data."""
     quick: bool = False

@@ -7,7 +7,7 @@ from typing import Any
 
 import jax
 
-PACKAGES = ("sim2gp", "jax", "jaxlib", "equinox", "optimistix", "numpy", "scipy")
+PACKAGES = ("sim2gp", "jax", "jaxlib", "equinox", "numpy", "scipy")
 
 
 def provenance(command_line: str, started: float) -> dict[str, Any]:

@@ -7,6 +7,7 @@ and README files are drawn by the same rooms (`figure1`, `animation_gif`).
 from sim2gp.report.animation import animation_gif, animation_png
 from sim2gp.report.document import write_report
 from sim2gp.report.figure1 import arm_drawing, figure1, figure_bytes
+from sim2gp.report.figure2 import figure2
 from sim2gp.report.redraw import load_run, redraw
 
 __all__ = [
@@ -14,6 +15,7 @@ __all__ = [
     "animation_png",
     "arm_drawing",
     "figure1",
+    "figure2",
     "figure_bytes",
     "load_run",
     "redraw",

@@ -124,28 +124,36 @@ def _machine(summary: Summary, arrays: Arrays) -> Raw:
     )
 
 
-def _figure1(summary: Summary, arrays: Arrays) -> Raw:
-    if not summary.get("figure1") or "figure1/prior/mean" not in arrays:
-        return Raw("")
+def _figure(summary: Summary, arrays: Arrays) -> Raw:
+    """The paper's figure that this run reproduces."""
     from sim2gp.report.figure1 import figure1, figure_bytes
+    from sim2gp.report.figure2 import figure2
 
-    drawing = figure_bytes(figure1(arrays, summary), "png")
-    code = base64.b64encode(drawing).decode("ascii")
-    words = (
-        "Figure 1: the arm over two data sets, and the beliefs before and after each"
-    )
+    if summary.get("figure1") and "figure1/prior/mean" in arrays:
+        name, drawn = "Figure 1", figure1(arrays, summary)
+        words = "the arm over two data sets, and the beliefs before and after each"
+        more = (
+            "Shades are the central 90 % of draws, dashed black lines the recording; "
+            "the ellipses hold one and two standard deviations."
+        )
+    elif summary.get("figure2"):
+        name, drawn = "Figure 2", figure2(arrays, summary)
+        words = "best-seen score against episode, for every learner"
+        more = (
+            "Lines are medians over seeds, shades quartiles; 1 is the oracle's score, "
+            "0 that of a pole left hanging, the dotted line 0.95."
+        )
+    else:
+        return Raw("")
+    code = base64.b64encode(figure_bytes(drawn, "png")).decode("ascii")
     return section(
-        "figure1",
-        "Figure 1",
+        name.lower().replace(" ", ""),
+        name,
         Raw(
-            f'<div class="picture"><img alt="{words}" '
+            f'<div class="picture"><img alt="{name}: {words}" '
             f'src="data:image/png;base64,{code}"></div>\n'
         ),
-        paragraph(
-            "Shades are the central 90 % of draws, dashed black lines the recording; "
-            "the ellipses hold one and two standard deviations.",
-            "soft",
-        ),
+        paragraph(more, "soft"),
     )
 
 
@@ -168,7 +176,7 @@ def write_report(summary: Summary, arrays: Arrays) -> str:
     """
     sections = [
         data.claims(summary),
-        _figure1(summary, arrays),
+        _figure(summary, arrays),
         _machine(summary, arrays),
         returns(summary, arrays),
         parameters.parameter_table(summary),

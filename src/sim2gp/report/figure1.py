@@ -30,7 +30,7 @@ STAGES = {
 }
 _INK, _SOFT = "#1b1f24", "#59636e"
 _FIRST, _SECOND = "#0072b2", "#d55e00"
-_STYLE = {
+STYLE = {
     "font.size": 8.0,
     "axes.linewidth": 0.7,
     "axes.edgecolor": _SOFT,
@@ -247,7 +247,7 @@ def figure1(arrays: Arrays, summary: Summary) -> "Figure":
     about = summary["figure1"]
     lengths = about.get("lengths", (0.5, 0.4))
     vertical = bool(about.get("vertical", False))
-    with rc_context(_STYLE):
+    with rc_context(STYLE):
         figure = Figure(figsize=(10.6, 5.6), facecolor="white")
         outer = figure.add_gridspec(
             1, 2, width_ratios=(1.0, 1.08), wspace=0.14,
@@ -289,6 +289,6 @@ def figure_bytes(figure: "Figure", kind: str = "svg", dpi: float = 160.0) -> byt
     file = io.BytesIO()
     FigureCanvasAgg(figure)
     dated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
-    with rc_context(_STYLE):
+    with rc_context(STYLE):
         figure.savefig(file, format=kind, dpi=dpi, metadata=dated.get(kind, {}))
     return file.getvalue()

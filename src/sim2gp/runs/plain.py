@@ -40,7 +40,7 @@ def _plain_values(value: Any, key: str) -> Any:
 
 def environment() -> dict[str, str]:
     """Versions and machine that a result was made with."""
-    names = ("sim2gp", "jax", "jaxlib", "equinox", "numpy", "scipy", "optimistix")
+    names = ("sim2gp", "jax", "jaxlib", "equinox", "numpy", "scipy")
     found = {name: version(name) for name in names}
     return found | {"python": platform.python_version(), "machine": platform.machine()}
 

@@ -1,0 +1,177 @@
+"""Cells of the swing-up studies: one learner on one hidden machine, episode by episode.
+
+All learners of a seed meet the same truth under the same noise. A cell holds its
+returns and every argument that made them; a study is a list of cells.
+"""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from sim2gp.errors import NotConverged, NotFinite
+from sim2gp.loops import Episode, Purpose, accept_truth, key_for, psrl
+from sim2gp.models import (
+    NLM,
+    AbstractModel,
+    FunctionSpace,
+    PointEstimate,
+    Residual,
+    ResidualFunctionSpace,
+    Sim2GP,
+)
+from sim2gp.planning import MPC
+from sim2gp.runs.cells import Cells
+from sim2gp.systems import CartPole, Furuta
+from sim2gp.systems.base import AbstractMechanism
+from sim2gp.systems.effects import AbstractEffect, RailFriction, Spring
+from sim2gp.systems.perturbed import Perturbed
+from sim2gp.tasks import (
+    Task,
+    cartpole_swingup,
+    draw_truth,
+    furuta_swingup,
+    hanging_return,
+    score,
+)
+
+#: Machine, and the physics that the real one has in the mismatched cells of figure 2,
+#: fixed before anything was run: a cable spring (N m/rad), strong Coulomb friction.
+MACHINES: dict[str, tuple[Callable[[], AbstractMechanism], Callable[..., Task]]] = {
+    "furuta": (Furuta, furuta_swingup),
+    "cartpole": (CartPole, cartpole_swingup),
+}
+MISSING: dict[str, AbstractEffect] = {
+    "furuta": Spring("theta", 0.02),
+    "cartpole": RailFriction(magnitude=0.1),
+}
+CONDITIONS = ("nominal", "mismatch")
+WITH_TERM = "SIM2GP with the term"
+
+
+def _with_term(system: AbstractMechanism, missing: AbstractEffect) -> AbstractModel:
+    return Sim2GP(Perturbed(system, [missing], free=True))
+
+
+#: Each learner, made of the simulator and the physics that it lacks.
+METHODS: dict[str, Callable[[AbstractMechanism, AbstractEffect], AbstractModel]] = {
+    "SIM2GP": lambda system, _: Sim2GP(system),
+    "point estimate": lambda system, _: PointEstimate(Sim2GP(system)),
+    "NLM": lambda system, _: NLM(system),
+    "RES": lambda system, _: Residual(Sim2GP(system)),
+    "FS literal": lambda system, _: FunctionSpace(Sim2GP(system), objective="literal"),
+    "FS": lambda system, _: FunctionSpace(Sim2GP(system)),
+    "RES-FS": lambda system, _: ResidualFunctionSpace(Sim2GP(system)),
+    WITH_TERM: _with_term,
+}
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One learner, on one machine of one seed; ``oracle`` is a method as well."""
+
+    machine: str
+    condition: str
+    method: str
+    seed: int
+    episodes: int
+
+    @property
+    def name(self) -> str:
+        """Of its file."""
+        words = (self.machine, self.condition, self.method, str(self.seed))
+        return "_".join(words).replace(" ", "-")
+
+
+def effects_of(machine: str, condition: str) -> tuple[AbstractEffect, ...]:
+    """What the real machine has and its simulator lacks."""
+    return (MISSING[machine],) if condition == "mismatch" else ()
+
+
+def oracle_cell(cell: Cell) -> dict[str, Any]:
+    """Find the seed's truth, the first that its oracle swings up, and its returns."""
+    make, preset = MACHINES[cell.machine]
+    effects = effects_of(cell.machine, cell.condition)
+    found = accept_truth(
+        lambda record: preset(record, effects),
+        make(),
+        MPC(),
+        key=jax.random.key(cell.seed),
+    )
+    return {
+        "returns": found.oracle.returns.tolist(),
+        "oracle_return": found.oracle.oracle_return,
+        "hang_return": hanging_return(found.task),
+        "redrawn": found.redrawn,
+    }
+
+
+def learner_cell(cell: Cell, redrawn: int) -> dict[str, Any]:
+    """Fly one learner; an episode after a fit that failed was not flown."""
+    make, preset = MACHINES[cell.machine]
+    system, key = make(), jax.random.key(cell.seed)
+    record = draw_truth(system, key_for(key, redrawn, Purpose.TRUTH))
+    task = preset(record, effects_of(cell.machine, cell.condition))
+    model = METHODS[cell.method](system, MISSING[cell.machine])
+    returns: list[float] = []
+    started, failure = time.perf_counter(), None
+
+    def note(episode: Episode) -> None:
+        returns.append(float(episode.trajectory.total))
+
+    try:
+        psrl(task, model, MPC(), episodes=cell.episodes, key=key, on_episode=note)
+    except (NotConverged, NotFinite) as error:
+        failure = str(error)
+    seconds = time.perf_counter() - started
+    return {"returns": returns, "failure": failure, "seconds": seconds}
+
+
+def fly_cell(cell: Cell, cells: Cells) -> dict[str, Any]:
+    """A cell's values, from the disk if it is finished."""
+    stored = cells.load(cell.name, asdict(cell))
+    if stored is not None:
+        return stored
+    if cell.method == "oracle":
+        return cells.save(cell.name, asdict(cell), oracle_cell(cell))
+    oracle = fly_cell(reference(cell), cells)
+    return cells.save(
+        cell.name, asdict(cell), learner_cell(cell, int(oracle["redrawn"]))
+    )
+
+
+def reference(cell: Cell) -> Cell:
+    """The oracle's cell of the same machine."""
+    return Cell(cell.machine, cell.condition, "oracle", cell.seed, 0)
+
+
+def scores(
+    values: Sequence[Mapping[str, Any]],
+    references: Sequence[Mapping[str, Any]],
+    episodes: int,
+) -> Float[np.ndarray, "seeds E"]:
+    """Score of each seed's episodes; NaN for episodes that were not flown."""
+    out = np.full((len(values), episodes), np.nan)
+    for i, (value, oracle) in enumerate(zip(values, references, strict=True)):
+        for e, total in enumerate(value["returns"][:episodes]):
+            out[i, e] = score(total, oracle["hang_return"], oracle["oracle_return"])
+    return out
+
+
+def best_seen(score: Float[np.ndarray, "seeds E"]) -> Float[np.ndarray, "seeds E"]:
+    """The best score so far; what was not flown adds nothing."""
+    filled = np.where(np.isfinite(score), score, -np.inf)
+    best = np.maximum.accumulate(filled, axis=1)
+    return np.where(np.isfinite(best), best, 0.0)
+
+
+def first_at(
+    score: Float[np.ndarray, "seeds E"], solved: float
+) -> Float[np.ndarray, " seeds"]:
+    """The first episode, from 1, whose score is at least ``solved``; inf if never."""
+    reached = np.where(np.isfinite(score), score, -np.inf) >= solved
+    return np.where(reached.any(axis=1), 1.0 + reached.argmax(axis=1), np.inf)

@@ -1,0 +1,131 @@
+"""Figure 2's bookkeeping: scores, claims on planted returns, cells that resume."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sim2gp.experiments import figure2, swingup
+from sim2gp.experiments.swingup import CONDITIONS, MACHINES, METHODS, Cell
+from sim2gp.report import figure2 as drawn
+from sim2gp.runs import Progress
+from sim2gp.runs.cells import Cells
+
+ORACLE = {"hang_return": 50.0, "oracle_return": 150.0, "redrawn": 1, "returns": [150.0]}
+
+
+def test_scores_and_the_best_seen_by_hand():
+    values = [{"returns": [50.0, 150.0, 100.0]}, {"returns": [60.0]}]
+    score = swingup.scores(values, [ORACLE, ORACLE], 3)
+    np.testing.assert_allclose(score[0], [0.0, 1.0, 0.5])
+    assert score[1, 0] == pytest.approx(0.1)
+    assert np.isnan(score[1, 1:]).all()
+    best = swingup.best_seen(score)
+    np.testing.assert_allclose(best, [[0.0, 1.0, 1.0], [0.1, 0.1, 0.1]])
+    np.testing.assert_array_equal(swingup.first_at(score, 0.95), [2.0, np.inf])
+
+
+def planted(fast: str = "", slow: str = "") -> figure2.Table:
+    """Everybody solves in episode 2, ``fast`` at once, ``slow`` never; NLM in 5."""
+    rng = np.random.default_rng(0)
+    table = {}
+    for machine in MACHINES:
+        for condition in CONDITIONS:
+            for method in METHODS:
+                score = np.full((10, 6), 1.0) + 1e-3 * rng.standard_normal((10, 6))
+                score[:, 0] = 0.1
+                if method == "NLM":
+                    score[:, :4] = 0.2
+                if method == fast:
+                    score[:, 0] = 1.0
+                if method == slow:
+                    score[:] = 0.3
+                table[machine, condition, method] = score
+    return table
+
+
+def holds(table: figure2.Table, name: str) -> bool:
+    return figure2.claims(table, np.random.default_rng(1))[name]["holds"]
+
+
+def test_claims_see_what_was_planted():
+    table = planted(fast="FS literal", slow="SIM2GP")
+    assert holds(table, "furuta_literal_function_space_is_best_under_mismatch")
+    assert holds(table, "furuta_physics_alone_fails_under_mismatch")
+    assert not holds(table, "furuta_physics_learns_twice_as_fast")
+    assert not holds(table, "furuta_residual_costs_nothing")
+    assert not holds(table, "sampling_beats_the_point_estimate_somewhere")
+    table = planted(fast="SIM2GP", slow="FS literal")
+    assert holds(table, "sampling_beats_the_point_estimate_somewhere")
+    assert holds(table, "cartpole_physics_learns_twice_as_fast")
+    assert holds(table, "cartpole_RES_FS_solves_mismatch_in_three")
+    assert not holds(table, "cartpole_literal_function_space_is_best_under_mismatch")
+    assert not holds(table, "cartpole_physics_alone_fails_under_mismatch")
+    for claim in figure2.claims(table, np.random.default_rng(1)).values():
+        assert claim["figure"]
+        json.dumps(claim, allow_nan=False)
+
+
+def test_a_bootstrap_interval_covers_the_mean():
+    """Of normal samples: the central 95 % is mean -+ 1.96 sd / sqrt(n), nearly."""
+    rng = np.random.default_rng(3)
+    sample = rng.standard_normal(200)
+    low, high = figure2.interval(sample, rng)
+    half = 1.96 * sample.std() / np.sqrt(200)
+    assert low == pytest.approx(sample.mean() - half, abs=0.02)
+    assert high == pytest.approx(sample.mean() + half, abs=0.02)
+
+
+def test_a_finished_cell_is_not_flown_again(tmp_path: Path):
+    cells = Cells(tmp_path / "fig2")
+    cell = Cell("furuta", "nominal", "SIM2GP", 3, 2)
+    assert cells.load(cell.name, asdict(cell)) is None
+    saved = cells.save(cell.name, asdict(cell), {"returns": (1.0, np.float64(2.0))})
+    assert saved == {"returns": [1.0, 2.0]}
+    assert swingup.fly_cell(cell, cells) == saved
+    assert not [f for f in cells.folder.iterdir() if f.name.startswith(".")]
+    # With other arguments, or damaged, it counts as missing.
+    more = Cell("furuta", "nominal", "SIM2GP", 3, 4)
+    assert cells.load(more.name, asdict(more)) is None
+    (cells.folder / f"{cell.name}.json").write_text('{"arguments": ')
+    assert cells.load(cell.name, asdict(cell)) is None
+
+
+def test_the_figure_goes_on_where_it_was(tmp_path: Path, monkeypatch):
+    """Interrupted after seven cells, the second run flies only what is missing."""
+    flown: list[str] = []
+
+    def learner(cell: Cell, redrawn: int):
+        if len(flown) == 7:
+            raise KeyboardInterrupt
+        flown.append(cell.name)
+        assert redrawn == 1
+        returns = [60.0 + 10.0 * e + cell.seed for e in range(cell.episodes)]
+        return {"returns": returns, "failure": None, "seconds": 1.0}
+
+    monkeypatch.setattr(swingup, "learner_cell", learner)
+    monkeypatch.setattr(swingup, "oracle_cell", lambda cell: ORACLE)
+
+    def draw():
+        out, progress = tmp_path / "fig2", Progress()
+        return figure2.run(out=out, seed=0, quick=True, progress=progress)
+
+    with pytest.raises(KeyboardInterrupt):
+        draw()
+    assert not (tmp_path / "fig2").exists()
+    first = list(flown)
+    flown.append("go on")
+    summary = draw()
+    again = flown[len(first) + 1 :]
+    assert not set(first) & set(again)
+    assert len(first) + len(again) == 2 * len(CONDITIONS) * len(METHODS) * len(MACHINES)
+    assert summary["seeds"] == 2
+    assert (tmp_path / "fig2" / "figure2.png").stat().st_size > 20_000
+    assert "Figure 2" in (tmp_path / "fig2" / "report.html").read_text()
+    # Redrawn from the stored arrays alone.
+    with np.load(tmp_path / "fig2" / "arrays.npz") as arrays:
+        figure = drawn(dict(arrays), summary)
+    assert len(figure.axes) == 4
+    assert len(figure.axes[0].lines) == len(METHODS) + 1
