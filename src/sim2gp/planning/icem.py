@@ -34,7 +34,7 @@ class ICEM(AbstractUpdate):
     iterations: int | None = eqx.field(static=True, default=None)
     elites: int = eqx.field(static=True, default=10)
     noise_colour: float | None = eqx.field(static=True, default=None)
-    sd: float = eqx.field(static=True, default=0.5)
+    sd: float = eqx.field(static=True, default=0.8)
     reuse: float = eqx.field(static=True, default=0.3)
     smoothing: float = eqx.field(static=True, default=0.1)
     decay: float = eqx.field(static=True, default=1.0)
