@@ -46,8 +46,10 @@ def demo(action: Callable[[Path, Progress], Any]) -> Callable[..., dict[str, Any
         seed: int,
         seeds: int,
         episodes: int,
+        truth: str,
         progress: Progress,
     ) -> dict[str, Any]:
+        assert truth == "prior"
         action(out, progress)
         asked = {"seed": seed, "seeds": seeds, "machine": machine}
         return SUMMARY | asked | {"episodes": episodes}

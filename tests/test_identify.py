@@ -30,8 +30,6 @@ voltage = "u"
 
 [likelihood]
 window = 0.2
-start = "causal"
-start_sd = 0.01
 """
 
 
@@ -72,8 +70,8 @@ def test_identify_finds_the_constants(run: Path) -> None:
     nominal = Furuta().parameters.nominal()
     assert list(summary["parameters"]) == sorted(FREE, key=list(nominal).index)
     for name, entry in summary["parameters"].items():
-        # A causal start lags: its error is in the noise, and pulls a little.
-        assert entry["mean"] == pytest.approx(nominal[name], rel=0.3)
+        assert entry["mean"] == pytest.approx(nominal[name], rel=0.1), name
+        assert abs(entry["mean"] - nominal[name]) < 4.0 * entry["sd"], name
         for key in ("unit", "prior_mean", "prior_sd", "q025", "q975", "verdict"):
             assert key in entry
     for key in ("log_evidence", "directions", "misfit", "n_transitions", "n_rows"):

@@ -14,6 +14,7 @@ from sim2gp.logs import Log
 from sim2gp.models import Sim2GP
 from sim2gp.models import windows as likelihood
 from sim2gp.models.cutting import cut
+from sim2gp.models.grid import evaluation_windows
 from sim2gp.models.windows import Windows, fit_windows
 from sim2gp.systems import Actuated, Furuta
 from sim2gp.systems.actuator import actuator_prior
@@ -268,3 +269,25 @@ def test_gaussian_prior_comes_back_without_data(short: Log) -> None:
     factor = factor_at(system, blank, np.zeros(3), np.ones(2)).data
     assert isinstance(system.parameters.prior(), Gaussian)
     np.testing.assert_array_equal(np.asarray(factor)[:, :], 0.0)
+
+
+def test_causal_windows_stand_where_forecasts_start() -> None:
+    """Every 0.1 s from 0.1 s on, and blind to what comes after their start."""
+    log = simulated(seconds=1.0, seed=5, noise=1e-3)
+    system = pendulum()
+    windows, places = cut([log], system, window=0.2, start="causal")
+    rows = [row for _, row in places]
+    np.testing.assert_allclose(log.time[rows], [0.1, 0.3, 0.5, 0.7], atol=1e-9)
+    grid = evaluation_windows([log], system, longest=0.1)
+    shared = np.isin(np.round(grid.since, 6), np.round(log.time[rows], 6))
+    np.testing.assert_allclose(
+        windows.start, grid.windows.start[shared], rtol=1e-6, atol=1e-9
+    )
+    later = {n: np.where(log.time > 0.5, 9.0, y) for n, y in log.channels.items()}
+    changed, _ = cut(
+        [dataclasses.replace(log, channels=later)],
+        system,
+        window=0.2,
+        start="causal",
+    )
+    np.testing.assert_array_equal(changed.start[:3], windows.start[:3])
