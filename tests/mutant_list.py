@@ -1,7 +1,6 @@
 """The mutants: a name, a file, the text it replaces, what it puts there, the tests.
 
-The text must occur exactly once: code that has moved is an error, not a mutant that
-quietly no longer exists. `mutants.py` hunts them.
+The text must occur exactly once, or it is an error. `mutants.py` hunts them.
 """
 
 import ast
@@ -289,6 +288,13 @@ MUTANTS = (
         "found.cost < best.cost",
         "~(found.cost < best.cost)",
         ("test_laplace.py", "best"),
+    ),
+    Mutant(
+        "first start not descended",
+        LAPLACE,
+        "jnp.where(first | lost",
+        "jnp.where(lost",
+        ("test_laplace.py", "every"),
     ),
     Mutant(
         "steps too long are taken",

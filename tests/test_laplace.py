@@ -129,6 +129,13 @@ def test_the_best_of_several_descents_wins():
     assert float(fit.cost) == pytest.approx(float(jnp.min(costs)), rel=1e-12)
 
 
+def test_every_start_is_descended():
+    """The same start twice costs the same: the first has nothing before it."""
+    fit, _, costs = multi_start(rosenbrock, [[-1.2, 1.0], [-1.2, 1.0]])
+    assert float(costs[0]) == pytest.approx(float(costs[1]), rel=1e-9)
+    assert float(costs[0]) == pytest.approx(float(fit.cost), rel=1e-6)
+
+
 def test_dead_parameters_are_named():
     """mujoco#3286: zero iterations at a zero gradient is no success."""
     fit, _, _ = multi_start(lambda z: jnp.stack([0.0 * z @ z - 1.0]), [[1.0, 1.0]])

@@ -42,7 +42,6 @@ FIRST_DAMPING = 1.0  # the prior's own precision: trust one prior standard devia
 AGAIN_DAMPING = 1e-2  # of a descent that follows another
 LEAST_DAMPING = 1e-5  # below this the step is undamped
 MOST_DAMPING = 1e14
-LEAST_CURVATURE = 0.1  # of Gauss-Newton's, in any direction
 
 
 class AbstractLikelihood(eqx.Module):
@@ -259,13 +258,8 @@ def multi_start(
         noise = jax.tree.map(lambda new, old: jnp.where(stay, old, new), settled, noise)
         again = _point(best.z, best.e, best.blocks, noise)
         here = _select(searching, nowhere, again)
-        damping = jnp.where(last, 0.0, AGAIN_DAMPING)
-        damping = jnp.where(searching, FIRST_DAMPING, damping)
-        dz, de, gain = _step(likelihood, again, noise, damping)
-        z = jnp.where(searching, start, again.z + dz)
-        trial = (z, jnp.where(searching, e, again.e + de), gain)
         found, taken = _descend(
-            likelihood, here, trial, damping, noise, tolerance, last
+            likelihood, here, (start, e), searching, noise, tolerance, last
         )
         # A cost that is not finite never wins; a comparison with NaN is false.
         better = jnp.where(searching, found.cost < best.cost, True)
@@ -280,19 +274,23 @@ def multi_start(
 def _descend(
     likelihood: AbstractLikelihood,
     here: Point,
-    trial: tuple[Array, Array, Array],
-    damping: Scalar,
+    start: tuple[Float[Array, " p"], Float[Array, "W n"]],
+    fresh: Bool[Array, ""],
     noise: Noise,
     tolerance: float,
     exact: Bool[Array, ""],
 ) -> tuple[Point, Int[Array, ""]]:
-    """Levenberg-Marquardt from ``here``, whose first step and promise are ``trial``.
+    """Levenberg-Marquardt from ``start`` where it is ``fresh``, else from ``here``.
 
     The damping follows the ratio of gained to promised cost (Nielsen 1999).
     """
 
     def improve(carry: tuple) -> tuple:
-        here, (z, e, promise), damping, count, _ = carry
+        here, damping, count, _ = carry
+        dz, de, promise = _step(likelihood, here, noise, damping)
+        first = fresh & (count == 0)
+        z = jnp.where(first, start[0], here.z + dz)
+        e = jnp.where(first, start[1], here.e + de)
         there = _point(z, e, likelihood.blocks(z, e), noise)
         gained = here.cost - there.cost
         # Rounding in the cost must not refuse the last, gradient-only digits.
@@ -300,17 +298,15 @@ def _descend(
         lost_in_rounding = (jnp.abs(gained) <= slack) & (there.gradient < here.gradient)
         keep = (gained > slack) | lost_in_rounding
         settled = keep & (gained <= tolerance * (1.0 + there.cost))
-        ratio = jnp.where(lost_in_rounding, 1.0, gained / promise)
+        # A start has nothing to be compared with, and rounding no ratio.
+        ratio = jnp.where(first | lost_in_rounding, 1.0, gained / promise)
         lowered = damping * jnp.clip(1.0 - (2.0 * ratio - 1.0) ** 3, 0.1, 2.0)
         raised = 4.0 * jnp.maximum(damping, LEAST_DAMPING)
-        damping = jnp.where(keep, lowered, raised)
-        here = _select(keep, there, here)
-        dz, de, promise = _step(likelihood, here, noise, damping)
-        trial = (here.z + dz, here.e + de, promise)
-        return here, trial, damping, count + 1, settled
+        damping = jnp.where(first, damping, jnp.where(keep, lowered, raised))
+        return _select(keep, there, here), damping, count + 1, settled
 
     def unfinished(carry: tuple) -> Array:
-        here, _, damping, count, settled = carry
+        here, damping, count, settled = carry
         finite = jnp.isfinite(here.cost)
         small = finite & (here.gradient <= 0.1 * GRADIENT_TOLERANCE)
         hopeless = ~finite | ~(damping < MOST_DAMPING) | (count > MAX_STEPS)
@@ -319,8 +315,9 @@ def _descend(
         done = jnp.where(exact, small & (count >= 2), settled | small)
         return ~done & ~hopeless
 
-    start = (here, trial, damping, jnp.zeros((), int), jnp.zeros((), bool))
-    here, _, _, count, _ = jax.lax.while_loop(unfinished, improve, start)
+    damping = jnp.where(exact, 0.0, jnp.where(fresh, FIRST_DAMPING, AGAIN_DAMPING))
+    carry = (here, damping, jnp.zeros((), int), jnp.zeros((), bool))
+    here, _, count, _ = jax.lax.while_loop(unfinished, improve, carry)
     return here, count
 
 
@@ -332,13 +329,13 @@ def _step(
     arrow = eliminate(here.blocks, here.e, noise, damping)
     damped = jnp.sqrt(damping) * jnp.eye(here.z.size, here.z.size + 1)
     full = stack(with_prior(arrow.data, here.z), damped)
-    # Whitened by R, the maps' curvature is a change of the identity. It is bounded from
-    # below: every step is one of descent, and where it is zero that of the QR.
+    # Whitened by R, the maps' curvature is a change of the identity. Only where it is
+    # positive: it may shorten the QR's step; longer ones were measured to go astray.
     R, c = full[:-1, :-1], full[:-1, -1]
     S = likelihood.curvature(here.z, here.by_z - here.z)
     left = solve_triangular(R, S, trans="T")
     values, vectors = jnp.linalg.eigh(solve_triangular(R, left.T, trans="T"))
-    c = vectors @ ((vectors.T @ c) / jnp.maximum(1.0 + values, LEAST_CURVATURE))
+    c = vectors @ ((vectors.T @ c) / (1.0 + jnp.maximum(values, 0.0)))
     dz = -solve_triangular(R, c)
     de = -(arrow.slope[..., -1] + arrow.slope[..., :-1] @ dz)
     promise = damping * (dz @ dz + jnp.sum(de**2))

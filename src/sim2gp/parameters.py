@@ -17,6 +17,7 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from statistics import NormalDist
 from typing import Any
 
 import equinox as eqx
@@ -24,7 +25,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
-import scipy.stats
 from jaxtyping import Array, Float
 
 from sim2gp.errors import InputError, nearest
@@ -102,7 +102,7 @@ class Parameter:
 
     def quantile(self, q: float) -> float:
         """Physical prior quantile; the maps are monotone, so they commute with it."""
-        return self.constrain(self.mean + self.sd * float(scipy.stats.norm.ppf(q)))
+        return self.constrain(self.mean + self.sd * NormalDist().inv_cdf(q))
 
 
 def bounded(
