@@ -1,7 +1,4 @@
-"""The mutants: a name, a file, the text it replaces, what it puts there, the tests.
-
-The text must occur exactly once, or it is an error. `mutants.py` hunts them.
-"""
+"""The mutants; the text that one replaces must occur exactly once in its file."""
 
 import ast
 from dataclasses import dataclass
