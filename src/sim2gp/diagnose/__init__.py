@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 from sim2gp.diagnose.base_parameters import base_parameters
 from sim2gp.diagnose.conflicts import prior_conflicts
 from sim2gp.diagnose.directions import directions
+from sim2gp.diagnose.misfit import Misfit, misfit
 from sim2gp.diagnose.spectrum import FisherAt, Spectrum, spectrum
 from sim2gp.diagnose.table import parameter_table
 from sim2gp.gaussian import Gaussian
@@ -28,10 +29,12 @@ from sim2gp.types import Key, in_float64
 
 __all__ = [
     "FisherAt",
+    "Misfit",
     "Spectrum",
     "arrays",
     "base_parameters",
     "directions",
+    "misfit",
     "parameter_table",
     "prior_conflicts",
     "spectrum",
