@@ -3,11 +3,10 @@
 Posterior sampling (Thompson 1933; Osband et al. 2013, arXiv 1306.0940): each episode
 is planned in ONE draw from the belief, held fixed until the episode ends. With the
 task's reward it is posterior-sampling reinforcement learning, with information gain
-it is active learning. Every key is ``fold_in(fold_in(key, episode), purpose)``: what
-is added to a run changes nothing that was in it.
+it is active learning. With ``update_every`` the belief is updated *within* the episode
+as well, and the draw moves with it: same random numbers, newer posterior.
 """
 
-import enum
 from collections.abc import Callable
 from typing import Any
 
@@ -17,169 +16,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from sim2gp.errors import NotFinite, Sim2GPError, warn
+from sim2gp.errors import Sim2GPError
+from sim2gp.flight import (
+    Purpose,
+    Trajectory,
+    episode,
+    key_for,
+    oracle_world,
+    world_of,
+)
 from sim2gp.models.base import AbstractBelief, AbstractModel
 from sim2gp.planning import AbstractObjective, AbstractPlanner, MarkovObjective, World
 from sim2gp.systems import AbstractSystem
 from sim2gp.tasks import Task, draw_truth
 from sim2gp.transitions import Transitions
-from sim2gp.types import Dynamics, Key, Scalar
-
-
-class Purpose(enum.IntEnum):
-    """What a key is for. Numbers are never reused or changed: runs depend on them."""
-
-    INIT = 0
-    DRAW = 1
-    PREPARE = 2
-    EPISODE = 3
-    FIT = 4
-    ORACLE = 5
-    TRUTH = 6
-    RESET = 7
-    NOISE = 8
-    PLAN = 9
-
-
-def key_for(key: Key, episode: int, purpose: Purpose) -> Key:
-    """The key of one purpose in one episode of one run."""
-    return jax.random.fold_in(jax.random.fold_in(key, episode), purpose)
-
-
-class Trajectory(eqx.Module):
-    """One episode on the real machine: T + 1 states seen, T actions and rewards.
-
-    ``failed`` marks steps whose action rests on no valid prediction.
-    """
-
-    state: Float[Array | np.ndarray, "times n"]
-    action: Float[Array | np.ndarray, "T m"]
-    reward: Float[Array | np.ndarray, " T"]
-    failed: Bool[Array | np.ndarray, " T"]
-
-    @property
-    def total(self) -> Scalar:
-        """The return of the episode."""
-        return jnp.sum(self.reward)
-
-    def transitions(
-        self, history: int = 0
-    ) -> tuple[
-        Float[np.ndarray, "T k"], Float[np.ndarray, "T m"], Float[np.ndarray, "T k"]
-    ]:
-        """``(s, a, s')`` of every step; states carry ``history`` past actions."""
-        S, A = np.asarray(self.state), np.asarray(self.action)
-        T, m = A.shape
-        # Row history + t of `done` is the action of step t.
-        done = np.concatenate([np.zeros((history, m), A.dtype), A])
-        past = [done[history - k : history - k + T + 1] for k in range(1, history + 1)]
-        full = np.concatenate([S, *past], axis=1)
-        return full[:-1], A, full[1:]
-
-
-def world_of(
-    task: Task, dynamics: Dynamics, objective: AbstractObjective, *, history: int = 0
-) -> World:
-    """A draw and an objective, within what the task lets a planner know.
-
-    ``history`` is the number of past actions in the state of ``dynamics``.
-    """
-    free = jnp.full(history * task.actions.low.size, jnp.inf, task.state_bound.dtype)
-    return World(
-        dynamics,
-        objective,
-        task.reset,
-        task.actions,
-        task.horizon,
-        state_bound=jnp.concatenate([task.state_bound, free]),
-        history=history,
-        planning_horizon=task.planning_horizon,
-        planning_iterations=task.planning_iterations,
-        noise_colour=task.noise_colour,
-    )
-
-
-def oracle_world(task: Task) -> World:
-    """The task's own noise-free dynamics and reward: the upper reference line."""
-    objective = MarkovObjective(task.reward)
-    return world_of(task, task.dynamics, objective, history=task.history)
-
-
-def fly(
-    task: Task, planner: AbstractPlanner, planner_state: Any, world: World, *, key: Key
-) -> tuple[Trajectory, Any]:
-    """One episode as one scan: pure, for `jit` and `vmap`; nothing is checked.
-
-    The planner sees the physical state and as much of the past actions as its world
-    carries; the machine gets exactly the planned action, clipped to its box.
-    """
-    reset, noise, plan = (
-        jax.random.fold_in(key, purpose)
-        for purpose in (Purpose.RESET, Purpose.NOISE, Purpose.PLAN)
-    )
-    past = jnp.zeros(world.history * task.actions.low.size, task.start.dtype)
-
-    def step(carry: Any, t: Array) -> tuple[Any, Any]:
-        s, past, planner_state = carry
-        seen = jnp.concatenate([s[: task.size], past])
-        planned, planner_state = planner.act(
-            planner_state, world, seen, key=jax.random.fold_in(plan, t)
-        )
-        a = task.limit(planned)
-        s2 = task.step(s, a, key=jax.random.fold_in(noise, t))
-        reward, failed = task.reward(s, a, s2), planner.failed(planner_state)
-        past = jnp.concatenate([a, past])[: past.size]
-        return (s2, past, planner_state), (s2[: task.size], a, reward, failed)
-
-    s0 = task.reset(reset)
-    (_, _, planner_state), (states, actions, rewards, failed) = jax.lax.scan(
-        step, (s0, past, planner_state), jnp.arange(task.horizon)
-    )
-    states = jnp.concatenate([s0[None, : task.size], states])
-    return Trajectory(states, actions, rewards, failed), planner_state
-
-
-_fly = eqx.filter_jit(fly)
-
-
-def episode(
-    task: Task, planner: AbstractPlanner, planner_state: Any, world: World, *, key: Key
-) -> tuple[Trajectory, Any]:
-    """One checked episode, compiled once for all draws, truths and keys.
-
-    Raises `NotFinite` E203 at the first state, action or reward that is not finite;
-    warns W203 where the draw predicted nothing valid and the last plan was kept.
-    """
-    trajectory, planner_state = _fly(task, planner, planner_state, world, key=key)
-    check_finite(trajectory, task.name)
-    blind = int(np.sum(np.asarray(trajectory.failed)))
-    if blind:
-        warn(
-            "W203",
-            f"{blind} of {task.horizon} plans had no valid rollout: the drawn dynamics "
-            "diverge there, and the last plan was kept",
-        )
-    return trajectory, planner_state
-
-
-def check_finite(trajectory: Trajectory, where: str) -> None:
-    """Raise `NotFinite` E203 at the first step that holds a non-finite number."""
-    for what, values in (
-        ("action", trajectory.action),
-        ("state", trajectory.state),
-        ("reward", trajectory.reward),
-    ):
-        rows = np.asarray(values).reshape(len(values), -1)
-        bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
-        if bad.size:
-            raise NotFinite(
-                "E203",
-                f"{what} {bad[0]} of an episode",
-                where=where,
-                got=str(rows[bad[0]].tolist()),
-                expected="finite numbers",
-                fix="check the truth's constants and the integration step",
-            )
+from sim2gp.types import Key, in_float64
 
 
 class Episode(eqx.Module):
@@ -221,14 +72,16 @@ def posterior_sampling(
     episodes: int,
     key: Key,
     history: int = 0,
+    update_every: int | None = None,
     on_episode: Callable[[Episode], None] | None = None,
 ) -> History:
     """``episodes`` rounds of: draw a world, act in it on ``task``, fit all data.
 
     ``objective`` makes what is maximised out of the belief at the episode's start.
     The first episode is flown on a draw from the prior. ``history`` is the number of
-    past actions that the model's state carries. ``on_episode`` is called after each
-    fit. Raises what the fit raises, and `NotFinite`.
+    past actions that the model's state carries. ``update_every`` is None or a number
+    of steps after which the belief learns within the episode (`within`). ``on_episode``
+    is called after each fit. Raises what the fit raises, and `NotFinite`.
     """
     m = task.actions.low.size
     data = Transitions.empty(episodes * task.horizon, task.size + history * m, m)
@@ -236,23 +89,90 @@ def posterior_sampling(
     summaries, trajectories = [_parameters(belief)], []
     planner_state = None
     for e in range(1, episodes + 1):
-        draw = belief.sample(key_for(key, e, Purpose.DRAW))
-        world = world_of(task, draw, objective(belief), history=history)
+
+        def world_in(belief: AbstractBelief, e: int = e) -> World:
+            draw = belief.sample(key_for(key, e, Purpose.DRAW))
+            return world_of(task, draw, objective(belief), history=history)
+
+        world = world_in(belief)
         if planner_state is None:
             planner_state = planner.init(world, key=key_for(key, 0, Purpose.PREPARE))
         planner_state = planner.prepare(
             planner_state, world, data, key=key_for(key, e, Purpose.PREPARE)
         )
+        key_e, fitting = key_for(key, e, Purpose.EPISODE), key_for(key, e, Purpose.FIT)
         trajectory, planner_state = episode(
-            task, planner, planner_state, world, key=key_for(key, e, Purpose.EPISODE)
+            task,
+            planner,
+            planner_state,
+            world,
+            key=key_e,
+            part=update_every,
+            world_at=within(model, belief, data, history, world_in, key=fitting),
         )
         data = data.extend(*trajectory.transitions(history))
-        belief = model.fit(belief, data, key=key_for(key, e, Purpose.FIT))
-        trajectories.append(jax.tree.map(np.asarray, trajectory))
+        belief = model.fit(belief, data, key=fitting)
+        trajectories.append(trajectory)
         summaries.append(_parameters(belief))
         if on_episode is not None:
             on_episode(Episode(e, trajectories[-1], belief))
     return _history(trajectories, summaries, belief, data)
+
+
+def within(
+    model: AbstractModel,
+    belief: AbstractBelief,
+    data: Transitions,
+    history: int,
+    world_in: Callable[[AbstractBelief], World],
+    *,
+    key: Key,
+) -> Callable[[Trajectory], World]:
+    """The world to plan in amid an episode, given what was flown in it so far.
+
+    Constants and last layer are conditioned on each new transition in turn
+    (`AbstractModel.update`), features and noise are kept. Before any fit there is no
+    noise level to condition with: in a first episode the model is fitted instead. What
+    is learned here lasts for this episode; the fit after it starts from ``belief``.
+    """
+    seen = 0
+
+    def world_at(flown: Trajectory) -> World:
+        nonlocal belief, seen
+        S, A, S2 = flown.transitions(history)
+        if data.count == 0:
+            belief = model.fit(belief, data.extend(S, A, S2), key=key)
+        else:
+            belief = _conditioned(model, belief, S[seen:], A[seen:], S2[seen:])
+        seen = len(S)
+        return world_in(belief)
+
+    return world_at
+
+
+@in_float64
+def _conditioned(
+    model: AbstractModel,
+    belief: AbstractBelief,
+    S: Float[np.ndarray, "T n"],
+    A: Float[np.ndarray, "T m"],
+    S2: Float[np.ndarray, "T n"],
+) -> AbstractBelief:
+    return _condition(model, belief, *(jnp.asarray(x, float) for x in (S, A, S2)))
+
+
+@eqx.filter_jit
+def _condition(
+    model: AbstractModel, belief: AbstractBelief, S: Array, A: Array, S2: Array
+) -> AbstractBelief:
+    """Condition on rows one after the other, as one scan."""
+    arrays, rest = eqx.partition(belief, eqx.is_array)
+
+    def step(arrays: Any, row: Any) -> tuple[Any, None]:
+        updated = model.update(eqx.combine(arrays, rest), *row)
+        return eqx.filter(updated, eqx.is_array), None
+
+    return eqx.combine(jax.lax.scan(step, arrays, (S, A, S2))[0], rest)
 
 
 def psrl(
@@ -263,6 +183,7 @@ def psrl(
     episodes: int,
     key: Key,
     history: int = 0,
+    update_every: int | None = None,
     on_episode: Callable[[Episode], None] | None = None,
 ) -> History:
     """Posterior sampling with the task's own reward."""
@@ -274,6 +195,7 @@ def psrl(
         episodes=episodes,
         key=key,
         history=history,
+        update_every=update_every,
         on_episode=on_episode,
     )
 

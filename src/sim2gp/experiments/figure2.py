@@ -104,7 +104,7 @@ def claims(table: Table, rng: np.random.Generator) -> dict[str, dict[str, Any]]:
         key: best_seen(score)[:, :CLAIM_EPISODES].mean(axis=1)
         for key, score in table.items()
     }
-    rivals = [m for m in METHODS if m not in ("point estimate", WITH_TERM)]
+    rivals = [m for m in METHODS if m not in ("point estimate", "Auto", WITH_TERM)]
     out: dict[str, dict[str, Any]] = {}
     for machine in MACHINES:
         nominal, wrong = (machine, "nominal"), (machine, "mismatch")

@@ -14,10 +14,12 @@ import numpy as np
 from jaxtyping import Float
 
 from sim2gp.errors import NotConverged, NotFinite
-from sim2gp.loops import Episode, Purpose, accept_truth, key_for, psrl
+from sim2gp.flight import Purpose, key_for
+from sim2gp.loops import Episode, accept_truth, psrl
 from sim2gp.models import (
     NLM,
     AbstractModel,
+    Auto,
     FunctionSpace,
     PointEstimate,
     Residual,
@@ -57,6 +59,11 @@ def _with_term(system: AbstractMechanism, missing: AbstractEffect) -> AbstractMo
     return Sim2GP(Perturbed(system, [missing], free=True))
 
 
+def _auto(system: AbstractMechanism, _: AbstractEffect) -> AbstractModel:
+    sim = Sim2GP(system)
+    return Auto([sim, Residual(sim), ResidualFunctionSpace(sim)])
+
+
 #: Each learner, made of the simulator and the physics that it lacks.
 METHODS: dict[str, Callable[[AbstractMechanism, AbstractEffect], AbstractModel]] = {
     "SIM2GP": lambda system, _: Sim2GP(system),
@@ -66,6 +73,7 @@ METHODS: dict[str, Callable[[AbstractMechanism, AbstractEffect], AbstractModel]]
     "FS literal": lambda system, _: FunctionSpace(Sim2GP(system), objective="literal"),
     "FS": lambda system, _: FunctionSpace(Sim2GP(system)),
     "RES-FS": lambda system, _: ResidualFunctionSpace(Sim2GP(system)),
+    "Auto": _auto,
     WITH_TERM: _with_term,
 }
 

@@ -1,5 +1,7 @@
 """How data become a belief over dynamics."""
 
+from sim2gp.models.auto import Auto as Auto
+from sim2gp.models.auto import AutoBelief as AutoBelief
 from sim2gp.models.base import AbstractBelief as AbstractBelief
 from sim2gp.models.base import AbstractModel as AbstractModel
 from sim2gp.models.base import PointEstimate as PointEstimate

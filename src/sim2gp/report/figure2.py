@@ -19,6 +19,7 @@ LINES = {
     "FS literal": ("#e69f00", "-"),
     "FS": ("#d55e00", "--"),
     "RES-FS": ("#cc79a7", "--"),
+    "Auto": ("#8a5a00", "-."),
     "SIM2GP with the term": ("#1b1f24", ":"),
 }
 

@@ -1,0 +1,172 @@
+"""Auto: let the data choose the model, by how well each foretold the newest episode.
+
+    index = argmax_k  mean_n log p_k(s'_n | s_n, a_n),   n in the newest episode
+
+with every ``p_k`` as it stood *before* it saw that episode (the prequential score;
+Dawid 1984). It needs no evidence, so that a network's model stands beside physics.
+Models are given from simple to complex, and the simplest one is kept unless another is
+better by more than one standard error of the paired difference.
+"""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from sim2gp.gaussian import Gaussian
+from sim2gp.models.base import AbstractBelief, AbstractModel
+from sim2gp.transitions import Transitions
+from sim2gp.types import Action, Dynamics, Key, Scalar, State, in_float64
+
+
+class AutoDraw(eqx.Module):
+    """The chosen model's draw; the others wait, so that a new choice is new data."""
+
+    draws: tuple[Dynamics, ...]
+    index: Int[Array, ""]
+
+    def __call__(self, s: State, a: Action) -> State:
+        branches = [lambda s, a, draw=draw: draw(s, a) for draw in self.draws]
+        return jax.lax.switch(self.index, branches, s, a)
+
+
+class AutoBelief(AbstractBelief):
+    """All beliefs, and which one speaks.
+
+    scores: mean log score of each model on the episode of the last choice, nats per
+        transition; zeros before any.
+    seen: number of transitions that the beliefs have been fitted to.
+    """
+
+    beliefs: tuple[AbstractBelief, ...]
+    index: Int[Array, ""]
+    scores: Float[Array, " models"]
+    seen: Int[Array, ""]
+
+    def latent(self, s: State, a: Action) -> Gaussian:
+        return self._spoken([b.latent(s, a) for b in self.beliefs])
+
+    def predict(self, s: State, a: Action) -> Gaussian:
+        return self._spoken([b.predict(s, a) for b in self.beliefs])
+
+    def sample(self, key: Key) -> Dynamics:
+        return AutoDraw(tuple(b.sample(key) for b in self.beliefs), self.index)
+
+    def point(self) -> Dynamics:
+        return AutoDraw(tuple(b.point() for b in self.beliefs), self.index)
+
+    def information_gain(self, s: State, a: Action) -> Scalar:
+        return jnp.stack([b.information_gain(s, a) for b in self.beliefs])[self.index]
+
+    def trajectory_information_gain(
+        self, S: Float[Array, "T n"], A: Float[Array, "T m"]
+    ) -> Scalar:
+        gains = [b.trajectory_information_gain(S, A) for b in self.beliefs]
+        return jnp.stack(gains)[self.index]
+
+    def _spoken(self, all_of_them: Sequence[Gaussian]) -> Gaussian:
+        """The chosen one; scales are padded by columns of zeros to one width."""
+        width = max(g.scale.shape[1] for g in all_of_them)
+        means = jnp.stack([g.mean for g in all_of_them])
+        scales = [
+            jnp.pad(g.scale, ((0, 0), (0, width - g.scale.shape[1])))
+            for g in all_of_them
+        ]
+        return Gaussian(means[self.index], jnp.stack(scales)[self.index])
+
+
+class Auto(AbstractModel):
+    """Choose among ``models``, given from simple to complex, episode by episode.
+
+    Every fit after the first takes the rows that are new to it as the newest episode.
+    Raises ValueError for fewer than two models.
+    """
+
+    models: tuple[AbstractModel, ...]
+
+    def __init__(self, models: Sequence[AbstractModel]) -> None:
+        if len(models) < 2:
+            raise ValueError(f"nothing to choose from {len(models)} model")
+        self.models = tuple(models)
+
+    @in_float64
+    def init(self, key: Key) -> AutoBelief:
+        """All priors; the simplest model speaks."""
+        keys = jax.random.split(key, len(self.models))
+        beliefs = (m.init(k) for m, k in zip(self.models, keys, strict=True))
+        count = len(self.models)
+        nothing = jnp.zeros((), int)
+        return AutoBelief(tuple(beliefs), nothing, jnp.zeros(count), nothing)
+
+    @in_float64
+    def fit(self, belief: AbstractBelief, data: Transitions, *, key: Key) -> AutoBelief:
+        """Score on what is new, choose, then fit every model. Raises what a fit raises.
+
+        ``data`` extends what was given before; the first fit chooses among the priors.
+        """
+        assert isinstance(belief, AutoBelief)
+        new = jnp.asarray(data.mask) & (jnp.arange(len(data.mask)) >= belief.seen)
+        index, scores = belief.index, belief.scores
+        if bool(jnp.any(new)):
+            each = jnp.stack([log_scores(b, data) for b in belief.beliefs])
+            index, scores = choose(each, new)
+        keys = jax.random.split(key, len(self.models))
+        fitted = tuple(
+            m.fit(b, data, key=k)
+            for m, b, k in zip(self.models, belief.beliefs, keys, strict=True)
+        )
+        return AutoBelief(fitted, index, scores, jnp.asarray(data.count))
+
+    def update(
+        self, belief: AbstractBelief, s: State, a: Action, s2: State
+    ) -> AutoBelief:
+        """One more transition for every model; the choice waits for the next fit."""
+        assert isinstance(belief, AutoBelief)
+        updated = tuple(
+            m.update(b, s, a, s2)
+            for m, b in zip(self.models, belief.beliefs, strict=True)
+        )
+        return eqx.tree_at(lambda b: b.beliefs, belief, updated)
+
+
+@in_float64
+def log_scores(belief: AbstractBelief, data: Transitions) -> Float[Array, " capacity"]:
+    """Log density of each ``s'`` under the predictive, nats; 0 where masked.
+
+    Of the physical states alone: past actions in a state are known exactly.
+    """
+    return _log_scores(belief, jax.tree.map(jnp.asarray, data))
+
+
+@eqx.filter_jit
+def _log_scores(belief: AbstractBelief, data: Transitions) -> Float[Array, " capacity"]:
+    def one(s: Array, a: Array, s2: Array) -> Scalar:
+        predictive = belief.predict(s, a)
+        d = belief.noise.size  # type: ignore[attr-defined]
+        return Gaussian(predictive.mean[:d], predictive.scale[:d]).log_prob(s2[:d])
+
+    each = jax.vmap(one)(data.state, data.action, data.next_state)
+    return jnp.where(data.mask, each, 0.0)
+
+
+def choose(
+    each: Float[Array, "models N"], new: Bool[Array, " N"]
+) -> tuple[Int[Array, ""], Float[Array, " models"]]:
+    """The first model that none beats by more than a standard error, and all means.
+
+    A score that is not finite loses to every finite one.
+    """
+    count = jnp.sum(new, dtype=each.dtype)
+    each = jnp.where(new[None], each, 0.0)
+    means = jnp.sum(each, axis=1) / count
+    ranked = jnp.where(jnp.isfinite(means), means, -jnp.inf)
+    best = jnp.argmax(ranked)
+    gap = jnp.where(new[None], each[best][None] - each, 0.0)
+    lost = jnp.sum(gap, axis=1) / count
+    spread = jnp.sum(jnp.where(new[None], (gap - lost[:, None]) ** 2, 0.0), axis=1)
+    error = jnp.sqrt(spread / jnp.maximum(count - 1.0, 1.0) / count)
+    tied = (lost <= error) & jnp.isfinite(ranked)
+    # `best` ties with itself, so that argmax finds one wherever a score is finite.
+    return jnp.argmax(tied | (jnp.arange(len(means)) == best)), means
