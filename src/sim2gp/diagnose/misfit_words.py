@@ -92,7 +92,7 @@ def _f_test(ratio: float, alarm: bool, about: Mapping[str, object]) -> str:
 
 _HALVES = {
     "late": ("The first and the second half of the data", "the machine has changed"),
-    "vigorous": ("Gentle and vigorous motion", "the model errs with the amplitude"),
+    "vigorous": ("Gentle and vigorous motion", "the model errs with its size"),
 }
 
 
@@ -102,7 +102,7 @@ def _split(distance: float, alarm: bool, about: Mapping[str, object]) -> str:
     if alarm:
         return (
             f"{halves} give constants that differ {about['times']:.1f} times as much "
-            f"as their intervals allow: {why}, and the intervals are too narrow"
+            f"as their intervals allow: {why}, or the intervals are too narrow"
         )
     return "Early and late, gentle and vigorous rows agree on the constants"
 
@@ -122,9 +122,12 @@ def verdict(tests: Mapping[str, Finding], count: int, rows: str) -> str:
     raised = [name for name in _SHORT if tests[name].alarm]
     if raised:
         first = _SHORT[raised[0]].format(p=said(tests[raised[0]].p))
+        split = tests["split_half"]
+        times = digits(math.sqrt(split.statistic / max(split.freedom, 1)), 2)
+        halves = f", about {times} times going by two halves" if split.alarm else ""
         return (
             f"{first}: something is missing from the model, and the intervals are too "
-            "narrow; try `sim2gp explain`."
+            f"narrow{halves}; try `sim2gp explain`."
         )
     few = count < FEW
     return f"Nothing in {count} {rows} contradicts the model. " + (
