@@ -94,9 +94,23 @@ def logs(rng: np.random.Generator) -> Run:
         "units": {"q1": "rad", "q2": "rad"},
         "noise": {"q1": {"sd": 0.0041, "unit": "rad"}, "q2": {"sd": 0.0038}},
         "misfit": {
-            "q1": {"whiteness_p": 0.34, "ratio": 1.02},
-            "q2": {"whiteness_p": 2e-5, "ratio": 1.31},
-            "text": "The residuals of q2 are not white: friction is not smooth.",
+            "verdict": "The residuals are correlated from row to row.",
+            "alarm": True,
+            "tests": {
+                "chi2": {
+                    "statistic": None, "p": None, "freedom": 0, "alarm": False,
+                    "text": "Not tested: the noise was estimated.",
+                },
+                "ljung_box": {
+                    "statistic": 61.2, "p": 2e-5, "freedom": 20, "alarm": True,
+                    "text": "The residuals of q2 are correlated from row to row.",
+                },
+                "f_test": {
+                    "statistic": 1.1, "p": 0.34, "freedom": 17, "alarm": False,
+                    "text": "The residuals follow neither the state nor the input.",
+                },
+            },
+            "noise": ["The noise of q2 is 12 times the rounding of its sensor."],
         },
     }  # fmt: skip
     return summary, arrays

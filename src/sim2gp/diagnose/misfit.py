@@ -44,7 +44,7 @@ QUIET = 0.1
 RANK_TOLERANCE = 1e-8
 FEATURE_TOLERANCE = 1e-6
 
-Columns = Float[np.ndarray, "N d c"]
+Columns = Float[np.ndarray, "N d _"]
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,13 @@ from dataclasses import dataclass
 
 from sim2gp.diagnose.words import digits
 
+#: Noise of the states themselves enters successive one-step residuals with opposite
+#: signs: -1/2 between neighbours.
+NOISY = -0.25
+NOISY_STATES = (
+    "it looks like sensor noise on the states, which one-step regression takes for "
+    "exact; set likelihood.window to some tenths of a second"
+)
 FEW = 1000  # rows below which small dry friction was measured not to show
 
 
@@ -13,7 +20,8 @@ FEW = 1000  # rows below which small dry friction was measured not to show
 class Finding:
     """One test: its statistic and p value (NaN where it does not apply), and words.
 
-    ``freedom`` are the statistic's degrees of freedom, those of the numerator of an F.
+    ``freedom`` are the statistic's degrees of freedom, those of the numerator of an F;
+    ``cause`` is the likely cause of an alarm, where the test can tell.
     """
 
     statistic: float
@@ -21,6 +29,7 @@ class Finding:
     p: float
     alarm: bool
     text: str
+    cause: str = ""
 
     def as_dict(self) -> dict[str, object]:
         """JSON has no NaN: a number that does not exist is None."""
@@ -44,7 +53,9 @@ def found(
         return Finding(math.nan, 0, math.nan, False, _not_tested(test, about))
     words = {"chi2": _chi2, "ljung_box": _ljung_box, "f_test": _f_test}
     text = words.get(test, _split)(statistic, alarm, about)
-    return Finding(statistic, freedom, p, alarm, f"{text} ({said(p)}).")
+    differenced = test == "ljung_box" and alarm and float(str(about["first"])) < NOISY
+    cause = NOISY_STATES if differenced else ""
+    return Finding(statistic, freedom, p, alarm, f"{text} ({said(p)}).", cause)
 
 
 def said(p: float) -> str:
@@ -74,8 +85,8 @@ def _ljung_box(Q: float, alarm: bool, about: Mapping[str, object]) -> str:
     if alarm:
         return (
             f"The residuals of {about['channel']} are correlated from row to row "
-            f"({about['first']:.2f} between neighbours): the rows say less than their "
-            "number, and the intervals are too narrow"
+            f"({about['first']:.2f} between neighbours): they are not as many as they "
+            "are counted, and the intervals are wrong, mostly too narrow"
         )
     return f"The residuals are not correlated over {about['lags']} rows"
 
@@ -123,6 +134,8 @@ def verdict(tests: Mapping[str, Finding], count: int, rows: str) -> str:
     if raised:
         first = _SHORT[raised[0]].format(p=said(tests[raised[0]].p))
         split = tests["split_half"]
+        if raised == ["ljung_box"] and tests["ljung_box"].cause:
+            return f"{first}: {tests['ljung_box'].cause}."
         times = digits(math.sqrt(split.statistic / max(split.freedom, 1)), 2)
         halves = f", about {times} times going by two halves" if split.alarm else ""
         return (

@@ -15,6 +15,7 @@ import jax
 import numpy as np
 
 from sim2gp import diagnose
+from sim2gp.diagnose.residuals import misfit_of_transitions
 from sim2gp.experiments.record import provenance
 from sim2gp.loops import AcceptedTruth, Episode, History, accept_truth, psrl
 from sim2gp.models import AbstractModel, PointEstimate, PriorMean, Sim2GP, Sim2GPBelief
@@ -164,6 +165,7 @@ def _summarise(
             for m in methods
         },
         "noise": dict(zip(states, np.asarray(belief.noise).tolist(), strict=True)),
+        "misfit": misfit_of_transitions(belief, shown.data).as_dict(),
         "log_evidence": float(belief.log_evidence),
         "n_transitions": int(belief.count),
         **found,

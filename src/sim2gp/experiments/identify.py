@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from sim2gp import diagnose
+from sim2gp.diagnose.residuals import misfit_of_windows
 from sim2gp.experiments.prediction import (
     channels,
     cut_logs,
@@ -127,7 +128,10 @@ def _summarise(
         "seed": seed,
         "converged": True,
         "noise": noise,
-        "misfit": _misfit(names, noise, windows, units(system)),
+        "misfit": {
+            **misfit_of_windows(belief, windows).as_dict(),
+            "noise": _noise_words(names, noise, windows, units(system)),
+        },
         "log_evidence": float(belief.log_evidence),
         "n_rows": rows,
         "n_logs": len(set(recordings(logs))),
@@ -162,7 +166,7 @@ def _count(logs: Sequence[Log]) -> str:
     return "one log" if count == 1 else f"{count} logs"
 
 
-def _misfit(
+def _noise_words(
     names: Sequence[str],
     noise: dict[str, float],
     windows: Windows,

@@ -7,6 +7,7 @@ import numpy as np
 
 from sim2gp.report import svg
 from sim2gp.report.markup import (
+    MISSING,
     Raw,
     cards,
     esc,
@@ -67,31 +68,48 @@ def _sentence(item: object) -> object:
     return item
 
 
+#: What each misfit test asks.
+_TESTS = {
+    "chi2": "reduced chi-squared: as large as the noise?",
+    "ljung_box": "Ljung-Box: correlated from row to row?",
+    "f_test": "F test: do state and input explain them?",
+    "split_half": "split-half distance: do two halves agree?",
+}
+
+
+def _tests(tests: Mapping[str, Any]) -> Raw:
+    """What the residuals say of the model, test by test."""
+
+    def row(name: str, test: Mapping[str, Any]) -> list[object]:
+        tone, word = ("bad", "alarm") if test.get("alarm") else ("good", "passed")
+        chip = Raw(f'<span class="chip {tone}">{word}</span>')
+        statistic, p = number(test.get("statistic")), number(test.get("p"), 2)
+        tested = chip if is_number(test.get("p")) else MISSING
+        return [_TESTS.get(name, name), statistic, p, tested, test.get("text")]
+
+    return table(
+        ["what is asked of the residuals", "statistic", "p", "verdict", "in words"],
+        [row(name, test) for name, test in tests.items()],
+        words=(0, 3, 4),
+    )
+
+
 def noise_and_misfit(summary: Summary) -> Raw:
     """The noise of every channel, and what the model leaves unexplained."""
     noise, misfit = summary.get("noise"), summary.get("misfit")
     parts: list[str] = []
     if isinstance(noise, Mapping) and noise:
         parts += [Raw("<h3>Noise</h3>\n"), records(noise, "channel")]
-    if misfit:
+    if isinstance(misfit, Mapping):
         parts.append(Raw("<h3>Misfit</h3>\n"))
-        if isinstance(misfit, str):
-            parts.append(paragraph(misfit))
-        elif isinstance(misfit, Mapping):
-            tabular = {k: v for k, v in misfit.items() if isinstance(v, Mapping)}
-            plain = [v for v in misfit.values() if isinstance(v, str)]
-            plain += [
-                f"{key.replace('_', ' ')}: {number(value)}"
-                for key, value in misfit.items()
-                if is_number(value)
-            ]
-            parts.append(listing(plain))
-            parts.append(records(tabular, "channel") if tabular else "")
-            lists = [v for v in misfit.values() if isinstance(v, Sequence)]
-            lists = [v for v in lists if not isinstance(v, str)]
-            parts += [listing(map(_sentence, items)) for items in lists]
-        else:
-            parts.append(listing(map(_sentence, misfit)))
+        if misfit.get("verdict"):
+            parts.append(paragraph(misfit["verdict"]))
+        if misfit.get("tests"):
+            parts.append(_tests(misfit["tests"]))
+        parts.append(listing(map(_sentence, misfit.get("noise") or ())))
+    elif misfit:
+        parts.append(Raw("<h3>Misfit</h3>\n"))
+        parts.append(listing(map(_sentence, misfit)))
     return section("misfit", "Noise and misfit", *parts)
 
 

@@ -61,6 +61,9 @@ def _problems(summary: Summary) -> list[tuple[str, str]]:
     idle = _named(summary, "dead")
     if idle:
         found.append(("bad", f"The data do not depend on: {idle}."))
+    misfit = summary.get("misfit")
+    if isinstance(misfit, Mapping) and misfit.get("alarm"):
+        found.append(("warn", str(misfit.get("verdict"))))
     for item in summary.get("prior_conflicts") or ():
         found.append(("warn", f"Data against prior: {_said(item)}"))
     flat = [d for d in summary.get("directions") or () if d.get("flat")]
