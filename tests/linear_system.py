@@ -46,6 +46,9 @@ class Linear(AbstractSystem):
     def delays(self, params: Array) -> Array:
         return jnp.zeros(len(self.actions))
 
+    def mean_inputs(self, params: Array, held: Array, dt: float, count: int) -> Array:
+        return jnp.broadcast_to(held[:1], (count, held.shape[1]))
+
 
 def linear(p: int, d: int, kind: str = "identity", **spec: float) -> Linear:
     free = tuple(

@@ -123,6 +123,23 @@ class Evaluate(Writes):
 
 
 @dataclass(kw_only=True)
+class Explain(Writes):
+    """What physics a simulator lacks: nothing, an effect, or none of these."""
+
+    path: Annotated[Positional[Path], arg(metavar="RUN")]
+    """The folder of identify or demo."""
+    add: bool = False
+    """Write the winner into the project file, so that identify fits it."""
+
+    def run(self, progress: Progress) -> dict[str, Any]:
+        out = _out(self.out, f"explain-{self.path.name}")
+        load_run(self.path)  # a folder that is no run fails before the work
+        return _experiment("explain")(
+            self.path, add=self.add, out=out, progress=progress
+        )
+
+
+@dataclass(kw_only=True)
 class Report(Common):
     """Draw the report of a run anew."""
 
@@ -171,6 +188,7 @@ COMMANDS: dict[str, type[Common]] = {
     "demo": Demo,
     "identify": Identify,
     "evaluate": Evaluate,
+    "explain": Explain,
     "report": Report,
     "selftest": Selftest,
     "reproduce": Reproduce,

@@ -176,6 +176,13 @@ class _Windowed(AbstractLikelihood):
         return self.system.parameters.curvature(self.prior, z, gradient)
 
 
+def likelihood(
+    system: AbstractSystem, prior: Gaussian, windows: Windows
+) -> AbstractLikelihood:
+    """The likelihood that `fit_windows` descends, for whoever linearises it himself."""
+    return _Windowed(system, prior, windows)
+
+
 @eqx.filter_jit
 def _fit(
     system: AbstractSystem,
@@ -193,7 +200,7 @@ def _fit(
     sd = jnp.sqrt(jnp.sum(away**2, axis=(0, 1)) / jnp.maximum(N, 1)) + windows.floor
     W, n = windows.start.shape
     fit, noise, _ = multi_start(
-        _Windowed(system, prior, windows),
+        likelihood(system, prior, windows),
         starts,
         jnp.zeros((W, n)),
         Noise(sd, jnp.ones(W)),

@@ -15,7 +15,13 @@ from sim2gp.parameters import Parameter, Parameters, unknown_parameter
 from sim2gp.project.priors import located, prior
 from sim2gp.project.schema import ActuatorSpec, EffectSpec, PriorSpec, ProjectSpec
 from sim2gp.project.source import Source
-from sim2gp.systems import AbstractMechanism, AbstractSystem, Perturbed, effects
+from sim2gp.systems import (
+    AbstractMechanism,
+    AbstractSystem,
+    Perturbed,
+    effects,
+    placement,
+)
 from sim2gp.systems.actuator import Actuated, actuator_prior
 from sim2gp.systems.effects import AbstractEffect
 
@@ -23,14 +29,20 @@ from sim2gp.systems.effects import AbstractEffect
 EFFECTS: dict[str, Any] = {
     kind.what: kind
     for kind in (
+        effects.BackEmf,
+        placement.BaseTilt,
+        placement.BaseTiltSide,
         effects.Coulomb,
         effects.DeadZone,
         effects.Drag,
+        placement.EncoderOffset,
+        placement.Payload,
         effects.PoleGeometry,
         effects.RailFriction,
         effects.RailTilt,
         effects.RodInertia,
         effects.Spring,
+        effects.Stribeck,
     )
 }
 
@@ -142,9 +154,8 @@ def _effect(
     what: str, where: str, said: EffectSpec | float, line: str
 ) -> AbstractEffect:
     """The effect of a name on a channel, with the options it has (E160)."""
-    given = {} if isinstance(said, float) else {"width": said.width}
-    if isinstance(said, EffectSpec):
-        given["smoothing"] = said.smoothing
+    known_options = set(EffectSpec.model_fields) - set(PriorSpec.model_fields)
+    given = {} if isinstance(said, float) else said.model_dump(include=known_options)
     options = {name: value for name, value in given.items() if value is not None}
     known = [f.name for f in dataclasses.fields(EFFECTS[what])]
     for name in options:

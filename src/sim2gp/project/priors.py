@@ -30,7 +30,7 @@ def prior(spec: PriorSpec | float, base: Parameter, where: str) -> Parameter | f
     """The prior, or the fixed value, that a table of the file states (E141 to E144)."""
     if not isinstance(spec, PriorSpec):
         return float(spec)
-    given = spec.model_dump(exclude_none=True, exclude={"width", "smoothing"})
+    given = spec.model_dump(exclude_none=True, include=set(PriorSpec.model_fields))
     if spec.value is not None:
         if len(given) > 1:
             raise _conflict(where, "value", given, "value alone, or a prior")

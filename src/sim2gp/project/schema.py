@@ -40,11 +40,12 @@ class EffectSpec(PriorSpec):
     """Physics that the machine's equations lack: its magnitude, as any constant's.
 
     ``[effects.theta.coulomb]`` adds the constant ``theta.coulomb``; a bare number
-    fixes it. ``width`` (a velocity) and ``smoothing`` (an input) are options of the
-    effects that have them.
+    fixes it. ``width`` and ``speed`` (velocities) and ``smoothing`` (an input) are
+    options of the effects that have them.
     """
 
     width: Positive | None = None
+    speed: Positive | None = None
     smoothing: Positive | None = None
 
 

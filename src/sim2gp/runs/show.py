@@ -9,12 +9,17 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 LONGEST = 12  # numbers of a list that are still printed
-# What a terminal need not repeat: the report and summary.json have it all.
-_HIDDEN = ("warnings", "versions", "animation", "figure1", "units", "tables", "command")
+# What a terminal need not repeat: the report and summary.json have it all, and a table
+# of its own says some of it better.
+_HIDDEN = (
+    *("warnings", "versions", "animation", "figure1", "units", "tables", "command"),
+    *("candidates", "misfit_tests"),
+)
 _HIDDEN_COLUMNS = {
     "parameters": ("meaning", "note", "partners", "low", "high"),
     "directions": ("combination", "flat"),
     "base_parameters": ("prior_sd", "everywhere"),
+    "misfit.tests": ("freedom",),
 }
 
 
@@ -60,15 +65,17 @@ def _singles(summary: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str
 
 
 def _groups(
-    summary: Mapping[str, Any],
+    summary: Mapping[str, Any], prefix: str = ""
 ) -> Iterator[tuple[str, dict[str, Mapping[str, Any]]]]:
     for key, value in summary.items():
-        if key in _HIDDEN:
+        if prefix == "" and key in _HIDDEN:
             continue
         if isinstance(value, Mapping) and _is_group(value):
-            yield key, dict(value)
+            yield prefix + key, dict(value)
+        elif isinstance(value, Mapping):
+            yield from _groups(value, f"{prefix}{key}.")
         elif isinstance(value, list) and value and isinstance(value[0], Mapping):
-            yield key, {str(i + 1): row for i, row in enumerate(value)}
+            yield prefix + key, {str(i + 1): row for i, row in enumerate(value)}
 
 
 def _is_group(value: Mapping[str, Any]) -> bool:

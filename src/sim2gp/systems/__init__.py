@@ -12,6 +12,7 @@ from sim2gp.systems.base import (
 from sim2gp.systems.cartpole import CartPole, CartPoleParams
 from sim2gp.systems.effects import (
     AbstractEffect,
+    BackEmf,
     Coulomb,
     DeadZone,
     Drag,
@@ -20,8 +21,11 @@ from sim2gp.systems.effects import (
     RailTilt,
     RodInertia,
     Spring,
+    Stribeck,
 )
 from sim2gp.systems.furuta import Furuta, FurutaParams
+from sim2gp.systems.lag import Lagged, LaggedParams, lagged_means
+from sim2gp.systems.library import Candidate, InputLag, library
 from sim2gp.systems.perturbed import (
     STRENGTHS,
     InputDelay,
@@ -31,6 +35,7 @@ from sim2gp.systems.perturbed import (
     effect,
     perturb,
 )
+from sim2gp.systems.placement import BaseTilt, BaseTiltSide, EncoderOffset, Payload
 from sim2gp.systems.two_link import (
     TwoLink,
     TwoLinkParams,
@@ -45,16 +50,25 @@ __all__ = [
     "AbstractSystem",
     "Actuated",
     "ActuatedParams",
+    "BackEmf",
+    "BaseTilt",
+    "BaseTiltSide",
     "Bound",
+    "Candidate",
     "CartPole",
     "CartPoleParams",
     "Channel",
     "Coulomb",
     "DeadZone",
     "Drag",
+    "EncoderOffset",
     "Furuta",
     "FurutaParams",
     "InputDelay",
+    "InputLag",
+    "Lagged",
+    "LaggedParams",
+    "Payload",
     "Perturbed",
     "PerturbedParams",
     "PoleGeometry",
@@ -62,6 +76,7 @@ __all__ = [
     "RailTilt",
     "RodInertia",
     "Spring",
+    "Stribeck",
     "TwoLink",
     "TwoLinkParams",
     "UniformRodArm",
@@ -70,6 +85,8 @@ __all__ = [
     "catalogue",
     "delayed_means",
     "effect",
+    "lagged_means",
+    "library",
     "perturb",
     "rk4",
 ]

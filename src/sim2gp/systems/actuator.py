@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from sim2gp.errors import InputError
 from sim2gp.parameters import Parameter, Parameters
-from sim2gp.systems.base import AbstractSystem, Channel
+from sim2gp.systems.base import AbstractSystem, Channel, delayed_means
 from sim2gp.types import Action, Scalar, State
 
 _NEUTRAL = {"gain": 1.0, "offset": 0.0, "delay": 0.0}
@@ -117,6 +117,15 @@ class Actuated(AbstractSystem):
 
     def delays(self, params: ActuatedParams) -> Float[Array, " m"]:
         return params.delay
+
+    def mean_inputs(
+        self,
+        params: ActuatedParams,
+        held: Float[Array, "past m"],
+        dt: float,
+        count: int,
+    ) -> Float[Array, "count m"]:
+        return delayed_means(held, dt, params.delay, count)
 
     def neutral(self, params: Any) -> ActuatedParams:
         """A record of the bare machine, with unit gains and no offset or delay."""

@@ -92,6 +92,15 @@ class AbstractSystem(eqx.Module):
     def delays(self, params: Any) -> Float[Array, " m"]:
         """Delay of each input in seconds."""
 
+    @abc.abstractmethod
+    def mean_inputs(
+        self, params: Any, held: Float[Array, "past m"], dt: float, count: int
+    ) -> Float[Array, "count m"]:
+        """Mean of what arrives over each of ``count`` substeps of one period ``dt``.
+
+        ``held`` are the held inputs, newest first; the last was held for ever before.
+        """
+
     @property
     def physical_states(self) -> tuple[Channel, ...]:
         """The states that `ode` integrates, without the carried past actions."""
@@ -126,7 +135,7 @@ class AbstractSystem(eqx.Module):
             )
         n = s.size - self.history * m
         held = jnp.concatenate([a[None], s[n:].reshape(self.history, m)])
-        inputs = delayed_means(held, dt, self.delays(params), count)
+        inputs = self.mean_inputs(params, held, dt, count)
         x = _integrate(substep, s[:n], inputs, count)
         return jnp.concatenate([x, held[:-1].reshape(-1)])
 
@@ -174,6 +183,12 @@ class AbstractMechanism(AbstractSystem):
     def delays(self, params: Any) -> Float[Array, " m"]:
         """No input is delayed."""
         return jnp.zeros(len(self.actions), jax.tree.leaves(params)[0].dtype)
+
+    def mean_inputs(
+        self, params: Any, held: Float[Array, "past m"], dt: float, count: int
+    ) -> Float[Array, "count m"]:
+        """The newest input."""
+        return jnp.broadcast_to(held[:1], (count, held.shape[1]))
 
     def mass_matrix(self, params: Any, q: Float[Array, " 2"]) -> Float[Array, "2 2"]:
         """Joint-space inertia ``M(q)``."""

@@ -137,8 +137,53 @@ class RailFriction(AbstractForce):
     def force(
         self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
     ) -> Pair:
-        weight = (params.cart_mass + params.pole_mass) * _gravity(system)
+        weight = (params.cart_mass + params.pole_mass) * gravity_of(system)
         return _on_joint(0, -coulomb(v[0], x * weight, self.width))
+
+
+class Stribeck(AbstractForce):
+    """Friction that is twice as large at rest as in motion.
+
+    ``-magnitude (1 + exp(-(v / speed)^2)) / 2 tanh(v / width)``: ``magnitude`` is the
+    level at breakaway, half of it the level of fast motion (Armstrong-Helouvry 1991).
+    """
+
+    where: str = eqx.field(static=True)
+    magnitude: float = eqx.field(static=True)
+    width: float = eqx.field(static=True, default=0.05)
+    speed: float = eqx.field(static=True, default=1.0)
+    what: ClassVar[str] = "stribeck"
+    meaning: ClassVar[str] = "friction that falls from rest to motion"
+    max_substep: ClassVar[float] = COULOMB_SUBSTEP
+
+    def unit(self, system: AbstractMechanism) -> str:
+        return _force_unit(system, self.where)
+
+    def force(
+        self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
+    ) -> Pair:
+        i = system.joint(self.where)
+        level = 0.5 * x * (1.0 + jnp.exp(-((v[i] / self.speed) ** 2)))
+        return _on_joint(i, -coulomb(v[i], level, self.width))
+
+
+class BackEmf(AbstractForce):
+    """A motor that brakes with its speed, ``-magnitude v``."""
+
+    where: str = eqx.field(static=True)
+    magnitude: float = eqx.field(static=True)
+    what: ClassVar[str] = "back_emf"
+    meaning: ClassVar[str] = "braking by the motor's back-EMF"
+    max_substep: ClassVar[float] = _SUBSTEP
+
+    def unit(self, system: AbstractMechanism) -> str:
+        return _per(system, self.where, " s")
+
+    def force(
+        self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
+    ) -> Pair:
+        i = system.joint(self.where)
+        return _on_joint(i, -x * v[i])
 
 
 class Spring(AbstractForce):
@@ -199,7 +244,7 @@ class RailTilt(AbstractForce):
     def force(
         self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
     ) -> Pair:
-        p, g = params, _gravity(system)
+        p, g = params, gravity_of(system)
         up, lost = jnp.sin(x), 2.0 * jnp.sin(0.5 * x) ** 2
         lever = lost * jnp.sin(q[1]) - up * jnp.cos(q[1])
         return g * jnp.stack(
@@ -271,7 +316,7 @@ class PoleGeometry(AbstractGeometry):
         self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
     ) -> Pair:
         first = params.pole_mass * x * jnp.sin(q[1])
-        return jnp.stack([first * v[1] ** 2, -first * _gravity(system)])
+        return jnp.stack([first * v[1] ** 2, -first * gravity_of(system)])
 
 
 class DeadZone(AbstractEffect):
@@ -308,7 +353,8 @@ def _on_joint(i: int, f: Scalar) -> Pair:
     return jnp.stack([f, none] if i == 0 else [none, f])
 
 
-def _gravity(system: AbstractMechanism) -> float:
+def gravity_of(system: AbstractMechanism) -> float:
+    """Acceleration of gravity, m/s^2, of a machine that has any."""
     return float(system.gravity)  # type: ignore[attr-defined]
 
 

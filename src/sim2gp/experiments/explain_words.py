@@ -1,0 +1,182 @@
+"""What `explain` found, in the words of a control engineer."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from sim2gp.diagnose.evidence import AbstractData
+from sim2gp.diagnose.explain import Explanation
+from sim2gp.diagnose.misfit import Misfit
+from sim2gp.diagnose.missing import Refitted, Scored
+from sim2gp.diagnose.words import digits, listed, quantity
+
+NAMES = {
+    "chi2": "size",
+    "ljung_box": "correlation in time",
+    "f_test": "dependence on state and input",
+    "split_half": "constants of two halves",
+}
+
+
+def candidate_rows(found: Explanation) -> list[dict[str, Any]]:
+    """One entry for each candidate, by falling evidence; aliases last.
+
+    ``evidence_gain`` is None where nothing can tell; ``value`` and ``sd`` are those of
+    a fit (``fitted``), else of a linearisation, and None without.
+    """
+    fitted = {r.scored.candidate.name: r for r in found.search.refitted}
+    rows = [_row(s, fitted.get(s.candidate.name), found) for s in found.search.scored]
+
+    def order(row: Mapping[str, Any]) -> tuple[bool, bool, float]:
+        gain = row["evidence_gain"]
+        return gain is None, not row["fitted"], -(gain or 0.0)
+
+    return sorted(rows, key=order)
+
+
+def _row(s: Scored, refit: Refitted | None, found: Explanation) -> dict[str, Any]:
+    where, what = s.candidate.name.rsplit(".", 1)
+    table, name = s.system.parameters, s.candidate.name
+    j = table.names.index(name)
+    gain: float | None = s.gain if refit is None else refit.gain
+    constant = table[name]
+    value: float | None = constant.constrain(
+        constant.mean + constant.sd * float(s.starts[0, j])
+    )
+    if s.alias or not math.isfinite(s.gain):
+        gain = value = None
+    elif refit is not None:
+        value = refit.value
+    return {
+        "effect": what,
+        "where": where,
+        "parameter": name,
+        "meaning": s.candidate.meaning,
+        "unit": constant.unit,
+        "evidence_gain": gain,
+        "value": value,
+        "sd": None if refit is None else refit.sd,
+        "fitted": refit is not None,
+        "like": list(s.partners) if s.alias else [],
+        "verdict": _verdict(s, refit, found),
+    }
+
+
+def _verdict(s: Scored, refit: Refitted | None, found: Explanation) -> str:
+    best = found.search.best
+    if s.alias:
+        same = listed(s.partners) if s.partners else "no motion in these data"
+        return f"not distinguishable from {same}"
+    if s.candidate.name in found.search.failed:
+        return "no fit"
+    if refit is None:
+        return "not fitted"
+    if refit is best:
+        return "missing" if found.effect else "best, but not enough"
+    if refit in found.search.tied:
+        return "not told apart from the best"
+    if refit.gain > found.search.threshold:
+        return "behind the best" if refit.physical else "impossible sign"
+    return "no evidence"
+
+
+def headline(found: Explanation, data: AbstractData) -> str:
+    """The answer in one or two sentences."""
+    best, tests = found.search.best, found.best
+    reasons = _reasons(tests)
+    if found.answer == "nothing missing":
+        top = found.search.refitted[0] if found.search.refitted else None
+        text = "Nothing is missing that these data could show: no effect of the library"
+        text += f" is worth the {found.search.threshold:.1f} nats that it would take"
+        if top is not None:
+            text += f" (the best, {top.scored.candidate.name}, {top.gain:+.1f})"
+        return text + ", and what the fit leaves over looks like noise."
+    if best is None:
+        return (
+            "None of these: no effect of the library is worth its constant, and yet "
+            f"the simulator does not fit. {reasons}"
+        )
+    said = _said(best)
+    if found.answer == "none of these":
+        return (
+            f"None of these. The best effect of the library is {said}, but with it "
+            f"the simulator still does not fit. {reasons}"
+        )
+    text = f"Missing: {said}. With it what is left over looks like noise."
+    if found.search.tied:
+        names = listed([r.scored.candidate.name for r in found.search.tied])
+        text += f" These data do not tell it from {names}."
+    return text
+
+
+def _said(best: Refitted) -> str:
+    candidate = best.scored.candidate
+    unit = best.scored.system.parameters[candidate.name].unit
+    size = f"{quantity(best.value, '')} ± {quantity(_two(best.sd), unit)}"
+    text = f"{candidate.meaning} ({candidate.name} = {size}, "
+    text += f"{best.gain:.0f} nats of evidence"
+    if best.inflation > 1.0:
+        text += f", errors taken as correlated over {best.inflation:.0f} samples"
+    return text + ")"
+
+
+def _two(x: float) -> float:
+    """Two digits are enough for a standard deviation."""
+    return float(f"{x:.2g}")
+
+
+def _reasons(tests: Misfit | None) -> str:
+    if tests is None:
+        return ""
+    return " ".join(t.text for t in tests.tests.values() if t.alarm)
+
+
+def tables(
+    found: Explanation, rows: Sequence[Mapping[str, Any]]
+) -> list[dict[str, Any]]:
+    """Candidates by evidence, and what the fits leave over."""
+    cells = [
+        [
+            row["parameter"],
+            row["meaning"],
+            "-" if row["evidence_gain"] is None else f"{row['evidence_gain']:+.1f}",
+            _value(row),
+            row["verdict"],
+        ]
+        for row in rows
+    ]
+    gains = {
+        "title": "Candidates, by evidence gained over the machine as it is",
+        "columns": ["constant", "what it is", "nats", "value", "verdict"],
+        "rows": cells,
+        "note": "Fitted candidates first, then those that a linearisation ranked "
+        f"behind; {found.search.threshold:.1f} nats make 'nothing' improbable.",
+    }
+    left = [
+        [NAMES.get(name, name), *(_finding(t, name) for t in (found.bare, found.best))]
+        for name in (found.bare.tests if found.bare else ())
+    ]
+    over = {
+        "title": "What the fits leave over (p of four tests)",
+        "columns": ["test", "as it is", "with the best"],
+        "rows": left,
+    }
+    return [gains, over] if left else [gains]
+
+
+def _value(row: Mapping[str, Any]) -> str:
+    if row["value"] is None:
+        return "-"
+    if row["sd"] is None:
+        return f"about {quantity(_two(row['value']), row['unit'])}"
+    size = quantity(_two(row["sd"]), row["unit"])
+    return f"{digits(row['value'], 3)} ± {size}"
+
+
+def _finding(tests: Misfit | None, name: str) -> str:
+    if tests is None:
+        return "-"
+    finding = tests.tests[name]
+    if math.isnan(finding.p):
+        return "not tested"
+    return f"{finding.p:.1g}" + (" !" if finding.alarm else "")

@@ -1,0 +1,243 @@
+"""Effects on friction, geometry and inputs against mechanics or closed forms."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+
+import lagrangians
+import machines
+from sim2gp import systems as sy
+from sim2gp.errors import InputError
+from sim2gp.parameters import Parameter
+from test_systems import cartpole_forces, furuta_forces
+
+
+@pytest.fixture(autouse=True)
+def float64():
+    with jax.enable_x64(True):
+        yield
+
+
+def close(got, expected, rtol=1e-11):
+    np.testing.assert_allclose(
+        got, expected, rtol=0.0, atol=rtol * np.max(np.abs(expected))
+    )
+
+
+def against(machine, effect, lagrangian, forces):
+    """Accelerations of the perturbed machine against Euler-Lagrange."""
+    bare = machines.bare()[machine]
+    system = sy.Perturbed(bare, [effect])
+
+    def both(tt, s, a):
+        p = machines.params_at(bare, tt)
+        q, v = s[:2], s[2:]
+        got = system.ode(system.with_effects(p), s, a)[2:]
+        return got, lagrangians.acceleration(lagrangian(p), forces(p, v, a), q, v)
+
+    got, expected = jax.jit(jax.vmap(both))(*machines.batch(bare, 100, 4))
+    for row, oracle in zip(got, expected, strict=True):
+        close(row, oracle)
+
+
+def pendulum_at(p, r):
+    """A place on the Furuta's pendulum, ``r`` from its joint, in the base's frame."""
+
+    def position(q):
+        sin, cos = jnp.sin(q[0]), jnp.cos(q[0])
+        side = r * jnp.sin(q[1])
+        return jnp.stack(
+            [
+                p.arm_length * cos - side * sin,
+                p.arm_length * sin + side * cos,
+                -r * jnp.cos(q[1]),
+            ]
+        )
+
+    return position
+
+
+@pytest.mark.parametrize(
+    ("kind", "rising"), [(sy.BaseTilt, [1.0, 0.0]), (sy.BaseTiltSide, [0.0, 1.0])]
+)
+@pytest.mark.parametrize("tilt", [0.3, -0.02])
+def test_base_tilt_turns_gravity(kind, rising, tilt):
+    up = jnp.array([*(np.sin(tilt) * np.array(rising)), np.cos(tilt)])
+
+    def lagrangian(p):
+        centre = pendulum_at(p, p.pendulum_length / 2)
+
+        def with_height(q):  # `point` takes the last coordinate as height
+            return jnp.append(centre(q), 0.0)
+
+        def L(q, v):
+            moving = lagrangians.point(with_height, p.pendulum_mass, 0.0)(q, v)
+            return moving - p.pendulum_mass * 9.81 * centre(q) @ up
+
+        own = p.pendulum_mass * p.pendulum_length**2 / 12
+        arm = p.arm_mass * p.arm_length**2 / 12
+        return lagrangians.together(
+            lagrangians.spin(lambda q: q[0], arm),
+            lagrangians.spin(lambda q: q[1], own),
+            L,
+        )
+
+    against("furuta", kind(magnitude=tilt), lagrangian, furuta_forces)
+
+
+def test_payload_is_a_point_at_the_end():
+    def furuta(p):
+        end = pendulum_at(p, p.pendulum_length)
+        return lagrangians.together(
+            lagrangians.furuta(p), lagrangians.point(end, 0.01, 9.81)
+        )
+
+    def cartpole(p):
+        def end(q):
+            r = 2.0 * p.pole_half_length
+            return jnp.stack([q[0] + r * jnp.sin(q[1]), -r * jnp.cos(q[1])])
+
+        return lagrangians.together(
+            lagrangians.cartpole(p), lagrangians.point(end, 0.03, 9.81)
+        )
+
+    against("furuta", sy.Payload("alpha", 0.01), furuta, furuta_forces)
+    against("cartpole", sy.Payload("theta", 0.03), cartpole, cartpole_forces)
+
+
+@pytest.mark.parametrize("machine", ["furuta", "cartpole", "two_link"])
+@pytest.mark.parametrize("joint", [0, 1])
+def test_an_encoders_offset_moves_the_machine_not_its_equations(machine, joint):
+    bare = machines.bare()[machine]
+    name = bare.states[joint].name
+    system = sy.Perturbed(bare, [sy.EncoderOffset(name, 0.2)])
+    for tt, s, a in machines.points(bare, 20, 5):
+        p = machines.params_at(bare, tt)
+        got = system.ode(system.with_effects(p), s, a)
+        close(got, bare.ode(p, s.at[joint].add(0.2), a))
+
+
+def test_friction_formulas():
+    furuta = sy.Furuta()
+    q, v, a = jnp.array([0.7, 2.0]), jnp.array([-1.5, 0.4]), jnp.array([1.1])
+    p = furuta.nominal()
+    for effect, expected in (
+        (
+            sy.Stribeck("theta", 4e-3, speed=2.0),
+            [2e-3 * (1.0 + np.exp(-(0.75**2))), 0.0],
+        ),
+        (sy.Stribeck("alpha", 4e-3, width=0.4), [0.0, -2e-3 * (1 + np.exp(-0.16))]),
+        (sy.BackEmf("theta", 1e-3), [1.5e-3, 0.0]),
+    ):
+        system = sy.Perturbed(furuta, [effect])
+        f = system.forces(system.with_effects(p), q, v, a) - furuta.forces(p, q, v, a)
+        expected = np.array(expected) * [1.0, np.tanh(1.0) if expected[0] == 0 else 1.0]
+        np.testing.assert_allclose(f, expected, rtol=1e-9, atol=1e-15)
+    assert sy.Stribeck("theta", 1.0).unit(furuta) == "N m"
+    assert sy.BackEmf("theta", 1.0).unit(furuta) == "N m s/rad"
+
+
+def test_friction_only_takes_energy():
+    """In free motion every friction lowers the energy of the Furuta."""
+    furuta = sy.Furuta()
+    p = machines.nominal(furuta, arm_damping=1e-6, pendulum_damping=1e-7)
+    energy = lagrangians.energy
+    L = lagrangians.furuta(p)
+    none = jnp.zeros(1)
+    for effect in (sy.Stribeck("theta", 4e-3), sy.BackEmf("alpha", 1e-4)):
+        system = sy.Perturbed(furuta, [effect])
+        for _, s, _ in machines.points(furuta, 20, 6):
+            rate = jax.jvp(
+                lambda q, v: energy(L, q, v),
+                (s[:2], s[2:]),
+                (s[2:], system.ode(system.with_effects(p), s, none)[2:]),
+            )[1]
+            bare = jax.jvp(
+                lambda q, v: energy(L, q, v),
+                (s[:2], s[2:]),
+                (s[2:], furuta.ode(p, s, none)[2:]),
+            )[1]
+            assert rate < bare
+
+
+@pytest.mark.parametrize("lag", [2e-3, 0.015, 0.08])
+def test_lagged_means_are_those_of_a_low_pass(lag):
+    """Against a stiff integrator; the oldest input was held for ever before."""
+    held, dt, count = np.array([1.0, -2.0, 3.0, 0.5]), 0.02, 4
+    got = sy.lagged_means(jnp.asarray(held), dt, jnp.asarray(lag), count)
+    now = held[-1]
+    for u in held[:0:-1]:  # the oldest first
+        now = u + (now - u) * np.exp(-dt / lag)
+    edges = np.linspace(0.0, dt, count + 1)
+    solved = scipy.integrate.solve_ivp(
+        lambda t, y: [(held[0] - y[0]) / lag, y[0]],
+        (0.0, dt),
+        [now, 0.0],
+        t_eval=edges,
+        rtol=1e-10,
+        atol=1e-12,
+    )
+    np.testing.assert_allclose(got, np.diff(solved.y[1]) / (dt / count), rtol=1e-7)
+
+
+def test_a_lag_of_a_constant_is_the_constant_and_no_lag_the_newest():
+    lag = jnp.asarray(0.01)
+    same = sy.lagged_means(jnp.full(4, 2.5), 0.02, lag, 3)
+    np.testing.assert_allclose(same, 2.5, rtol=1e-13)
+    newest = sy.lagged_means(jnp.array([1.0, 5.0, 9.0]), 0.02, jnp.asarray(1e-9), 3)
+    np.testing.assert_allclose(newest, 1.0, rtol=1e-6)
+
+
+def test_lagged_machine_carries_what_still_matters():
+    furuta = sy.Furuta()
+    system = sy.Lagged(furuta, "voltage", 0.01, period=0.02)
+    assert system.history == 3  # 50 ms in steps of 20
+    assert len(system.states) == 7
+    p = system.record(system.parameters.values(jnp.zeros(8)))
+    s = jnp.array([0.1, 0.4, 0.3, -0.2, 2.0, 2.0, 2.0])
+    got = system.step(p, s, jnp.array([2.0]), 0.02)
+    plain = furuta.step(p.system, s[:4], jnp.array([2.0]), 0.02)
+    np.testing.assert_allclose(got[:4], plain, rtol=1e-12)
+    later = system.step(p, s, jnp.array([-1.0]), 0.02)
+    np.testing.assert_allclose(later[4:], [-1.0, 2.0, 2.0])
+    assert abs(later[2] - got[2]) > 1e-3
+
+
+def test_mistakes_of_lag_and_payload_are_named():
+    with pytest.raises(InputError, match=r"E103.*voltage"):
+        sy.Lagged(sy.Furuta(), "volage", 0.01)
+    with pytest.raises(InputError, match="E141"):
+        sy.Lagged(sy.Furuta(), "voltage", 0.0)
+    box = Parameter("voltage.delay", "s", "", "box", 0.0, 0.02)
+    delayed = sy.Actuated(sy.Furuta(), {"voltage.delay": box}, delay_max=0.02)
+    with pytest.raises(InputError, match=r"E145.*delayed"):
+        sy.Lagged(delayed, "voltage", 0.01)
+    system = sy.Lagged(sy.Furuta(), "voltage", 0.01)
+    with pytest.raises(InputError, match=r"E145.*windows.*use a delay"):
+        system.delays(system.nominal())
+    with pytest.raises(InputError, match=r"E145.*TwoLink"):
+        sy.Perturbed(sy.TwoLink(), [sy.Payload("q2", 0.1)])
+    with pytest.raises(InputError, match=r"E145.*CartPole"):
+        sy.Perturbed(sy.CartPole(), [sy.BaseTilt(where="theta")])
+
+
+def test_library_offers_what_the_machine_has_not():
+    furuta = sy.Furuta()
+    names = [c.name for c in sy.library(furuta)]
+    assert len(set(names)) == len(names)
+    assert {"theta.coulomb", "voltage.delay", "voltage.lag"} <= {*names}
+    held = sy.Actuated(
+        sy.Perturbed(furuta, [sy.Coulomb("theta", 1e-3)]),
+        {"voltage.delay": sy.actuator_prior(furuta.actions[0], "delay")},
+    )
+    rest = [c.name for c in sy.library(held, windows=True)]
+    gone = {"theta.coulomb", "voltage.delay", "voltage.lag"}
+    assert {*names} - {*rest} == gone
+    for machine in ("furuta", "cartpole", "two_link", "six"):
+        bare = machines.bare()[machine]
+        for candidate in sy.library(bare):
+            free = candidate.freed(bare, period=0.02)
+            assert free.parameters.names.count(candidate.name) == 1
+            assert len(free.parameters) == len(bare.parameters) + 1
