@@ -16,7 +16,7 @@ import numpy as np
 from sim2gp.diagnose.evidence import AbstractData, OneStepData, WindowData
 from sim2gp.diagnose.explain import explain
 from sim2gp.errors import InputError
-from sim2gp.experiments.explain_words import candidate_rows, headline, tables
+from sim2gp.experiments.explain_words import candidate_rows, headline, table
 from sim2gp.experiments.identify import PROJECT
 from sim2gp.experiments.prediction import cut_logs, load
 from sim2gp.experiments.record import provenance
@@ -46,21 +46,18 @@ def run(run: Path, *, add: bool, out: Path, progress: Progress) -> dict[str, Any
         summary: dict[str, Any] = {
             "command": "explain",
             "title": f"{run.name}: what its simulator lacks",
-            "headline": headline(found, data),
+            "headline": headline(found),
             "answer": found.answer,
             "best": found.effect,
             "none_of_these": found.answer == "none of these",
             "threshold": found.search.threshold,
             "candidates": candidates,
-            "misfit_tests": {
-                name: test.as_dict()
-                for name, test in (("bare", found.bare), ("best", found.best))
-                if test is not None
-            },
+            "misfit": None if found.best is None else found.best.as_dict(),
+            "misfit_as_it_is": None if found.bare is None else found.bare.as_dict(),
             "log_evidence": found.search.bare.log_evidence,
             "added": None,
             "warnings": [f"no fit with {name}" for name in found.search.failed],
-            "tables": tables(found, candidates),
+            "tables": [table(found, candidates)],
         }
         line = f"sim2gp explain {run}" + (" --add" if add else "")
         summary |= provenance(line, started)

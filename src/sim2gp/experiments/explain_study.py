@@ -8,7 +8,7 @@ and inputs alone.
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array
 
 from sim2gp.diagnose.evidence import OneStepData
+from sim2gp.diagnose.explain import explain
 from sim2gp.planning.noise import coloured_noise
 from sim2gp.systems import (
     AbstractSystem,
@@ -46,6 +47,8 @@ EPISODES = 2
 CENTRE = {"furuta": 1.0, "cartpole": 12.0}
 FASTEST = {"furuta": 20.0, "cartpole": 12.0}
 NOTHING = "nothing"
+#: Machines with nothing missing, for each of those with something.
+SOUND = 2
 
 
 class Cogging(AbstractForce):
@@ -223,3 +226,103 @@ def data_of(machine: str, planted: Planted | None, key: Key) -> OneStepData:
     """What `explain` sees of them."""
     make, _ = MACHINES[machine]
     return OneStepData(make(), flights(machine, planted, key))
+
+
+def scaled(planted: Planted, strength: float) -> Planted:
+    """The same effect, so many times as strong."""
+    return dataclasses.replace(planted, magnitude=strength * planted.magnitude)
+
+
+def settings(machine: str) -> dict[str, Planted | None]:
+    """Everything that is planted on a machine, by name: nothing, effects, others."""
+    return {NOTHING: None, **PLANTED[machine], **OUTSIDE[machine]}
+
+
+def cells(machine: str, truths: int) -> Iterator[tuple[str, int]]:
+    """Name of a setting and number of a hidden machine, for all of the study."""
+    for name in settings(machine):
+        count = SOUND * truths if name == NOTHING else truths
+        yield from ((name, k) for k in range(count))
+
+
+def cell(
+    machine: str, name: str, index: int, *, seed: int = 0, strength: float = 1.0
+) -> dict[str, Any]:
+    """What `explain` answers on one hidden machine, and what would be right."""
+    every = settings(machine)
+    planted = every[name]
+    if planted is not None:
+        planted = scaled(planted, strength)
+    key = jax.random.fold_in(jax.random.key(seed), list(MACHINES).index(machine))
+    for part in (list(every).index(name), index):
+        key = jax.random.fold_in(key, part)
+    found = explain(data_of(machine, planted, key))
+    ranked = [r.scored.candidate.name for r in found.search.refitted]
+    scored = sorted((s for s in found.search.scored if not s.alias), key=_falling)
+    inside = name in PLANTED[machine] and planted is not None
+    truth = name_of(planted) if inside and planted is not None else ""
+    best = found.search.refitted[0] if ranked else None
+    return {
+        "machine": machine,
+        "planted": name,
+        "index": index,
+        "truth": truth,
+        "answer": found.answer,
+        "effect": found.effect or "",
+        "ranked": ranked,
+        "gains": [r.gain for r in found.search.refitted],
+        "tied": [r.scored.candidate.name for r in found.search.tied],
+        "value": None if best is None else best.value,
+        "magnitude": 0.0 if planted is None else planted.magnitude,
+        "scored_first": scored[0].candidate.name,
+        "alarms": [k for k, t in found.best.tests.items() if t.alarm]
+        if found.best
+        else [],
+    }
+
+
+def _falling(scored: Any) -> float:
+    return -float(scored.gain)
+
+
+def verdict(machine: str, found: Mapping[str, Any]) -> str:
+    """right, or what was answered instead."""
+    name, answer = found["planted"], found["answer"]
+    if name == NOTHING:
+        return "right" if answer == "nothing missing" else _told(found)
+    if name in OUTSIDE[machine]:
+        return "right" if answer == "none of these" else _told(found)
+    return "right" if found["effect"] == found["truth"] else _told(found)
+
+
+def _told(found: Mapping[str, Any]) -> str:
+    return str(found["effect"] or found["answer"])
+
+
+def claims(found: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """The three shares of right answers, their bars, and how often the right effect
+    was ranked first whatever the answer."""
+    kinds: dict[str, list[bool]] = {"effect": [], "nothing": [], "none of these": []}
+    first = []
+    for one in found:
+        right = verdict(one["machine"], one) == "right"
+        if one["planted"] == NOTHING:
+            kinds["nothing"].append(right)
+        elif one["truth"]:
+            kinds["effect"].append(right)
+            first.append(bool(one["ranked"]) and one["ranked"][0] == one["truth"])
+        else:
+            kinds["none of these"].append(right)
+    kinds["effect ranked first"] = first
+    bars = {
+        "effect": 0.85,
+        "effect ranked first": 0.85,
+        "nothing": 0.95,
+        "none of these": 0.80,
+    }
+    out = {}
+    for name, bar in bars.items():
+        share = float(np.mean(kinds[name])) if kinds[name] else math.nan
+        figures = {"share": share, "of": len(kinds[name]), "bar": bar}
+        out[name] = {"holds": share >= bar, **figures}
+    return out

@@ -4,18 +4,10 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sim2gp.diagnose.evidence import AbstractData
 from sim2gp.diagnose.explain import Explanation
 from sim2gp.diagnose.misfit import Misfit
 from sim2gp.diagnose.missing import Refitted, Scored
 from sim2gp.diagnose.words import digits, listed, quantity
-
-NAMES = {
-    "chi2": "size",
-    "ljung_box": "correlation in time",
-    "f_test": "dependence on state and input",
-    "split_half": "constants of two halves",
-}
 
 
 def candidate_rows(found: Explanation) -> list[dict[str, Any]]:
@@ -80,7 +72,7 @@ def _verdict(s: Scored, refit: Refitted | None, found: Explanation) -> str:
     return "no evidence"
 
 
-def headline(found: Explanation, data: AbstractData) -> str:
+def headline(found: Explanation) -> str:
     """The answer in one or two sentences."""
     best, tests = found.search.best, found.best
     reasons = _reasons(tests)
@@ -131,10 +123,8 @@ def _reasons(tests: Misfit | None) -> str:
     return " ".join(t.text for t in tests.tests.values() if t.alarm)
 
 
-def tables(
-    found: Explanation, rows: Sequence[Mapping[str, Any]]
-) -> list[dict[str, Any]]:
-    """Candidates by evidence, and what the fits leave over."""
+def table(found: Explanation, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Candidates by evidence."""
     cells = [
         [
             row["parameter"],
@@ -145,23 +135,13 @@ def tables(
         ]
         for row in rows
     ]
-    gains = {
+    return {
         "title": "Candidates, by evidence gained over the machine as it is",
         "columns": ["constant", "what it is", "nats", "value", "verdict"],
         "rows": cells,
         "note": "Fitted candidates first, then those that a linearisation ranked "
         f"behind; {found.search.threshold:.1f} nats make 'nothing' improbable.",
     }
-    left = [
-        [NAMES.get(name, name), *(_finding(t, name) for t in (found.bare, found.best))]
-        for name in (found.bare.tests if found.bare else ())
-    ]
-    over = {
-        "title": "What the fits leave over (p of four tests)",
-        "columns": ["test", "as it is", "with the best"],
-        "rows": left,
-    }
-    return [gains, over] if left else [gains]
 
 
 def _value(row: Mapping[str, Any]) -> str:
@@ -171,12 +151,3 @@ def _value(row: Mapping[str, Any]) -> str:
         return f"about {quantity(_two(row['value']), row['unit'])}"
     size = quantity(_two(row["sd"]), row["unit"])
     return f"{digits(row['value'], 3)} ± {size}"
-
-
-def _finding(tests: Misfit | None, name: str) -> str:
-    if tests is None:
-        return "-"
-    finding = tests.tests[name]
-    if math.isnan(finding.p):
-        return "not tested"
-    return f"{finding.p:.1g}" + (" !" if finding.alarm else "")
