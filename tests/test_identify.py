@@ -77,6 +77,12 @@ def test_identify_finds_the_constants(run: Path) -> None:
     for key in ("log_evidence", "directions", "misfit", "n_transitions", "n_rows"):
         assert key in summary
     assert summary["n_rows"] == 1300
+    misfit = summary["misfit"]
+    assert [*misfit["tests"]] == ["chi2", "ljung_box", "f_test", "split_half"]
+    assert misfit["verdict"].startswith("Nothing in 1200 samples contradicts the model")
+    assert not misfit["alarm"]
+    assert misfit["tests"]["chi2"]["p"] is None  # the noise was estimated
+    assert len(misfit["noise"]) == 2
     assert set(summary["noise"]) == {"theta", "alpha"}
     assert summary["project"] == {"file": "machine.toml", "folder": ".."}
 

@@ -69,6 +69,8 @@ def _not_tested(test: str, about: Mapping[str, object]) -> str:
             "Not tested: the noise was estimated from these same residuals, so that "
             "their size says nothing about the model."
         )
+    if test == "ljung_box":
+        return "Not tested: too few rows follow each other."
     return "Not tested: too few rows."
 
 
@@ -83,10 +85,11 @@ def _chi2(ratio: float, alarm: bool, about: Mapping[str, object]) -> str:
 def _ljung_box(Q: float, alarm: bool, about: Mapping[str, object]) -> str:
     del Q
     if alarm:
+        alike = float(str(about["first"])) > 0.0
         return (
             f"The residuals of {about['channel']} are correlated from row to row "
-            f"({about['first']:.2f} between neighbours): they are not as many as they "
-            "are counted, and the intervals are wrong, mostly too narrow"
+            f"({about['first']:.2f} between neighbours): each row says less than it is "
+            f"counted for, and the intervals are {'too narrow' if alike else 'wrong'}"
         )
     return f"The residuals are not correlated over {about['lags']} rows"
 

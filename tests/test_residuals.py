@@ -1,0 +1,109 @@
+"""The misfit tests of whole fits: one-step models and windows of logs."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from linear_system import linear, transitions
+from sim2gp.diagnose import misfit
+from sim2gp.diagnose.residuals import (
+    earlier,
+    encoded,
+    misfit_of_transitions,
+    misfit_of_windows,
+)
+from sim2gp.gaussian import Gaussian
+from sim2gp.models import Sim2GP
+from sim2gp.models.cutting import cut
+from sim2gp.models.windows import Windows, WindowsBelief
+from sim2gp.systems import Channel, Furuta
+from sim2gp.types import in_float64
+from simulated_logs import pendulum, simulated
+
+
+def test_a_linear_fit_is_tested_on_its_own_rows() -> None:
+    """Against the core, given the Jacobian that is known in closed form."""
+    rng = np.random.default_rng(0)
+    J = rng.standard_normal((300, 2, 3))
+    y = J @ np.array([0.5, -1.0, 0.2]) + 0.1 * rng.standard_normal((300, 2))
+    y[:, 1] += 0.2 * np.abs(J[:, 1, 0])  # not linear in the action: a misfit
+    data, model = transitions(J, y), Sim2GP(linear(3, 2), dt=1.0)
+    # Room for more rows, which must not count.
+    padded = data.extend(np.full((1, 2), 9.0), np.full((1, 6), 9.0), np.ones((1, 2)))
+    padded = dataclasses.replace(padded, mask=np.arange(600) < 300)
+    estimate = np.linalg.lstsq(J.reshape(600, 3), y.reshape(600), rcond=None)[0]
+    with jax.enable_x64(True):
+        belief = eqx.tree_at(
+            lambda b: (b.posterior.mean, b.noise),
+            model.init(jax.random.key(0)),
+            (jnp.asarray(estimate), jnp.array([0.1, 0.15])),
+        )
+    found = misfit_of_transitions(belief, padded)
+    sd, tt = np.asarray(belief.noise), np.asarray(belief.posterior.mean)
+    theirs = misfit(
+        (J @ tt - y) / sd, J.reshape(300, 6), jacobian=J / sd[:, None],
+        past=earlier(J.reshape(300, 6), np.arange(300)), group=np.arange(300),
+    )  # fmt: skip
+    for name, finding in theirs.tests.items():
+        assert found.tests[name].p == pytest.approx(finding.p, rel=1e-6, nan_ok=True)
+    assert found.rows == 300
+    assert found.tests["f_test"].alarm
+    assert "x1" in found.tests["f_test"].text
+    # Every row starts anew at zero: none follows another.
+    assert "too few rows follow each other" in found.tests["ljung_box"].text
+
+
+def test_inputs_of_the_tests() -> None:
+    a = np.arange(6.0)[:, None]
+    past = earlier(a, np.array([0, 0, 0, 0, 1, 1]))
+    np.testing.assert_array_equal(past[3], [2.0, 1.0, 0.0])
+    np.testing.assert_array_equal(past[1], [0.0, 0.0, 0.0])
+    np.testing.assert_array_equal(past[5], [4.0, 4.0, 4.0])
+    channels = (Channel("q", "rad", angle=True), Channel("v", "rad/s"))
+    columns = encoded(np.array([[0.3, 2.0]]), channels)
+    np.testing.assert_allclose(columns, [[np.sin(0.3), np.cos(0.3), 2.0]])
+
+
+@in_float64
+def at_the_truth(windows: Windows, noise: float, start: np.ndarray) -> WindowsBelief:
+    """A fit that found the constants and these starts."""
+    system, W = pendulum(), len(windows)
+    prior = system.parameters.prior()
+    nominal = Furuta().parameters.nominal()
+    truth = jnp.asarray([nominal[name] for name in system.parameters.names])
+    posterior = Gaussian(system.parameters.unconstrain(truth), 0.01 * prior.scale)
+    sd = jnp.full(len(windows.outputs), noise)
+    factor, zero = jnp.zeros_like(prior.scale), jnp.zeros(())
+    return WindowsBelief(
+        system, prior, posterior, sd, factor, jnp.ones(W), jnp.asarray(start), zero
+    )
+
+
+def test_one_step_rows_with_noisy_states_are_named() -> None:
+    """The noise of a state enters twice, with both signs."""
+    log = simulated(seconds=0.6, seed=1, noise=1e-4, velocities=True)
+    windows, _ = cut([log], pendulum(), window=0.0)
+    found = misfit_of_windows(at_the_truth(windows, 1.4e-4, windows.start), windows)
+    assert found.rows == 299
+    assert found.tests["ljung_box"].alarm
+    assert "sensor noise on the states" in found.verdict
+    assert "likelihood.window" in found.verdict
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.01])
+def test_windows_find_a_delay(delay: float) -> None:
+    exact, noisy = (
+        simulated(seconds=1.3, seed=1, noise=sd, delay=delay, velocities=True)
+        for sd in (0.0, 5e-4)
+    )
+    windows, _ = cut([noisy], pendulum(), window=0.2)
+    start = cut([exact], pendulum(), window=0.2)[0].y[:, 0]
+    found = misfit_of_windows(at_the_truth(windows, 5e-4, start), windows)
+    assert found.rows == 600
+    assert found.alarm is (delay > 0.0)
+    if delay:
+        assert "too narrow" in found.verdict
