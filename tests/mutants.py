@@ -3,7 +3,7 @@
     python tests/mutants.py            all of them, a table, exit code 1 if one survives
     python tests/mutants.py prior      those whose name contains "prior"
 
-The lists are in `mutant_list.py` and `mutant_networks.py`.
+The lists are in `mutant_list.py`, `mutant_networks.py` and `mutant_misfit.py`.
 """
 
 import os
@@ -17,9 +17,10 @@ from pathlib import Path
 
 from mutant_list import MUTANTS as PHYSICS
 from mutant_list import Hunt, Mutant
+from mutant_misfit import MISFIT
 from mutant_networks import NETWORKS
 
-MUTANTS = (*PHYSICS, *NETWORKS)
+MUTANTS = (*PHYSICS, *NETWORKS, *MISFIT)
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "src" / "sim2gp"

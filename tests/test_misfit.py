@@ -129,6 +129,19 @@ def test_ljung_box_has_its_level_with_many_constants_and_few_rows() -> None:
     assert np.mean(np.asarray(tail) < 1e-2) == pytest.approx(1e-2, abs=7e-3)
 
 
+def test_ljung_box_has_its_level_with_slow_regressors() -> None:
+    """What a fit takes out of slow motion makes neighbours differ: no fault."""
+    phase = np.pi * np.linspace(0.0, 1.0, 250)[:, None] * np.arange(12)
+    J = np.cos(phase)[:, None]
+    rng = np.random.default_rng(4)
+    found = [
+        misfit(rng.standard_normal((250, 1)), phase[:, 1:2], jacobian=J)
+        for _ in range(250)
+    ]
+    p = p_values("ljung_box", found)
+    assert stats.binomtest(int((p < 0.05).sum()), 250, 0.05).pvalue > 1e-3
+
+
 def windowed(seed: int) -> dict[str, np.ndarray]:
     """Forty windows of 20 rows, each with its own unknown start and drift."""
     rng = np.random.default_rng(seed)
