@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sim2gp.arrowhead import Blocks, Noise
+from sim2gp.arrowhead import Noise
 from sim2gp.diagnose.misfit import Misfit
 from sim2gp.diagnose.residuals import misfit_of_transitions, misfit_of_windows
 from sim2gp.gaussian import LOG_2PI, Gaussian
@@ -118,8 +118,8 @@ class AbstractData(abc.ABC):
         system: AbstractSystem,
         z: Float[np.ndarray, "G p"],
         nuisances: Float[Array, "W n"],
-    ) -> Blocks:
-        """Linearisations at points of the constants, whitened by the prior; stacked."""
+    ) -> Float[Array, "G W c k k"]:
+        """`Blocks` at points of the constants, whitened by the prior."""
         prior = system.parameters.prior()
         likelihood = self.likelihood(system, prior)
         return _blocks(likelihood, jnp.asarray(z, float), nuisances)
@@ -151,7 +151,7 @@ def scores_of(fit: Fit, noise: Noise) -> Float[np.ndarray, "W p"]:
 
 
 @eqx.filter_jit
-def _blocks(likelihood: AbstractLikelihood, z: Array, e: Array) -> Blocks:
+def _blocks(likelihood: AbstractLikelihood, z: Array, e: Array) -> Array:
     return jax.lax.map(lambda one: likelihood.blocks(one, e), z)
 
 

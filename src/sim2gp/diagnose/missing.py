@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sim2gp.diagnose.evidence import AbstractData, Fitted
-from sim2gp.diagnose.score import Scored, inflation_of, score, tempered
+from sim2gp.diagnose.score import Scored, inflation_of, score, tempered, widened
 from sim2gp.errors import NotConverged, NotFinite
 from sim2gp.systems.library import Candidate, library
 from sim2gp.types import in_float64
@@ -120,6 +120,7 @@ def _refit(data: AbstractData, bare: Fitted, scored: Scored) -> Refitted:
     assert fitted.scores is not None
     inflation = inflation_of(fitted.scores, data.cluster, white @ white[j], j)
     raw = fitted.log_evidence - bare.log_evidence
-    gain = tempered(raw, inflation, sd / table[name].sd)
-    half = 0.5 * (ends[1] - ends[0]) * math.sqrt(inflation)
+    relative = sd / table[name].sd
+    gain = tempered(raw, inflation, relative)
+    half = 0.5 * (ends[1] - ends[0]) * widened(inflation, relative)
     return Refitted(scored, fitted, gain, middle, half, inflation)

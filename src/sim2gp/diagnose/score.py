@@ -209,19 +209,31 @@ def inflation_of(
         return 1.0
     each = np.stack([scores[cluster == k].sum(axis=0) for k in clusters])
     each = each - each.mean(axis=0)
-    return max(1.0, float(np.sum((each @ row) ** 2) / row[j]))
+    lost = len(clusters) / (len(clusters) - 1.0)  # to their own mean
+    return max(1.0, lost * float(np.sum((each @ row) ** 2) / row[j]))
 
 
 def tempered(gain: float, inflation: float, sd: float) -> float:
-    """The gain in evidence when the data count for less by ``inflation``.
+    """The gain in evidence when the data count for less by ``inflation`` (k).
 
-    ``sd`` is the magnitude's, in prior sd: Occam's price is ``-log sd``, and a wider
-    posterior pays less. A gain that is not a number is none at all.
+    With the magnitude's ``sd`` in prior sd, the data's information is
+    ``I = 1 / sd^2 - 1``, Occam's price ``1/2 log(1 + I)``, and the rest of a gain
+    ``1/2 m^2 I^2 / (1 + I)``; ``I / k`` takes the place of ``I`` in both. A gain that
+    is not a number is none at all.
     """
     if not math.isfinite(gain):
         return -math.inf
-    occam = -math.log(sd)
-    return (gain + occam) / inflation - occam + 0.5 * math.log(inflation)
+    information = max(1.0 / sd**2 - 1.0, 0.0)
+    less = information / inflation
+    fit = gain + 0.5 * math.log1p(information)
+    share = (1.0 + information) / (inflation**2 * (1.0 + less))
+    return fit * share - 0.5 * math.log1p(less)
+
+
+def widened(inflation: float, sd: float) -> float:
+    """How many times ``sd`` (in prior sd) the magnitude is uncertain by then."""
+    information = max(1.0 / sd**2 - 1.0, 0.0)
+    return math.sqrt((1.0 + information) / (1.0 + information / inflation))
 
 
 def _extended(
