@@ -1,7 +1,7 @@
 """Figure 2's bookkeeping: scores, claims on planted returns, cells that resume."""
 
+import dataclasses
 import json
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +9,7 @@ import pytest
 
 from sim2gp.experiments import figure2, swingup
 from sim2gp.experiments.swingup import CONDITIONS, MACHINES, METHODS, Cell
+from sim2gp.planning import MPC
 from sim2gp.report import figure2 as drawn
 from sim2gp.runs import Progress
 from sim2gp.runs.cells import Cells
@@ -78,19 +79,26 @@ def test_a_bootstrap_interval_covers_the_mean():
     assert high == pytest.approx(sample.mean() + half, abs=0.02)
 
 
-def test_a_finished_cell_is_not_flown_again(tmp_path: Path):
+def test_a_finished_cell_is_not_flown_again(tmp_path: Path, monkeypatch):
     cells = Cells(tmp_path / "fig2")
     cell = Cell("furuta", "nominal", "SIM2GP", 3, 2)
-    assert cells.load(cell.name, asdict(cell)) is None
-    saved = cells.save(cell.name, asdict(cell), {"returns": (1.0, np.float64(2.0))})
+    assert cells.load(cell.name, cell.arguments) is None
+    saved = cells.save(cell.name, cell.arguments, {"returns": (1.0, np.float64(2.0))})
     assert saved == {"returns": [1.0, 2.0]}
-    assert swingup.fly_cell(cell, cells) == saved
+    assert swingup.fly_cell(cell, tmp_path / "fig2") == saved
     assert not [f for f in cells.folder.iterdir() if f.name.startswith(".")]
-    # With other arguments, or damaged, it counts as missing.
-    more = Cell("furuta", "nominal", "SIM2GP", 3, 4)
-    assert cells.load(more.name, asdict(more)) is None
+    # Fewer episodes are there as well; more are not, nor those of another planner.
+    fewer = dataclasses.replace(cell, episodes=1)
+    assert swingup.fly_cell(fewer, tmp_path / "fig2") == saved
+    monkeypatch.setattr(swingup, "learner_cell", lambda cell, redrawn: {"returns": []})
+    monkeypatch.setattr(swingup, "oracle_cell", lambda cell: ORACLE)
+    more = dataclasses.replace(cell, episodes=4)
+    assert swingup.fly_cell(more, tmp_path / "fig2") == {"returns": []}
+    monkeypatch.setattr(swingup, "PLANNER", MPC(horizon=7))
+    assert cells.load(cell.name, cell.arguments) is None
+    # Damaged, it counts as missing.
     (cells.folder / f"{cell.name}.json").write_text('{"arguments": ')
-    assert cells.load(cell.name, asdict(cell)) is None
+    assert cells.load(cell.name, cell.arguments) is None
 
 
 def test_the_figure_goes_on_where_it_was(tmp_path: Path, monkeypatch):
@@ -110,7 +118,15 @@ def test_the_figure_goes_on_where_it_was(tmp_path: Path, monkeypatch):
 
     def draw():
         out, progress = tmp_path / "fig2", Progress()
-        return figure2.run(out=out, seed=0, quick=True, progress=progress)
+        return figure2.run(
+            out=out,
+            seed=0,
+            seeds=None,
+            episodes=None,
+            quick=True,
+            workers=1,
+            progress=progress,
+        )
 
     with pytest.raises(KeyboardInterrupt):
         draw()

@@ -14,9 +14,10 @@ from tyro.conf import Positional, arg
 from sim2gp.cli.arguments import usage_error
 from sim2gp.runs import Progress, load_run
 from sim2gp.runs.store import check_target
+from sim2gp.runs.workers import cores
 
 #: Figure, and the module of `sim2gp.experiments` that makes it.
-FIGURES = {"fig1": "two_link", "fig2": "figure2"}
+FIGURES = {"fig1": "two_link", "fig2": "figure2", "mismatch": "mismatch"}
 
 
 @dataclass(kw_only=True)
@@ -168,19 +169,32 @@ class Selftest(Common):
 class Reproduce(Writes):
     """A figure of the paper: its data, the picture, and the claims checked."""
 
-    figure: Annotated[Positional[Literal["fig1", "fig2"]], arg(metavar="FIGURE")]
-    """Which figure."""
+    figure: Annotated[
+        Positional[Literal["fig1", "fig2", "mismatch"]], arg(metavar="FIGURE")
+    ]
+    """A figure of the paper, or the mismatch map."""
     seed: int = 0
     """Draws the data."""
+    seeds: int | None = None
+    """How many seeds (not figure 1); default the paper's."""
+    episodes: int | None = None
+    """Episodes of each seed (not figure 1); default the paper's."""
     quick: bool = False
-    """Fewer seeds, for a look."""
+    """Fewer seeds and episodes, for a look."""
+    workers: int | None = None
+    """Processes (not figure 1); default one per core."""
 
     def run(self, progress: Progress) -> dict[str, Any]:
+        more: dict[str, Any] = {}
+        if self.figure != "fig1":
+            more = {"seeds": self.seeds, "episodes": self.episodes}
+            more["workers"] = self.workers or cores()
         return _experiment(FIGURES[self.figure])(
             out=_out(self.out, self.figure),
             seed=self.seed,
             quick=self.quick,
             progress=progress,
+            **more,
         )
 
 

@@ -7,6 +7,8 @@ returns and every argument that made them; a study is a list of cells.
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -26,12 +28,15 @@ from sim2gp.models import (
     ResidualFunctionSpace,
     Sim2GP,
 )
+from sim2gp.parameters import Parameter
 from sim2gp.planning import MPC
+from sim2gp.runs import Progress
 from sim2gp.runs.cells import Cells
-from sim2gp.systems import CartPole, Furuta
+from sim2gp.runs.workers import spread
+from sim2gp.systems import Actuated, CartPole, Furuta
 from sim2gp.systems.base import AbstractMechanism
 from sim2gp.systems.effects import AbstractEffect, RailFriction, Spring
-from sim2gp.systems.perturbed import Perturbed
+from sim2gp.systems.perturbed import InputDelay, Perturbed, effect
 from sim2gp.tasks import (
     Task,
     cartpole_swingup,
@@ -47,25 +52,31 @@ MACHINES: dict[str, tuple[Callable[[], AbstractMechanism], Callable[..., Task]]]
     "furuta": (Furuta, furuta_swingup),
     "cartpole": (CartPole, cartpole_swingup),
 }
-MISSING: dict[str, AbstractEffect] = {
+Effect = AbstractEffect | InputDelay
+MISSING: dict[str, Effect] = {
     "furuta": Spring("theta", 0.02),
     "cartpole": RailFriction(magnitude=0.1),
 }
 CONDITIONS = ("nominal", "mismatch")
 WITH_TERM = "SIM2GP with the term"
+PLANNER = MPC()
 
 
-def _with_term(system: AbstractMechanism, missing: AbstractEffect) -> AbstractModel:
+def _with_term(system: AbstractMechanism, missing: Effect) -> AbstractModel:
+    if isinstance(missing, InputDelay):
+        name, longest = f"{missing.where}.delay", 2.0 * missing.magnitude
+        delay = Parameter(name, "s", "delay of the input", "box", 0.0, longest)
+        return Sim2GP(Actuated(system, {name: delay}, delay_max=longest))
     return Sim2GP(Perturbed(system, [missing], free=True))
 
 
-def _auto(system: AbstractMechanism, _: AbstractEffect) -> AbstractModel:
+def _auto(system: AbstractMechanism, _: Effect) -> AbstractModel:
     sim = Sim2GP(system)
     return Auto([sim, Residual(sim), ResidualFunctionSpace(sim)])
 
 
 #: Each learner, made of the simulator and the physics that it lacks.
-METHODS: dict[str, Callable[[AbstractMechanism, AbstractEffect], AbstractModel]] = {
+METHODS: dict[str, Callable[[AbstractMechanism, Effect], AbstractModel]] = {
     "SIM2GP": lambda system, _: Sim2GP(system),
     "point estimate": lambda system, _: PointEstimate(Sim2GP(system)),
     "NLM": lambda system, _: NLM(system),
@@ -80,24 +91,47 @@ METHODS: dict[str, Callable[[AbstractMechanism, AbstractEffect], AbstractModel]]
 
 @dataclass(frozen=True)
 class Cell:
-    """One learner, on one machine of one seed; ``oracle`` is a method as well."""
+    """One learner, on one machine of one seed; ``oracle`` is a method as well.
+
+    condition: ``nominal``, ``mismatch`` (figure 2's), or an effect of the catalogue and
+        its strength, as in ``coulomb mild``.
+    update_every: steps between updates within an episode; None is the paper's way.
+    """
 
     machine: str
     condition: str
     method: str
     seed: int
     episodes: int
+    update_every: int | None = None
 
     @property
     def name(self) -> str:
         """Of its file."""
-        words = (self.machine, self.condition, self.method, str(self.seed))
+        words = [self.machine, self.condition, self.method, str(self.seed)]
+        if self.update_every is not None:
+            words.append(f"every {self.update_every}")
         return "_".join(words).replace(" ", "-")
 
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """All that its returns depend on, but for how many of them there are."""
+        told = asdict(self)
+        del told["episodes"]
+        return told | {"planner": str(PLANNER)}
 
-def effects_of(machine: str, condition: str) -> tuple[AbstractEffect, ...]:
+
+def missing(machine: str, condition: str) -> Effect:
+    """The physics that a condition is about; the nominal one has figure 2's."""
+    if condition in CONDITIONS:
+        return MISSING[machine]
+    name, strength = condition.split()
+    return effect(machine, name, strength)
+
+
+def effects_of(machine: str, condition: str) -> tuple[Effect, ...]:
     """What the real machine has and its simulator lacks."""
-    return (MISSING[machine],) if condition == "mismatch" else ()
+    return () if condition == "nominal" else (missing(machine, condition),)
 
 
 def oracle_cell(cell: Cell) -> dict[str, Any]:
@@ -107,7 +141,7 @@ def oracle_cell(cell: Cell) -> dict[str, Any]:
     found = accept_truth(
         lambda record: preset(record, effects),
         make(),
-        MPC(),
+        PLANNER,
         key=jax.random.key(cell.seed),
     )
     return {
@@ -124,7 +158,9 @@ def learner_cell(cell: Cell, redrawn: int) -> dict[str, Any]:
     system, key = make(), jax.random.key(cell.seed)
     record = draw_truth(system, key_for(key, redrawn, Purpose.TRUTH))
     task = preset(record, effects_of(cell.machine, cell.condition))
-    model = METHODS[cell.method](system, MISSING[cell.machine])
+    model = METHODS[cell.method](system, missing(cell.machine, cell.condition))
+    # The past actions that a model of delayed inputs has in its state.
+    simulator = getattr(model, "system", system)
     returns: list[float] = []
     started, failure = time.perf_counter(), None
 
@@ -132,24 +168,59 @@ def learner_cell(cell: Cell, redrawn: int) -> dict[str, Any]:
         returns.append(float(episode.trajectory.total))
 
     try:
-        psrl(task, model, MPC(), episodes=cell.episodes, key=key, on_episode=note)
+        psrl(
+            task,
+            model,
+            PLANNER,
+            episodes=cell.episodes,
+            key=key,
+            history=simulator.history,
+            update_every=cell.update_every,
+            on_episode=note,
+        )
     except (NotConverged, NotFinite) as error:
         failure = str(error)
     seconds = time.perf_counter() - started
     return {"returns": returns, "failure": failure, "seconds": seconds}
 
 
-def fly_cell(cell: Cell, cells: Cells) -> dict[str, Any]:
-    """A cell's values, from the disk if it is finished."""
-    stored = cells.load(cell.name, asdict(cell))
-    if stored is not None:
+def fly_cell(cell: Cell, out: Path) -> dict[str, Any]:
+    """A cell's values, from the disk if it was flown for as many episodes."""
+    cells = Cells(out)
+    stored = cells.load(cell.name, cell.arguments)
+    if stored is not None and (
+        len(stored["returns"]) >= cell.episodes or stored.get("failure")
+    ):
         return stored
     if cell.method == "oracle":
-        return cells.save(cell.name, asdict(cell), oracle_cell(cell))
-    oracle = fly_cell(reference(cell), cells)
-    return cells.save(
-        cell.name, asdict(cell), learner_cell(cell, int(oracle["redrawn"]))
-    )
+        return cells.save(cell.name, cell.arguments, oracle_cell(cell))
+    oracle = fly_cell(reference(cell), out)
+    values = learner_cell(cell, int(oracle["redrawn"]))
+    return cells.save(cell.name, cell.arguments, values)
+
+
+def fly_cells(
+    cells: Sequence[Cell], out: Path, *, workers: int, progress: Progress
+) -> dict[Cell, dict[str, Any]]:
+    """All of them and their oracles, on ``workers`` processes; finished ones are read.
+
+    One process takes all cells of a learner on a machine, which it compiles once.
+    """
+    values: dict[Cell, dict[str, Any]] = {}
+    stages = (list(dict.fromkeys(map(reference, cells))), list(cells))
+    with progress.task("cells", sum(map(len, stages))) as task:
+        for stage in stages:
+            groups: dict[Any, list[Cell]] = {}
+            for cell in stage:
+                where = cell.condition if cell.method == "oracle" else ""
+                alike = cell.machine, cell.method, cell.update_every, where
+                groups.setdefault(alike, []).append(cell)
+            work = partial(fly_cell, out=out)
+            for cell, value in spread(work, list(groups.values()), workers):
+                values[cell] = value
+                told = f"{cell.machine}, {cell.condition}: {cell.method}"
+                task.advance(f"{told}, seed {cell.seed}")
+    return values
 
 
 def reference(cell: Cell) -> Cell:
@@ -183,3 +254,25 @@ def first_at(
     """The first episode, from 1, whose score is at least ``solved``; inf if never."""
     reached = np.where(np.isfinite(score), score, -np.inf) >= solved
     return np.where(reached.any(axis=1), 1.0 + reached.argmax(axis=1), np.inf)
+
+
+def told(flown: Mapping[Cell, Mapping[str, Any]]) -> dict[str, Any]:
+    """What a summary says of its cells: returns, failures, redrawn truths, seconds."""
+    spent: dict[str, float] = {}
+    redrawn: dict[str, int] = {}
+    for cell, value in flown.items():
+        if cell.method == "oracle":
+            where = f"{cell.machine}, {cell.condition}"
+            redrawn[where] = redrawn.get(where, 0) + int(value["redrawn"])
+        else:
+            spent[cell.method] = spent.get(cell.method, 0.0) + value["seconds"]
+    return {
+        "returns": {cell.name: value["returns"] for cell, value in flown.items()},
+        "fits_not_converged": [
+            f"{cell.name}: {value['failure']}"
+            for cell, value in flown.items()
+            if value.get("failure")
+        ],
+        "redrawn_truths": redrawn,
+        "seconds_of_cells": spent,
+    }

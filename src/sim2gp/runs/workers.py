@@ -1,0 +1,107 @@
+"""A long study on all cores: groups of jobs, each group in one process, in order.
+
+What a group has in common is compiled once, by the process that takes it. Processes
+are spawned, not forked (JAX has threads), and pinned to a core each where the system
+can: two that share two cores by threads are slower than two that own one each.
+"""
+
+import multiprocessing
+import os
+import queue
+from collections.abc import Callable, Iterator, Sequence
+from itertools import chain
+from typing import Any, TypeVar
+
+from sim2gp import errors
+from sim2gp.errors import Sim2GPError
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+PATIENCE = 1.0  # s between looks at whether the processes still live
+
+
+def cores() -> int:
+    """How many cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def spread(
+    work: Callable[[Job], Result], groups: Sequence[Sequence[Job]], workers: int
+) -> Iterator[tuple[Job, Result]]:
+    """``work(job)`` of every job as it gets done; ``work`` must be importable.
+
+    One worker is this process itself. What comes back from another one is plain data:
+    numbers, text, lists and dictionaries. Raises what ``work`` raises of `Sim2GPError`,
+    and E208 when a process dies of anything else.
+    """
+    groups = [group for group in groups if group]
+    workers = min(workers, len(groups))
+    if workers <= 1:
+        for group in groups:
+            for job in group:
+                yield job, work(job)
+        return
+    context = multiprocessing.get_context("spawn")
+    jobs, results = context.Queue(), context.Queue()
+    numbered = dict(enumerate(chain.from_iterable(groups)))
+    first = 0
+    for group in groups:
+        jobs.put((first, list(group)))
+        first += len(group)
+    for _ in range(workers):
+        jobs.put(None)
+    processes = [
+        context.Process(target=_serve, args=(work, jobs, results, i), daemon=True)
+        for i in range(workers)
+    ]
+    for process in processes:
+        process.start()
+    try:
+        for _ in numbered:
+            number, result = _next(results, processes)
+            yield numbered[number], result
+    finally:
+        for process in processes:
+            process.terminate()
+        for process in processes:
+            process.join()
+
+
+def _next(results: Any, processes: Sequence[Any]) -> Any:
+    """The next result, for as long as somebody lives to make it."""
+    while True:
+        try:
+            number, result, error = results.get(timeout=PATIENCE)
+        except queue.Empty:
+            died = [p.exitcode for p in processes if p.exitcode]
+            if died:
+                raise Sim2GPError(
+                    "E208",
+                    "a worker process died",
+                    got=f"exit code {died[0]}",
+                    fix="its message stands above; finished cells are kept",
+                ) from None
+            continue
+        if error is not None:
+            kind, fields = error
+            raise getattr(errors, kind)(
+                fields.pop("code"), fields.pop("what"), **fields
+            )
+        return number, result
+
+
+def _serve(work: Callable[[Any], Any], jobs: Any, results: Any, number: int) -> None:
+    """One process: take groups until there are none."""
+    if hasattr(os, "sched_setaffinity"):
+        allowed = sorted(os.sched_getaffinity(0))
+        os.sched_setaffinity(0, {allowed[number % len(allowed)]})
+    for first, group in iter(jobs.get, None):
+        for number, job in enumerate(group, first):
+            try:
+                results.put((number, work(job), None))
+            except Sim2GPError as error:
+                fields = {name: str(value) for name, value in vars(error).items()}
+                results.put((number, None, (type(error).__name__, fields)))
+                return

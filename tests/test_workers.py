@@ -1,0 +1,49 @@
+"""Studies on several processes: every job once, groups stay together, faults speak."""
+
+import os
+
+import pytest
+
+from sim2gp.errors import InputError, Sim2GPError
+from sim2gp.runs import workers
+from sim2gp.runs.workers import spread
+
+
+def square(job: int) -> tuple[int, int]:
+    if job == 13:
+        raise InputError("E103", "unlucky", got=job, fix="another number")
+    if job == 14:
+        os._exit(3)
+    return job**2, os.getpid()
+
+
+def test_every_job_is_done_once_and_groups_stay_together() -> None:
+    groups = [[1, 2, 3], [], [4, 5], [6]]
+    found = dict(spread(square, groups, 2))
+    assert {job: result[0] for job, result in found.items()} == {
+        n: n**2 for n in range(1, 7)
+    }
+    for group in groups:
+        assert len({found[job][1] for job in group}) <= 1
+    assert os.getpid() not in {pid for _, pid in found.values()}
+
+
+def test_one_worker_is_this_process() -> None:
+    found = dict(spread(square, [[1, 2], [3]], 1))
+    assert found == {n: (n**2, os.getpid()) for n in (1, 2, 3)}
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_an_error_arrives_whole(count: int) -> None:
+    with pytest.raises(InputError, match=r"E103 unlucky: got 13\. Fix: another") as e:
+        list(spread(square, [[13], [1]], count))
+    assert e.value.code == "E103"
+    assert str(e.value.got) == "13"
+
+
+def test_a_process_that_dies_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers, "PATIENCE", 0.1)
+    with pytest.raises(
+        Sim2GPError, match="E208 a worker process died: got exit code 3"
+    ):
+        list(spread(square, [[14], [1]], 2))
