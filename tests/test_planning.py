@@ -330,6 +330,20 @@ def test_decay_shrinks_the_population_down_to_two_elites() -> None:
     assert [len(U) for U, _ in recorder.seen] == [128, 64, 32, 20]
 
 
+def test_noise_falls_geometrically_from_the_first_sequence_to_the_last() -> None:
+    rule = ICEM(samples=20, iterations=1, sd=0.1, finest=0.2)
+    plan = rule.init(25, 1, jnp.dtype("float32"))
+    drawn = []
+    for key in jax.random.split(KEY, 60):
+        recorder = Recorder(jnp.ones((25, 1)))
+        rule.improve(plan, recorder, world(), key=key)
+        drawn.append(recorder.seen[0][0])
+    rms = np.sqrt(np.mean(np.square(drawn), axis=(0, 2, 3)))
+    # The first one is the mean (last round), three of the end are old elites.
+    share = 0.1 * 0.2 ** (np.arange(20) / 19)
+    np.testing.assert_allclose(rms[1:17], share[1:17], rtol=0.3)
+
+
 # ---------------------------------------------------------------- worlds
 class Steps(AbstractObjective):
     """Pays the number of steps before this one: only a carry can know it."""

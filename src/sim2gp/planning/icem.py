@@ -1,9 +1,9 @@
 """iCEM: the cross-entropy method with coloured noise and memory.
 
 Pinneri et al. 2020, arXiv 2008.06389. Per control step, ``I`` times: draw ``n``
-sequences ``clip(mean + sd * coloured noise)``, replace a few by the best ones known
-(and one by the mean, last time round), roll out, keep the ``K`` best; mean and sd move
-to theirs. The best sequence seen is executed, not the mean.
+sequences ``clip(mean + share_j sd * coloured noise)``, replace a few by the best ones
+known (and one by the mean, last time round), roll out, keep the ``K`` best; mean and sd
+move to theirs. The best sequence seen is executed, not the mean. The shares are ours.
 """
 
 from typing import Any
@@ -25,16 +25,19 @@ class ICEM(AbstractUpdate):
     samples: sequences per iteration, the reused ones counted in.
     elites: how many of the best shape the next mean and sd.
     sd: of the noise at the start of every step, in half-widths of the action box.
+    finest: the last sequence's noise, as a share of the first one's; between them it
+        falls geometrically. Coarse ones find the swing, fine ones keep the balance.
     reuse: share of the elites that compete again, also in the next step.
     smoothing: weight of the old mean and sd in the new.
     decay: above 1, iteration ``i`` draws ``samples / decay^i`` (never under 2 elites).
     """
 
-    samples: int = eqx.field(static=True, default=128)
+    samples: int = eqx.field(static=True, default=160)
     iterations: int | None = eqx.field(static=True, default=None)
-    elites: int = eqx.field(static=True, default=10)
+    elites: int = eqx.field(static=True, default=16)
     noise_colour: float | None = eqx.field(static=True, default=None)
     sd: float = eqx.field(static=True, default=0.8)
+    finest: float = eqx.field(static=True, default=0.2)
     reuse: float = eqx.field(static=True, default=0.3)
     smoothing: float = eqx.field(static=True, default=0.1)
     decay: float = eqx.field(static=True, default=1.0)
@@ -79,7 +82,8 @@ class ICEM(AbstractUpdate):
         """One round: sample, evaluate, move mean and sd to the elites."""
         mean = plan.mean
         noise = coloured_noise(key, samples, mean, colour)
-        U = jnp.clip(mean[None] + sd[None] * noise, -1.0, 1.0)
+        share = jnp.geomspace(1.0, self.finest, samples).astype(mean.dtype)
+        U = jnp.clip(mean[None] + share[:, None, None] * sd[None] * noise, -1.0, 1.0)
         reused = int(self.reuse * self.elites)
         U = U.at[samples - reused :].set(plan.elites[:reused])
         U = U.at[0].set(jnp.where(last, mean, U[0]))
