@@ -62,7 +62,14 @@ WITH_TERM = "SIM2GP with the term"
 PLANNER = MPC()
 
 
-def _with_term(system: AbstractMechanism, missing: Effect) -> AbstractModel:
+#: Half-widths of the box that a learner's inputs are scaled to, by channel.
+Reach = Mapping[str, float]
+
+
+def _with_term(
+    system: AbstractMechanism, missing: Effect, reach: Reach
+) -> AbstractModel:
+    del reach
     if isinstance(missing, InputDelay):
         name, longest = f"{missing.where}.delay", 2.0 * missing.magnitude
         delay = Parameter(name, "s", "delay of the input", "box", 0.0, longest)
@@ -70,23 +77,39 @@ def _with_term(system: AbstractMechanism, missing: Effect) -> AbstractModel:
     return Sim2GP(Perturbed(system, [missing], free=True))
 
 
-def _auto(system: AbstractMechanism, _: Effect) -> AbstractModel:
+def _auto(system: AbstractMechanism, missing: Effect, reach: Reach) -> AbstractModel:
+    del missing
     sim = Sim2GP(system)
-    return Auto([sim, Residual(sim), ResidualFunctionSpace(sim)])
+    residual, matched = (
+        Residual(sim, reach=reach),
+        ResidualFunctionSpace(sim, reach=reach),
+    )
+    return Auto([sim, residual, matched])
 
 
-#: Each learner, made of the simulator and the physics that it lacks.
-METHODS: dict[str, Callable[[AbstractMechanism, Effect], AbstractModel]] = {
-    "SIM2GP": lambda system, _: Sim2GP(system),
-    "point estimate": lambda system, _: PointEstimate(Sim2GP(system)),
-    "NLM": lambda system, _: NLM(system),
-    "RES": lambda system, _: Residual(Sim2GP(system)),
-    "FS literal": lambda system, _: FunctionSpace(Sim2GP(system), objective="literal"),
-    "FS": lambda system, _: FunctionSpace(Sim2GP(system)),
-    "RES-FS": lambda system, _: ResidualFunctionSpace(Sim2GP(system)),
+#: Each learner, made of the simulator, the physics that it lacks, and the box.
+METHODS: dict[str, Callable[[AbstractMechanism, Effect, Reach], AbstractModel]] = {
+    "SIM2GP": lambda system, _, reach: Sim2GP(system),
+    "point estimate": lambda system, _, reach: PointEstimate(Sim2GP(system)),
+    "NLM": lambda system, _, reach: NLM(system, reach=reach),
+    "RES": lambda system, _, reach: Residual(Sim2GP(system), reach=reach),
+    "FS literal": lambda system, _, reach: FunctionSpace(
+        Sim2GP(system), objective="literal", reach=reach
+    ),
+    "FS": lambda system, _, reach: FunctionSpace(Sim2GP(system), reach=reach),
+    "RES-FS": lambda system, _, reach: ResidualFunctionSpace(
+        Sim2GP(system), reach=reach
+    ),
     "Auto": _auto,
     WITH_TERM: _with_term,
 }
+
+
+def reach_of(task: Task, system: AbstractMechanism) -> Reach:
+    """The box of states that models are trusted in, a third of the planner's bound."""
+    bound = np.asarray(task.state_bound, float) / 3.0
+    pairs = zip(system.states, bound.tolist(), strict=True)
+    return {channel.name: half for channel, half in pairs if np.isfinite(half)}
 
 
 @dataclass(frozen=True)
@@ -158,7 +181,8 @@ def learner_cell(cell: Cell, redrawn: int) -> dict[str, Any]:
     system, key = make(), jax.random.key(cell.seed)
     record = draw_truth(system, key_for(key, redrawn, Purpose.TRUTH))
     task = preset(record, effects_of(cell.machine, cell.condition))
-    model = METHODS[cell.method](system, missing(cell.machine, cell.condition))
+    lacking = missing(cell.machine, cell.condition)
+    model = METHODS[cell.method](system, lacking, reach_of(task, system))
     # The past actions that a model of delayed inputs has in its state.
     simulator = getattr(model, "system", system)
     returns: list[float] = []

@@ -1,0 +1,90 @@
+"""The mismatch map's bookkeeping: conditions, regrets and the claim, on planted cells."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sim2gp.errors import InputError
+from sim2gp.experiments import mismatch, swingup
+from sim2gp.experiments.swingup import METHODS, WITH_TERM, Cell
+from sim2gp.runs import Progress
+from sim2gp.systems import Actuated, Furuta
+from sim2gp.systems.perturbed import InputDelay, effect
+from sim2gp.tasks import furuta_swingup
+
+ORACLE = {"hang_return": 50.0, "oracle_return": 150.0, "redrawn": 0, "returns": [150.0]}
+
+
+def test_the_map_is_the_registered_catalogue():
+    assert mismatch.EFFECTS == ("coulomb", "dead_zone", "spring", "delay", "drag")
+    for name in mismatch.EFFECTS:
+        for strength in ("mild", "middle", "strong"):
+            (found,) = swingup.effects_of("furuta", f"{name} {strength}")
+            assert found == effect("furuta", name, strength)
+    assert swingup.effects_of("furuta", "nominal") == ()
+    with pytest.raises(InputError, match="did you mean spring"):
+        swingup.effects_of("furuta", "sprong mild")
+
+
+def test_the_right_term_is_there_for_delays_as_well():
+    lacking = swingup.missing("furuta", "delay strong")
+    assert isinstance(lacking, InputDelay)
+    model = METHODS[WITH_TERM](Furuta(), lacking, {})
+    assert isinstance(model.system, Actuated)
+    assert "voltage.delay" in model.system.parameters.names
+    low, high = 0.0, 2 * lacking.magnitude
+    table = {p.name: p for p in model.system.parameters.free}
+    assert (table["voltage.delay"].low, table["voltage.delay"].high) == (low, high)
+    assert model.system.history == 2  # 40 ms of past actions, every 20 ms
+
+
+def test_the_box_of_a_learner_is_the_tasks():
+    reach = swingup.reach_of(furuta_swingup(), Furuta())
+    found = {name: pytest.approx(half) for name, half in reach.items()}
+    assert found == {"theta": 2.0, "theta.velocity": 15.0, "alpha.velocity": 25.0}
+
+
+def test_regret_by_hand():
+    score = np.asarray([[0.0, 0.5, 1.2], [np.nan, np.nan, 0.75]])
+    table = {("spring mild", "SIM2GP"): score, ("drag mild", "SIM2GP"): score}
+    assert mismatch.regrets(table) == {"SIM2GP": pytest.approx(2 * (1.5 + 2.25))}
+
+
+@pytest.mark.parametrize(("auto", "holds"), [(1.05, True), (1.2, False)])
+def test_auto_is_held_against_the_best_fixed_model(auto, holds):
+    """The simulator with the right term does not count: it knows the answer."""
+    lost = {m: 0.5 for m in METHODS} | {"RES": 0.2, WITH_TERM: 0.01}
+    lost["Auto"] = 0.2 * auto
+    table = {("spring mild", m): np.full((2, 3), 1.0 - x) for m, x in lost.items()}
+    claim = mismatch.claims(table)["choosing_costs_little"]
+    assert claim["holds"] is holds
+    assert claim["figure"] == f"{auto:.2f} times the regret of RES"
+
+
+def test_the_map_is_written_whole(tmp_path: Path, monkeypatch):
+    def learner(cell: Cell, redrawn: int):
+        returns = [60.0 + 10.0 * e + cell.seed for e in range(cell.episodes)]
+        return {"returns": returns, "failure": None, "seconds": 1.0}
+
+    monkeypatch.setattr(swingup, "learner_cell", learner)
+    monkeypatch.setattr(swingup, "oracle_cell", lambda cell: ORACLE)
+    summary = mismatch.run(
+        out=tmp_path / "map",
+        seed=0,
+        seeds=2,
+        episodes=None,
+        quick=False,
+        workers=1,
+        progress=Progress(quiet=True),
+    )
+    rows = summary["tables"][0]["rows"]
+    assert len(rows) == 15
+    assert all(row[1] == "0.30 (0/2)" for row in rows)
+    assert len(summary["returns"]) == 15 * (2 * len(METHODS) + 2)
+    stored = json.loads((tmp_path / "map" / "summary.json").read_text())
+    assert stored["regret"]["RES"] == pytest.approx(
+        15 * (0.9 + 0.8 + 0.7 + 0.87 * 0 + 2.37)
+    )
+    assert "Mismatch map" in (tmp_path / "map" / "report.html").read_text()
