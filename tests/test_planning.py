@@ -8,6 +8,18 @@ import pytest
 from jaxtyping import Array
 from scipy.linalg import solve_discrete_are
 
+from double_integrator import (
+    KEY,
+    S0,
+    A,
+    B,
+    Linear,
+    Q,
+    R,
+    act,
+    box,
+    world,
+)
 from sim2gp.planning import (
     ICEM,
     MPC,
@@ -21,54 +33,6 @@ from sim2gp.planning.base import DIVERGED, masked, rollout
 from sim2gp.planning.mpc import from_unit
 from sim2gp.planning.mppi import softmax_of_size
 from sim2gp.planning.noise import colour_factor, coloured_noise
-from sim2gp.types import Box
-
-A = np.array([[1.0, 0.1], [0.0, 1.0]])
-B = np.array([[0.005], [0.1]])
-Q, R = np.diag([1.0, 0.1]), np.array([[0.1]])
-
-
-class Linear(eqx.Module):
-    """``s' = A s + B a``, a double integrator at 10 Hz."""
-
-    A: Array
-    B: Array
-
-    def __call__(self, s: Array, a: Array) -> Array:
-        return self.A @ s + self.B @ a
-
-
-class Quadratic(eqx.Module):
-    def __call__(self, s: Array, a: Array, s2: Array) -> Array:
-        del s
-        q, r = jnp.asarray(np.diag(Q), s2.dtype), jnp.asarray(np.diag(R), s2.dtype)
-        return -(q @ s2**2) - r @ a**2
-
-
-def box(low: float = -3.0, high: float = 3.0) -> Box:
-    return Box(jnp.asarray([low], jnp.float32), jnp.asarray([high], jnp.float32))
-
-
-def at_rest(key: Array) -> Array:  # one function, or every world would retrace
-    return jnp.zeros(2)
-
-
-def world(dynamics: object = None, **changes: object) -> World:
-    if dynamics is None:
-        dynamics = Linear(jnp.asarray(A, jnp.float32), jnp.asarray(B, jnp.float32))
-    fields = {
-        "objective": MarkovObjective(Quadratic()),
-        "reset": at_rest,
-        "actions": box(),
-        "horizon": 60,
-        "planning_horizon": 25,
-        "planning_iterations": 4,
-    }
-    return World(dynamics, **{**fields, **changes})
-
-
-S0 = jnp.asarray([1.0, 0.0])
-KEY = jax.random.key(0)
 
 
 # ---------------------------------------------------------------- coloured noise
@@ -127,7 +91,7 @@ def closed_loop(planner: MPC, w: World, s0: Array, key: Array) -> Array:
     "update",
     [
         ICEM(samples=256, iterations=5),
-        ICEM(samples=256, iterations=5, decay=1.25),
+        ICEM(samples=256, iterations=5, elites=10, decay=1.25),
         MPPI(samples=512, iterations=4, effective=0.05),
     ],
     ids=["icem", "icem with decay", "mppi"],
@@ -170,7 +134,6 @@ def trap(poison: float, good: float = 1.0, fault: float = 0.0) -> World:
     return world(dynamics, objective=MarkovObjective(Greedy(jnp.asarray(fault))))
 
 
-act = eqx.filter_jit(lambda planner, *args, key: planner.act(*args, key=key))
 PLANNERS = [MPC(ICEM(samples=64)), MPC(MPPI(samples=64))]
 
 
@@ -263,85 +226,6 @@ def test_weights_of_ties_one_and_none() -> None:
     np.testing.assert_allclose(
         softmax_of_size(jnp.where(one, -2.0, jnp.nan), one, 0.25), one.astype(float)
     )
-
-
-# ---------------------------------------------------------------- iCEM's parts
-class Recorder:
-    """Evaluates sequences by a linear score and keeps what it was shown."""
-
-    def __init__(self, direction: Array) -> None:
-        self.direction, self.seen = direction, []
-
-    def __call__(self, U: Array) -> tuple[Array, Array]:
-        returns = jnp.einsum("ntm,tm->n", U, self.direction)
-        self.seen.append((np.asarray(U), np.asarray(returns)))
-        return returns, jnp.ones(len(U), bool)
-
-
-def test_icem_budget_memory_and_execution() -> None:
-    rule = ICEM(samples=40, iterations=3, elites=8, decay=1.0 + 1e-12)  # not scanned
-    w = world()
-    direction = jax.random.normal(jax.random.key(5), (25, 1))
-    plan = Plan(
-        jnp.full((25, 1), 0.2),
-        jax.random.uniform(KEY, (8, 25, 1), minval=-1.0),
-        jnp.asarray(40),
-    )
-    recorder = Recorder(direction)
-    sequence, after = rule.improve(plan, recorder, w, key=KEY)
-    shapes = [U.shape for U, _ in recorder.seen]
-    assert shapes == [(40, 25, 1), (39, 25, 1), (39, 25, 1)]
-    for U, _ in recorder.seen:
-        assert np.abs(U).max() <= 1.0
-    # Elites of the step before compete first; the best of a round in the next round.
-    np.testing.assert_array_equal(recorder.seen[0][0][-2:], plan.elites[:2])
-    U, returns = recorder.seen[1]
-    best = U[np.argsort(-returns)[:2]]
-    np.testing.assert_array_equal(recorder.seen[2][0][-2:], best)
-    # The best sequence ever seen is executed.
-    everything = max(float(returns.max()) for _, returns in recorder.seen)
-    value = float(jnp.sum(sequence * direction))
-    assert value == pytest.approx(everything, rel=1e-6)
-    np.testing.assert_array_equal(sequence, after.elites[0])
-    # The mean competes in the last round, and only there.
-    U, returns = recorder.seen[1]
-    elites = U[np.argsort(-returns)[:8]]
-    # Reconstructed from the outside: mean_2 = .1 mean_1 + .9 mean(elites_2).
-    first_U, first_returns = recorder.seen[0]
-    mean_1 = 0.02 + 0.9 * first_U[np.argsort(-first_returns)[:8]].mean(axis=0)
-    mean_2 = 0.1 * mean_1 + 0.9 * elites.mean(axis=0)
-    np.testing.assert_allclose(recorder.seen[2][0][0], mean_2, atol=1e-6)
-
-
-def test_scanned_and_unrolled_iterations_agree() -> None:
-    scanned, unrolled = (
-        act(MPC(ICEM(decay=decay)), plan, world(), S0, key=KEY)
-        for decay in (1.0, 1.0 - 1e-13)
-        for plan in [MPC(ICEM()).init(world(), key=KEY)]
-    )
-    np.testing.assert_allclose(scanned[0], unrolled[0], atol=1e-5)
-    np.testing.assert_allclose(scanned[1].mean, unrolled[1].mean, atol=1e-5)
-
-
-def test_decay_shrinks_the_population_down_to_two_elites() -> None:
-    rule = ICEM(samples=128, iterations=4, decay=2.0)
-    recorder = Recorder(jnp.ones((25, 1)))
-    rule.improve(rule.init(25, 1, jnp.dtype("float32")), recorder, world(), key=KEY)
-    assert [len(U) for U, _ in recorder.seen] == [128, 64, 32, 20]
-
-
-def test_noise_falls_geometrically_from_the_first_sequence_to_the_last() -> None:
-    rule = ICEM(samples=20, iterations=1, sd=0.1, finest=0.2)
-    plan = rule.init(25, 1, jnp.dtype("float32"))
-    drawn = []
-    for key in jax.random.split(KEY, 60):
-        recorder = Recorder(jnp.ones((25, 1)))
-        rule.improve(plan, recorder, world(), key=key)
-        drawn.append(recorder.seen[0][0])
-    rms = np.sqrt(np.mean(np.square(drawn), axis=(0, 2, 3)))
-    # The first one is the mean (last round), three of the end are old elites.
-    share = 0.1 * 0.2 ** (np.arange(20) / 19)
-    np.testing.assert_allclose(rms[1:17], share[1:17], rtol=0.3)
 
 
 # ---------------------------------------------------------------- worlds
