@@ -6,7 +6,6 @@ finished one is redrawn from them.
 """
 
 import time
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +18,9 @@ from sim2gp.experiments.swingup import (
     MACHINES,
     METHODS,
     WITH_TERM,
-    Cell,
     best_seen,
     first_at,
-    fly_cells,
-    reference,
-    scores,
-    told,
+    study,
 )
 from sim2gp.runs import Progress, new_run
 from sim2gp.tasks import SOLVED
@@ -56,20 +51,14 @@ def run(
     started = time.perf_counter()
     seeds = seeds or (QUICK_SEEDS if quick else SEEDS)
     episodes = episodes or (QUICK_EPISODES if quick else EPISODES)
-    groups = [(m, c, w) for m in MACHINES for c in CONDITIONS for w in METHODS]
+    groups = {
+        (m, c, w): (m, c, w) for m in MACHINES for c in CONDITIONS for w in METHODS
+    }
     numbers = range(seed, seed + seeds)
-    cells = {g: [Cell(*g, s, episodes) for s in numbers] for g in groups}
     with new_run(out, "reproduce fig2") as writer:
-        every = list(chain.from_iterable(cells.values()))
-        flown = fly_cells(every, out, workers=workers, progress=progress)
-        table = {
-            group: scores(
-                [flown[cell] for cell in row],
-                [flown[reference(cell)] for cell in row],
-                episodes,
-            )
-            for group, row in cells.items()
-        }
+        table, details = study(
+            groups, numbers, episodes, out, workers=workers, progress=progress
+        )
         words = f"sim2gp reproduce fig2 --seed {seed} --seeds {seeds} "
         summary: dict[str, Any] = {
             "command": "reproduce fig2",
@@ -83,7 +72,7 @@ def run(
             "seed": seed,
             "seeds": seeds,
             "claims": claims(table, np.random.default_rng(seed)),
-            **told(flown),
+            **details,
             "tables": [_table(table)],
             **provenance(words + f"--episodes {episodes}", started),
         }

@@ -6,7 +6,6 @@ the model that chooses, against the best model that was fixed beforehand.
 """
 
 import time
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -14,16 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sim2gp.experiments.record import provenance
-from sim2gp.experiments.swingup import (
-    METHODS,
-    WITH_TERM,
-    Cell,
-    first_at,
-    fly_cells,
-    reference,
-    scores,
-    told,
-)
+from sim2gp.experiments.swingup import METHODS, WITH_TERM, first_at, study
 from sim2gp.runs import Progress, new_run
 from sim2gp.systems.perturbed import STRENGTHS
 from sim2gp.tasks import SOLVED
@@ -63,22 +53,11 @@ def run(
         for strength in STRENGTHS
     ]
     numbers = range(seed, seed + seeds)
-    cells = {
-        (c, m): [Cell(MACHINE, c, m, s, episodes) for s in numbers]
-        for c in conditions
-        for m in METHODS
-    }
+    groups = {(c, m): (MACHINE, c, m) for c in conditions for m in METHODS}
     with new_run(out, "reproduce mismatch") as writer:
-        every = list(chain.from_iterable(cells.values()))
-        flown = fly_cells(every, out, workers=workers, progress=progress)
-        table = {
-            group: scores(
-                [flown[cell] for cell in row],
-                [flown[reference(cell)] for cell in row],
-                episodes,
-            )
-            for group, row in cells.items()
-        }
+        table, details = study(
+            groups, numbers, episodes, out, workers=workers, progress=progress
+        )
         words = f"sim2gp reproduce mismatch --seed {seed} --seeds {seeds} "
         words += f"--episodes {episodes}{' --quick' if quick else ''}"
         summary: dict[str, Any] = {
@@ -89,7 +68,7 @@ def run(
             "episodes": episodes,
             "regret": regrets(table),
             "claims": claims(table),
-            **told(flown),
+            **details,
             "tables": tables(table),
             **provenance(words, started),
         }

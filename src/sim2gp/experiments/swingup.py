@@ -8,8 +8,9 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -53,6 +54,7 @@ MACHINES: dict[str, tuple[Callable[[], AbstractMechanism], Callable[..., Task]]]
     "cartpole": (CartPole, cartpole_swingup),
 }
 Effect = AbstractEffect | InputDelay
+Group = TypeVar("Group")
 MISSING: dict[str, Effect] = {
     "furuta": Spring("theta", 0.02),
     "cartpole": RailFriction(magnitude=0.1),
@@ -221,6 +223,33 @@ def fly_cell(cell: Cell, out: Path) -> dict[str, Any]:
     oracle = fly_cell(reference(cell), out)
     values = learner_cell(cell, int(oracle["redrawn"]))
     return cells.save(cell.name, cell.arguments, values)
+
+
+def study(
+    groups: Mapping[Group, tuple[str, str, str]],
+    seeds: Sequence[int],
+    episodes: int,
+    out: Path,
+    *,
+    workers: int,
+    progress: Progress,
+) -> tuple[dict[Group, Float[np.ndarray, "seeds E"]], dict[str, Any]]:
+    """Scores of each group (machine, condition, method), and what a summary tells."""
+    cells = {
+        group: [Cell(*where, seed, episodes) for seed in seeds]
+        for group, where in groups.items()
+    }
+    every = list(chain.from_iterable(cells.values()))
+    flown = fly_cells(every, out, workers=workers, progress=progress)
+    table = {
+        group: scores(
+            [flown[cell] for cell in row],
+            [flown[reference(cell)] for cell in row],
+            episodes,
+        )
+        for group, row in cells.items()
+    }
+    return table, told(flown)
 
 
 def fly_cells(
