@@ -271,9 +271,9 @@ def test_the_pendulum_of_reliability_3_4() -> None:
 @pytest.mark.nightly
 def test_misfit_alarms_hold_s10() -> None:
     """False alarms at most 1 %; power, with the noise known and estimated."""
+    assert alarms(2000, 500)["any"] <= 0.01
+    assert alarms(500, 2000)["any"] <= 0.01
     for known in (True, False):
-        assert alarms(4000, 500, known=known)["any"] <= 0.01
-        assert alarms(1000, 2000, known=known)["any"] <= 0.01
-        assert alarms(1000, 2000, friction=0.3, known=known)["any"] >= 0.9
-        assert alarms(2000, 500, friction=1.0, known=known)["any"] >= 0.99
-        assert alarms(2000, 500, delay=2, known=known)["any"] >= 0.99
+        assert alarms(300, 2000, friction=0.3, known=known)["any"] >= 0.9
+        assert alarms(1000, 500, friction=1.0, known=known)["any"] >= 0.99
+        assert alarms(1000, 500, delay=2, known=known)["any"] >= 0.99
