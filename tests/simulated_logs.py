@@ -6,7 +6,7 @@ import numpy as np
 import scipy.integrate
 
 from sim2gp.logs import Log
-from sim2gp.systems import Furuta
+from sim2gp.systems import AbstractEffect, Furuta, Perturbed
 
 NAMES = ("theta", "alpha", "theta.velocity", "alpha.velocity")
 FREE = ("arm_damping", "motor_constant", "pendulum_length")
@@ -28,13 +28,14 @@ def simulated(
     noise: float = 0.0,
     velocities: bool = False,
     changes: dict[str, float] | None = None,
+    effects: tuple[AbstractEffect, ...] = (),
 ) -> Log:
     """A log by scipy's integrator: held inputs, stamps of their own, sensor noise."""
     rng = np.random.default_rng(seed)
     count = int(seconds / 0.002)
     time = 0.002 * np.arange(count) + jitter * rng.uniform(0.0, 0.002, count)
     held = np.repeat(rng.uniform(-4.0, 4.0, count // 20 + 1), 20)[:count]
-    system = Furuta()
+    system = Perturbed(Furuta(), effects)
     with jax.enable_x64(True):
         values = system.parameters.nominal() | (changes or {})
         params = system.record({k: jnp.asarray(v) for k, v in values.items()})

@@ -1,0 +1,140 @@
+"""`sim2gp explain` on finished runs: logs, a demo's flights, and its errors."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+import stub_experiments
+from sim2gp import systems as sy
+from sim2gp.cli import main
+from sim2gp.errors import InputError
+from sim2gp.experiments import explain, identify
+from sim2gp.experiments import explain_study as study
+from sim2gp.project import load_project
+from sim2gp.runs import Progress, load_run, new_run
+from simulated_logs import simulated
+from test_identify import project_in, write
+
+QUIET = Progress(quiet=True)
+SPRING = sy.Spring("theta", 4.5e-3)
+
+
+@pytest.fixture
+def few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two candidates instead of eighteen: the whole library takes minutes."""
+
+    def short(system: Any, *, windows: bool = False) -> tuple[sy.Candidate, ...]:
+        kinds = ("theta.spring", "theta.back_emf")
+        every = sy.library(system, windows=windows)
+        return tuple(c for c in every if c.name in kinds)
+
+    monkeypatch.setattr("sim2gp.diagnose.missing.library", short)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An identification of a machine that has a spring and of which none is known."""
+    folder = tmp_path_factory.mktemp("explain")
+    for seed in (1, 2):
+        log = simulated(seconds=1.3, seed=seed, noise=5e-4, effects=(SPRING,))
+        write(log, folder / "logs" / f"log{seed}.csv")
+    identify.run(project_in(folder), out=folder / "run", seed=0, progress=QUIET)
+    return folder / "run"
+
+
+@pytest.mark.usefixtures("few")
+def test_a_spring_is_found_in_logs_and_added(run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    summary = explain.run(run, add=True, out=out, progress=QUIET)
+    json.dumps(summary, allow_nan=False)
+    assert summary["best"] == "theta.spring"
+    assert summary["none_of_these"] is False
+    first, last = summary["candidates"]
+    assert {"effect", "evidence_gain", "parameter", "value"} <= {*first}
+    assert first["effect"] == "spring"
+    assert first["evidence_gain"] > summary["threshold"]
+    assert abs(first["value"] - SPRING.magnitude) < 4.0 * first["sd"]
+    assert last["like"] == ["arm_damping"]
+    assert load_run(out).summary["answer"] == "missing"
+    assert "theta.spring" in (out / "report.html").read_text()
+    project = run.parent / "machine.toml"
+    assert load_project(project).system.parameters.names[-1] == "theta.spring"
+    # The run was made with another file: nothing is added twice.
+    with pytest.raises(InputError, match=r"E160.*changed.*identify again"):
+        explain.run(run, add=True, out=out, progress=QUIET)
+
+
+def test_windows_of_a_second_share_an_error(run: Path) -> None:
+    project = load_project(run / "project.toml")
+    moved = type(project)(
+        run.parent / "machine.toml", project.source, project.spec, project.system
+    )
+    data = explain.window_data(moved)
+    assert data.cluster.tolist() == [0] * 5 + [1] + [2] * 5 + [3]
+    assert data.period == 0.0
+
+
+@pytest.mark.usefixtures("few")
+def test_a_demo_is_explained_by_its_own_flights(tmp_path: Path) -> None:
+    episodes = study.flights("furuta", SPRING, jax.random.key(6))
+    with new_run(tmp_path / "demo", "demo") as writer:
+        writer.write_summary(
+            {
+                "command": "demo",
+                "machine": "furuta",
+                "episodes": 2,
+                "animation": {"dt": 0.02},
+            }
+        )
+        states = np.concatenate([S[:-1] for S, _ in episodes])
+        inputs = np.concatenate([A for _, A in episodes])
+        arrays = {"animation/state": states, "animation/action": inputs}
+        writer.write_arrays("arrays.npz", arrays)
+    out, demo = tmp_path / "out", tmp_path / "demo"
+    summary = explain.run(demo, add=False, out=out, progress=QUIET)
+    assert summary["best"] == "theta.spring"
+    with pytest.raises(InputError, match=r"E160.*--add without a project"):
+        explain.run(demo, add=True, out=out, progress=QUIET)
+
+
+def test_a_run_without_data_is_told(tmp_path: Path) -> None:
+    with new_run(tmp_path / "other", "evaluate") as writer:
+        writer.write_summary({"command": "evaluate"})
+        writer.write_arrays("arrays.npz", {"x": np.zeros(1)})
+    out, other = tmp_path / "out", tmp_path / "other"
+    with pytest.raises(
+        InputError, match=r"E130.*got evaluate.*identify or sim2gp demo"
+    ):
+        explain.run(other, add=False, out=out, progress=QUIET)
+    assert not out.exists()
+
+
+def test_the_command_line_hands_on(
+    run: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+
+    def told(path: Path, *, add: bool, out: Path, progress: Progress) -> dict[str, Any]:
+        return {"path": str(path), "add": add, "out": str(out), "answer": "missing"}
+
+    stub_experiments.install(monkeypatch, explain=told)
+    assert main(["explain", str(run), "--add", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["add"] is True
+    assert said["out"] == "runs/explain-run"
+    for args, words in (
+        (["explain"], "E160 missing RUN"),
+        (["explain", str(tmp_path)], "E130"),
+        (["explain", str(run), "--ad"], "did you mean --add"),
+    ):
+        assert main(args) == 2
+        fault = capsys.readouterr().err
+        assert words in fault
+        assert fault.count("\n") == 1
