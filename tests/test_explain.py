@@ -106,6 +106,9 @@ def test_repeated_rows_of_a_cluster_say_nothing_new() -> None:
         more = np.repeat(20.0 * scores, m, axis=0)
         same = inflation_of(more, np.repeat(cluster, m), row / m, 2)
         assert same == pytest.approx(m * once)
+    # The scores sum to the prior's pull, which is no error of any cluster.
+    pulled = inflation_of(20.0 * scores + 3.0, cluster, row, 2)
+    assert pulled == pytest.approx(once)
     assert inflation_of(scores, np.zeros(40, int), row, 2) == 1.0
     assert inflation_of(1e-3 * scores, cluster, row, 2) == 1.0  # never below 1
 
