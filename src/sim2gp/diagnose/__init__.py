@@ -13,6 +13,7 @@ and posterior are Gaussian; moments and quantiles are reported in physical units
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Float
@@ -81,15 +82,22 @@ def arrays(
     Correlations are those of the virtual values; the maps are increasing, so they are
     the physical ones wherever the posterior is narrow.
     """
-
-    def physical(gaussian: Gaussian, key: Key) -> np.ndarray:
-        tt = jax.vmap(gaussian.sample)(jax.random.split(key, count))
-        return np.asarray(jax.vmap(parameters.constrain)(tt))
-
     before, after = jax.random.split(key)
     unit = np.asarray(posterior.scale) / np.asarray(posterior.sd())[:, None]
     return {
-        "parameters/prior_samples": physical(prior, before),
-        "parameters/samples": physical(posterior, after),
+        "parameters/prior_samples": _physical(parameters, prior, before, count),
+        "parameters/samples": _physical(parameters, posterior, after, count),
         "parameters/correlation": np.clip(unit @ unit.T, -1.0, 1.0),
     }
+
+
+def _physical(
+    parameters: Parameters, gaussian: Gaussian, key: Key, count: int
+) -> Float[np.ndarray, "draws p"]:
+    """Draws of the constants in their units."""
+    return np.asarray(_constrained(parameters, gaussian, jax.random.split(key, count)))
+
+
+@eqx.filter_jit
+def _constrained(parameters: Parameters, gaussian: Gaussian, keys: Array) -> Array:
+    return jax.vmap(lambda key: parameters.constrain(gaussian.sample(key)))(keys)

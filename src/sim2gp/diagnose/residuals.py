@@ -17,9 +17,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sim2gp.diagnose.misfit import Misfit, misfit
-from sim2gp.models import windows
 from sim2gp.models.sim2gp import Sim2GPBelief
-from sim2gp.models.windows import Windows, WindowsBelief
+from sim2gp.models.windows import Windows, WindowsBelief, linearise
 from sim2gp.systems.base import Channel
 from sim2gp.transitions import Transitions
 from sim2gp.types import in_float64
@@ -56,7 +55,7 @@ def misfit_of_windows(belief: WindowsBelief, cut: Windows) -> Misfit:
     One-step windows have no start state of their own, and are tested as transitions.
     """
     system = belief.system
-    found = _windowed(belief, _on_device(cut))
+    found = linearise(belief, cut, belief.posterior.mean)
     r, J, s, a = (np.asarray(x).reshape(-1, *x.shape[2:]) for x in found)
     weight = np.sqrt(np.repeat(np.asarray(belief.weights), cut.mask.shape[1]))
     scale = weight[:, None] / np.asarray(belief.noise)
@@ -149,29 +148,3 @@ def _one_step(belief: Sim2GPBelief, data: Transitions) -> tuple[Array, Array]:
 
     J, (r,) = _columns(residual, jnp.zeros_like(prior.mean))
     return r, J
-
-
-@eqx.filter_jit
-def _windowed(belief: WindowsBelief, cut: Windows) -> tuple[Array, ...]:
-    """Residuals, their Jacobian in constants and start states, states, inputs.
-
-    Rows of all windows; a start state moves by its own spread.
-    """
-    system, prior, n = belief.system, belief.prior, cut.start.shape[1]
-    outputs = np.asarray(cut.outputs)
-
-    def residual(x: Array) -> tuple[Array, ...]:
-        tt = belief.posterior.mean + prior.scale @ x[:-n]
-        params = system.record(system.parameters.values(tt))
-
-        def one(window: Windows, start: Array) -> tuple[Array, ...]:
-            x0 = start + window.start_sd * x[-n:]
-            states = windows.simulate(system, params, window, x0)
-            inputs = windows.inputs_of(window, system.delays(params))
-            return states[:, outputs] - window.y, states, inputs
-
-        found: tuple[Array, ...] = cut.each(one, belief.starts)
-        return found
-
-    J, (r, states, inputs) = _columns(residual, jnp.zeros(prior.mean.size + n))
-    return r, J, states, inputs

@@ -14,13 +14,12 @@ and time are linear in the data. ``w`` is one Student-t weight per window (1 if 
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
 from sim2gp.arrowhead import Blocks, Noise, eliminate
@@ -225,6 +224,57 @@ def _fit(
     return fit, belief
 
 
+class Linearised(NamedTuple):
+    """Every row of every window at one vector of constants, windows from their starts.
+
+    ``jacobian`` is that of the residuals in the constants and in the window's own start
+    state, per prior sd of each. Masked entries of both are zero.
+    """
+
+    residual: Float[Array, "W L c"]
+    jacobian: Float[Array, "W L c pn"]
+    state: Float[Array, "W L n"]
+    input: Float[Array, "W L m"]
+
+
+@in_float64
+def linearise(
+    belief: WindowsBelief, windows: Windows, tt: Float[Array, " p"]
+) -> Linearised:
+    """The windows' simulation at virtual values ``tt``, and its derivatives."""
+    exact = jax.tree.map(jnp.asarray, windows)
+    return _linearise(belief, exact, jnp.asarray(tt, float))
+
+
+@eqx.filter_jit
+def _linearise(
+    belief: WindowsBelief, windows: Windows, tt: Float[Array, " p"]
+) -> Linearised:
+    system, prior, n = belief.system, belief.prior, windows.start.shape[1]
+
+    def rows(x: Array) -> tuple[Array, ...]:
+        params = system.record(system.parameters.values(tt + prior.scale @ x[:-n]))
+
+        def one(window: Windows, start: Array) -> tuple[Array, ...]:
+            states = simulate(system, params, window, start + window.start_sd * x[-n:])
+            r = states[:, np.asarray(window.outputs)] - window.y
+            u = inputs_of(window, system.delays(params))
+            return jnp.where(window.mask, r, 0.0), states, u
+
+        found: tuple[Array, ...] = windows.each(one, belief.starts)
+        return found
+
+    # One column after the other: the code of a single one takes a third of the time to
+    # compile, and few points are ever asked for.
+    def column(v: Array) -> tuple[Array, tuple[Array, ...]]:
+        values, slopes = jax.jvp(rows, (jnp.zeros(prior.mean.size + n),), (v,))
+        return slopes[0], values
+
+    J, values = jax.lax.map(column, jnp.eye(prior.mean.size + n))
+    r, states, inputs = jax.tree.map(lambda x: x[0], values)
+    return Linearised(r, jnp.moveaxis(J, 0, -1), states, inputs)
+
+
 def information_at(
     belief: WindowsBelief, windows: Windows
 ) -> Callable[[Float[Array, " p"]], Float[Array, "p p"]]:
@@ -232,18 +282,22 @@ def information_at(
 
     The start states stay where their windows put them, the noise as it was learned.
     """
-    prior, exact = belief.prior, jax.tree.map(jnp.asarray, windows)
-    exact = eqx.tree_at(lambda w: w.start, exact, belief.starts)
-    noise = Noise(belief.noise, belief.weights)
+    n = windows.start.shape[1]
 
-    @eqx.filter_jit
-    def information(model: _Windowed, noise: Noise, tt: Array) -> Array:
-        z = solve_triangular(prior.scale, tt - prior.mean, lower=True)
-        e = jnp.zeros_like(model.windows.start)
-        return eliminate(model.blocks(z, e), e, noise).data[:-1, :-1]
+    def information(tt: Float[Array, " p"]) -> Float[Array, "p p"]:
+        found = linearise(belief, windows, tt)
+        noise = Noise(belief.noise, belief.weights)
+        return _information(found.jacobian, found.residual, noise, n)
 
-    model = _Windowed(belief.system, prior, exact)
-    return in_float64(lambda tt: information(model, noise, jnp.asarray(tt, float)))
+    return in_float64(information)
+
+
+@eqx.filter_jit
+def _information(J: Array, r: Array, noise: Noise, n: int) -> Float[Array, "p p"]:
+    """Start states eliminated."""
+    J = jnp.roll(J, n, axis=-1)  # the start's columns first
+    blocks = jax.vmap(jax.vmap(factor, in_axes=1))(J, r)
+    return eliminate(blocks, jnp.zeros((len(J), n)), noise).data[:-1, :-1]
 
 
 @in_float64
