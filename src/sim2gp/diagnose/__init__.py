@@ -22,7 +22,7 @@ from sim2gp.diagnose.base_parameters import base_parameters
 from sim2gp.diagnose.conflicts import prior_conflicts
 from sim2gp.diagnose.directions import directions
 from sim2gp.diagnose.misfit import Misfit, misfit
-from sim2gp.diagnose.spectrum import FisherAt, Spectrum, spectrum
+from sim2gp.diagnose.spectrum import FisherAt, Spectrum, constrained, spectrum
 from sim2gp.diagnose.table import parameter_table
 from sim2gp.gaussian import Gaussian
 from sim2gp.parameters import Parameters
@@ -95,9 +95,10 @@ def _physical(
     parameters: Parameters, gaussian: Gaussian, key: Key, count: int
 ) -> Float[np.ndarray, "draws p"]:
     """Draws of the constants in their units."""
-    return np.asarray(_constrained(parameters, gaussian, jax.random.split(key, count)))
+    tt = _draws(gaussian, jax.random.split(key, count))
+    return np.asarray(constrained(parameters, tt))
 
 
 @eqx.filter_jit
-def _constrained(parameters: Parameters, gaussian: Gaussian, keys: Array) -> Array:
-    return jax.vmap(lambda key: parameters.constrain(gaussian.sample(key)))(keys)
+def _draws(gaussian: Gaussian, keys: Array) -> Array:
+    return jax.vmap(gaussian.sample)(keys)

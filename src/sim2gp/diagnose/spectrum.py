@@ -120,9 +120,19 @@ def physical(
     parameters: Parameters, tt: Float[np.ndarray, " p"]
 ) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
     """Physical values and their slopes ``dtheta/dtt``."""
-    tt_ = jnp.asarray(tt, float)
-    theta, slope = jax.jvp(parameters.constrain, (tt_,), (jnp.ones_like(tt_),))
+    theta, slope = _with_slope(parameters, jnp.asarray(tt, float))
     return np.asarray(theta), np.asarray(slope)
+
+
+@eqx.filter_jit
+def _with_slope(parameters: Parameters, tt: Array) -> tuple[Array, Array]:
+    return jax.jvp(parameters.constrain, (tt,), (jnp.ones_like(tt),))
+
+
+@eqx.filter_jit
+def constrained(parameters: Parameters, TT: Float[Array, "n p"]) -> Float[Array, "n p"]:
+    """Physical values of many vectors at once: one compilation, not one per map."""
+    return jax.vmap(parameters.constrain)(TT)
 
 
 def virtual_columns(

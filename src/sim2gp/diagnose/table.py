@@ -16,13 +16,12 @@ would help.
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from sim2gp.diagnose.conflicts import conflict_of
-from sim2gp.diagnose.spectrum import DOMINATED, IDENTIFIED, Spectrum
+from sim2gp.diagnose.spectrum import DOMINATED, IDENTIFIED, Spectrum, constrained
 from sim2gp.diagnose.words import digits, falling, finite_or_none, listed, quantity
 from sim2gp.parameters import Parameters
 from sim2gp.types import in_float64
@@ -74,15 +73,12 @@ def physical_moments(
     z = np.linspace(-1.0, 1.0, _NODES)[:, None] * span[None]
     weight = np.exp(-0.5 * z**2)
     weight /= weight.sum(axis=0)
-    theta = np.asarray(
-        jax.vmap(parameters.constrain)(jnp.asarray(mean + sd * z, float))
-    )
+    ends = np.outer([-_UPPER, _UPPER], sd)
+    values = mean + np.concatenate([sd * z, ends])
+    theta = np.asarray(constrained(parameters, jnp.asarray(values, float)))
+    theta, (low, high) = theta[:-2], theta[-2:]
     first = np.sum(weight * theta, axis=0)
     second = np.sum(weight * (theta - first[None]) ** 2, axis=0)
-    low, high = (
-        np.asarray(parameters.constrain(jnp.asarray(mean + q * sd, float)))
-        for q in (-_UPPER, _UPPER)
-    )
     return {"mean": first, "sd": np.sqrt(second), "q025": low, "q975": high}
 
 
