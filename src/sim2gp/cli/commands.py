@@ -141,6 +141,29 @@ class Explain(Writes):
 
 
 @dataclass(kw_only=True)
+class Compare(Writes):
+    """Which model the logs support: simulator, residual, function space, black box."""
+
+    project: Positional[Path]
+    """The project file (TOML)."""
+    seed: int = 0
+    """Draws networks and forecasts."""
+    horizon: Annotated[tuple[float, ...], arg(metavar="S...")] = (0.2, 0.5)
+    """Open-loop horizons in s."""
+
+    def run(self, progress: Progress) -> dict[str, Any]:
+        out = _out(self.out, f"compare-{self.project.stem}")
+        _check_project(self.project)
+        return _experiment("compare")(
+            self.project,
+            horizons=self.horizon,
+            out=out,
+            seed=self.seed,
+            progress=progress,
+        )
+
+
+@dataclass(kw_only=True)
 class Report(Common):
     """Draw the report of a run anew."""
 
@@ -203,6 +226,7 @@ COMMANDS: dict[str, type[Common]] = {
     "identify": Identify,
     "evaluate": Evaluate,
     "explain": Explain,
+    "compare": Compare,
     "report": Report,
     "selftest": Selftest,
     "reproduce": Reproduce,

@@ -52,7 +52,7 @@ def run(
 ) -> dict[str, Any]:
     """Predict ``logs`` by an identify run; writes and returns the summary."""
     started = time.perf_counter()
-    _check_horizon(horizon)
+    check_horizon(horizon)
     stored = load_run(run)
     if "belief/mean" not in stored.arrays or not (run / PROJECT).exists():
         raise InputError(
@@ -77,7 +77,7 @@ def run(
     tested = found.read_logs(logs)
     with new_run(out, "evaluate") as writer, progress.task("evaluate", 2) as task:
         rows, longest = rows_for(horizon), max(horizon, CURVE[-1])
-        grid = _windows(tested, found, longest, horizon)
+        grid = windows_for(tested, found, longest, horizon)
         result = forecast(system, posterior, grid.windows, rows)
         train = _training(found, stored.summary, run)
         linear = None
@@ -110,7 +110,7 @@ def leave_one_out(
 ) -> dict[str, Any]:
     """Fit all recordings but one, predict that one, in turn; writes the summary."""
     started = time.perf_counter()
-    _check_horizon(horizon)
+    check_horizon(horizon)
     found = load_project(project)
     logs = load(found)
     files = list(dict.fromkeys(recordings(logs)))
@@ -125,7 +125,7 @@ def leave_one_out(
         )
     with new_run(out, "evaluate") as writer, progress.task("logs", len(files)) as task:
         windows, of = cut_logs(found, logs)
-        grid = _windows(logs, found, max(horizon, CURVE[-1]), horizon)
+        grid = windows_for(logs, found, max(horizon, CURVE[-1]), horizon)
         names = channels(found.system, windows)
         parts: list[Judged] = []
         arrays: dict[str, np.ndarray] = {}
@@ -214,7 +214,7 @@ def _constants_table(
     }
 
 
-def _windows(
+def windows_for(
     logs: Sequence[Log], project: Project, longest: float, horizon: float
 ) -> Grid:
     """Evaluation windows; E116 where no log is as long as the horizon."""
@@ -243,7 +243,8 @@ def _training(
         return None
 
 
-def _check_horizon(horizon: float) -> None:
+def check_horizon(horizon: float) -> None:
+    """E160 for a horizon that is not some seconds."""
     if not 0.0 < horizon <= 60.0:
         raise InputError(
             "E160",

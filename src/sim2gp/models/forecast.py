@@ -183,11 +183,17 @@ def fit_band(found: Forecast, grid: Grid, recordings: int) -> Band:
     squares = np.where(valid, found.error**2 / variance(best), 0.0).sum(axis=0)
     count = valid.sum(axis=0)
     shape = np.where(count > 0, squares / np.maximum(count, 1), 1.0)
-    # One log says nothing of another: then twice the sd is as good as any.
-    inflation = (m + 1) / (m - 1) if m > 1 else 4.0
     rows = np.asarray((0.0, *found.rows))
     shape = np.concatenate([np.ones_like(shape[:1]), shape])
-    return Band(start_sd, np.exp(best), resolution, rows, shape, inflation)
+    return Band(start_sd, np.exp(best), resolution, rows, shape, inflation_of(m))
+
+
+def inflation_of(recordings: int) -> float:
+    """By what a variance seen in ``m`` training logs is raised for another log.
+
+    One log says nothing of another: then twice the sd is as good as any.
+    """
+    return (recordings + 1) / (recordings - 1) if recordings > 1 else 4.0
 
 
 def _variance(

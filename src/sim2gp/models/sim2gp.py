@@ -84,13 +84,16 @@ class Sim2GP(AbstractModel):
 
     ``dt`` is the control period (s). ``prior`` replaces the table's own, in virtual
     space: with a posterior here, data sets are learned one after another. ``draws`` is
-    ``"linearized"`` (the paper's Gaussian process) or ``"nonlinear"``.
+    ``"linearized"`` (the paper's Gaussian process) or ``"nonlinear"``. A ``frozen``
+    simulator takes ``prior`` as the last word on its constants, because other data or
+    the same ones in another form have made it: a fit then learns the noise alone.
     """
 
     system: AbstractSystem
     prior: Gaussian
     dt: float = eqx.field(static=True)
     linear: bool = eqx.field(static=True)
+    frozen: bool = eqx.field(static=True)
 
     @in_float64
     def __init__(
@@ -100,6 +103,7 @@ class Sim2GP(AbstractModel):
         dt: float = 0.02,
         prior: Gaussian | None = None,
         draws: str = "linearized",
+        frozen: bool = False,
     ) -> None:
         if draws not in ("linearized", "nonlinear"):
             raise ValueError(f"draws is {draws!r}, not 'linearized' or 'nonlinear'")
@@ -107,6 +111,7 @@ class Sim2GP(AbstractModel):
         self.prior = system.parameters.prior() if prior is None else prior
         self.dt = dt
         self.linear = draws == "linearized"
+        self.frozen = frozen
 
     def with_prior(self, prior: Gaussian) -> "Sim2GP":
         """The same recipe, starting from another belief about the constants."""
@@ -138,6 +143,8 @@ class Sim2GP(AbstractModel):
         Raises `NotConverged`, `NotFinite` or `DeadParameters`.
         """
         assert isinstance(belief, Sim2GPBelief)
+        if self.frozen:
+            return _noise_alone(self, jax.tree.map(jnp.asarray, data))
         p = self.prior.mean.size
         warm = jax.scipy.linalg.solve(
             self.prior.scale, belief.posterior.mean - self.prior.mean
@@ -236,9 +243,7 @@ def _fit(
     model: Sim2GP, data: Transitions, starts: Float[Array, "starts p"]
 ) -> tuple[Fit, Sim2GPBelief]:
     d, N = len(model.system.physical_states), jnp.sum(data.mask, dtype=float)
-    y = jnp.where(data.mask[:, None], data.delta()[:, :d], 0.0)
-    change = jnp.sqrt(jnp.sum(y**2, axis=0) / jnp.maximum(N, 1.0))
-    change = jnp.where(change > 0.0, change, 1.0)
+    change = _rms_change(data, d)
 
     # Start from a large noise, so that the first MAP is not trapped.
     fit, noise, _ = multi_start(
@@ -262,6 +267,41 @@ def _fit(
         model.linear,
     )
     return fit, belief
+
+
+def _rms_change(data: Transitions, d: int) -> Float[Array, " d"]:
+    """Of each physical state in one step; 1 where nothing moves."""
+    N = jnp.sum(data.mask, dtype=float)
+    y = jnp.where(data.mask[:, None], data.delta()[:, :d], 0.0)
+    change = jnp.sqrt(jnp.sum(y**2, axis=0) / jnp.maximum(N, 1.0))
+    return jnp.where(change > 0.0, change, 1.0)
+
+
+@eqx.filter_jit
+def _noise_alone(model: Sim2GP, data: Transitions) -> Sim2GPBelief:
+    """The noise by one step of EM, exact where the constants' posterior is given.
+
+    The log evidence is that of the data at the constants' mean.
+    """
+    d, N = len(model.system.physical_states), jnp.sum(data.mask, dtype=float)
+    p = model.prior.mean.size
+    r, J = _OneStep(model, data).rows(jnp.zeros(p))
+    floor = FLOOR * _rms_change(data, d)
+    squares = jnp.sum(r**2, axis=0)
+    total = 2.0 * floor**2 + squares + jnp.sum(J**2, axis=(0, 2))
+    noise = jnp.sqrt(total / (2.0 + N))
+    normaliser = N * jnp.sum(jnp.log(noise) + 0.5 * LOG_2PI)
+    return Sim2GPBelief(
+        model.system,
+        model.prior,
+        model.prior,
+        noise,
+        jnp.zeros((p, p)),
+        -0.5 * jnp.sum(squares / noise**2) - normaliser,
+        jnp.sum(data.mask),
+        model.dt,
+        model.linear,
+    )
 
 
 def _update(belief: Sim2GPBelief, s: Array, a: Array, s2: Array) -> Sim2GPBelief:
