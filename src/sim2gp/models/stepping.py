@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Key as KeyArray
 
 from sim2gp.logs import Log
 from sim2gp.models.base import AbstractBelief
@@ -153,6 +154,10 @@ class Ensemble(eqx.Module):
     point: Float[np.ndarray, "W R c"]
     draws: Float[np.ndarray, "D W R c"]
 
+    def finite(self) -> bool:
+        """Whether every number is; a rollout far from the data may run away."""
+        return all(bool(np.isfinite(x).all()) for x in (self.point, self.draws))
+
 
 @in_float64
 def ensemble(
@@ -186,7 +191,7 @@ def _ensemble(
     start: Float[Array, "W n"],
     action: Float[Array, "W K m"],
     start_sd: Float[Array, " d"],
-    keys: Key,
+    keys: KeyArray[Array, " D"],
     steps: tuple[int, ...],
     outputs: tuple[int, ...],
 ) -> tuple[Array, Array]:

@@ -1,0 +1,197 @@
+"""Logs at an even period: inputs, states and rollouts, each computed another way."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sim2gp.gaussian import Gaussian
+from sim2gp.logs import Log
+from sim2gp.models import Sim2GP
+from sim2gp.models.forecast import forecast
+from sim2gp.models.grid import evaluation_windows, steps_of
+from sim2gp.models.stepping import (
+    Steps,
+    ensemble,
+    mean_inputs,
+    stepping,
+    steps_of_grid,
+    transitions,
+)
+from sim2gp.systems import Actuated, Furuta, actuator_prior
+from sim2gp.transitions import Transitions
+from sim2gp.types import in_float64
+from simulated_logs import pendulum, simulated
+
+PERIOD = 0.02
+DELAY = 0.007
+
+
+def behind_delay() -> Actuated:
+    """The pendulum with a delay to be learned."""
+    channel = Furuta().actions[0]
+    return Actuated(pendulum(), {"voltage.delay": actuator_prior(channel, "delay")})
+
+
+@in_float64
+def known(system: Actuated) -> Gaussian:
+    """A posterior that is sure of the published constants and of the delay."""
+    values = system.system.parameters.nominal() | {"voltage.delay": DELAY}
+    theta = jnp.asarray([values[name] for name in system.parameters.names])
+    tt = system.parameters.unconstrain(theta)
+    return Gaussian(tt, 1e-9 * jnp.eye(tt.size))
+
+
+@pytest.fixture(scope="module")
+def log() -> Log:
+    return simulated(seconds=1.2, seed=5, delay=DELAY)
+
+
+def test_mean_inputs_are_integrals_of_what_was_held(log: Log) -> None:
+    since = np.asarray([0.1, 0.3333, 1.19])
+    found = mean_inputs(log, ["voltage"], since, PERIOD, 2, 3)
+    assert found.shape == (3, 5, 1)
+    # Every input is held for 40 ms from a multiple of it; sampled finely instead.
+    u = log.inputs["voltage"]
+    for w, t in enumerate(since):
+        for k in range(5):
+            fine = t + PERIOD * (k - 2 + (np.arange(4000) + 0.5) / 4000)
+            row = np.clip(np.searchsorted(log.time, fine, side="right") - 1, 0, None)
+            assert found[w, k, 0] == pytest.approx(u[row].mean(), abs=5e-3)
+
+
+def test_the_delay_stays_a_constant_and_the_past_is_carried() -> None:
+    system = behind_delay()
+    stepper = stepping(system, PERIOD)
+    assert stepper.parameters == system.parameters
+    assert [c.name for c in stepper.states[4:]] == ["voltage[-1]"]
+    assert stepping(pendulum(), PERIOD) == pendulum()
+    half = stepping(system, 0.01)
+    assert [c.name for c in half.states[4:]] == ["voltage[-1]", "voltage[-2]"]
+
+
+def test_transitions_are_the_machines_own(log: Log) -> None:
+    """Smoothed rows of a clean log obey the simulator with its delay."""
+    system = behind_delay()
+    stepper = stepping(system, PERIOD)
+    data, of = transitions([log, log], stepper, PERIOD)
+    count = data.count
+    assert len(of) == count
+    np.testing.assert_array_equal(of, np.repeat([0, 1], count // 2))
+    # The past input of a row is the action of the one before it.
+    half = count // 2
+    state, action, then = (
+        np.asarray(x)[:half] for x in (data.state, data.action, data.next_state)
+    )
+    np.testing.assert_allclose(state[1:, 4:], action[:-1], atol=1e-12)
+    np.testing.assert_allclose(then[:-1], state[1:], atol=1e-12)
+    np.testing.assert_allclose(then[:, 4:], action, atol=1e-12)
+    with jax.enable_x64(True):
+        tt = known(system).mean
+        step = jax.vmap(lambda s, a: stepper.transition(tt, s, a, PERIOD))
+        error = np.asarray(step(jnp.asarray(state), jnp.asarray(action)) - then)[:, :4]
+    rms, change = (
+        np.sqrt(np.mean(x**2, axis=0)) for x in (error, (then - state)[:, :4])
+    )
+    # What is left is the smoothing of 50 ms across switching inputs.
+    np.testing.assert_array_less(rms[:2], 0.05 * change[:2])
+    np.testing.assert_array_less(rms[2:], 0.15 * change[2:])
+
+
+def test_masked_samples_leave_no_transition(log: Log) -> None:
+    bad = {name: mask.copy() for name, mask in log.mask.items()}
+    bad["alpha"][300] = False
+    other = Log(log.name, log.source, log.time, log.channels, log.inputs, bad)
+    system = stepping(pendulum(), PERIOD)
+    whole, part = (transitions([x], system, PERIOD)[0].count for x in (log, other))
+    # A parabola spans 50 ms, a transition has two of them 20 ms apart.
+    assert whole - part in (3, 4)
+
+
+def test_rollouts_are_the_windows_forecasts(log: Log) -> None:
+    """At 20 ms with mean inputs, the point is the forecast at 2 ms."""
+    system = behind_delay()
+    grid = evaluation_windows([log], system, longest=0.2)
+    stepper = stepping(system, PERIOD)
+    steps = steps_of_grid(grid, [log], stepper, PERIOD, (5, 10))
+    posterior = known(system)
+    rows = np.asarray([steps_of(0.1), steps_of(0.2)])
+    fine = forecast(system, posterior, grid.windows, rows)
+    np.testing.assert_array_equal(steps.y, fine.mean - fine.error)
+    np.testing.assert_array_equal(steps.valid, fine.valid)
+    belief = frozen(stepper, posterior)
+    key = jax.random.key(0)
+    found = ensemble(belief, steps, np.zeros(4), draws=2, key=key)
+    np.testing.assert_allclose(found.point, fine.mean, atol=4e-3)
+    moved = np.abs(fine.mean - np.asarray(grid.windows.start)[:, None, :2])
+    assert moved.max() > 0.3
+
+
+@in_float64
+def frozen(stepper: Actuated | Furuta, prior: Gaussian, noise: float = 0.0):
+    """A simulator with its constants given, and a noise by hand."""
+    model = Sim2GP(stepper, dt=PERIOD, prior=prior, frozen=True)
+    belief = model.init(jax.random.key(0))
+    given = jnp.full(4, noise)
+    return type(belief)(
+        **{f: getattr(belief, f) for f in belief.__dataclass_fields__ if f != "noise"},
+        noise=given,
+    )
+
+
+def test_draws_spread_by_start_and_noise() -> None:
+    """Of a machine at rest: variances add up as a random walk's."""
+    system = pendulum()
+    with jax.enable_x64(True):
+        nominal = system.parameters.nominal()
+        theta = jnp.asarray([nominal[n] for n in system.parameters.names])
+        tt = system.parameters.unconstrain(theta)
+        prior = Gaussian(tt, 1e-9 * jnp.eye(tt.size))
+    W = 1500
+    windows = Steps(
+        np.zeros((W, 4)),
+        np.zeros((W, 1, 1)),
+        np.zeros((W, 1, 2)),
+        np.ones((W, 1, 2), bool),
+        np.zeros(W, int),
+        (1,),
+        (0, 1),
+    )
+    start_sd = np.asarray([0.03, 0.0, 0.0, 0.0])
+    belief = frozen(system, prior, noise=0.04)
+    key = jax.random.key(1)
+    found = ensemble(belief, windows, start_sd, draws=4, key=key)
+    np.testing.assert_allclose(found.point, 0.0, atol=1e-7)
+    sd = found.draws.std(axis=(0, 1))[0]
+    np.testing.assert_allclose(sd, [0.05, 0.04], rtol=0.06)
+    # Every draw has a start and a noise of its own.
+    assert (
+        abs(np.corrcoef(found.draws[0, :, 0, 0], found.draws[1, :, 0, 0])[0, 1]) < 0.1
+    )
+
+
+def test_given_constants_are_not_learned_twice() -> None:
+    """The noise alone is fitted: about the residuals' rms, whatever the prior's sd."""
+    system = pendulum()
+    rng = np.random.default_rng(0)
+    with jax.enable_x64(True):
+        nominal = system.parameters.nominal()
+        theta = jnp.asarray([nominal[n] for n in system.parameters.names])
+        tt = system.parameters.unconstrain(theta)
+        prior = Gaussian(tt, 0.01 * jnp.eye(tt.size))
+        S = jnp.asarray(rng.uniform(-1.0, 1.0, (300, 4)))
+        A = jnp.asarray(rng.uniform(-4.0, 4.0, (300, 1)))
+        off = tt + 0.3  # data of another machine: a fit would move there
+        then = jax.vmap(lambda s, a: system.transition(off, s, a, PERIOD))(S, A)
+        here = jax.vmap(lambda s, a: system.transition(tt, s, a, PERIOD))(S, A)
+    data = Transitions.of(np.asarray(S), np.asarray(A), np.asarray(then))
+    model = Sim2GP(system, dt=PERIOD, prior=prior, frozen=True)
+    belief = model.init(jax.random.key(0))
+    fitted = model.fit(belief, data, key=jax.random.key(0))
+    np.testing.assert_array_equal(fitted.posterior.mean, prior.mean)
+    np.testing.assert_array_equal(fitted.posterior.scale, prior.scale)
+    rms = np.sqrt(np.mean(np.asarray(then - here) ** 2, axis=0))
+    np.testing.assert_allclose(fitted.noise, rms, rtol=0.02)
+    assert int(fitted.count) == 300
+    gain = np.asarray(fitted.information)
+    assert not gain.any()
