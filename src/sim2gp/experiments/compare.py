@@ -32,8 +32,11 @@ from sim2gp.models.cutting import measured_states
 from sim2gp.models.forecast import inflation_of
 from sim2gp.models.grid import CURVE, PERIOD, Grid
 from sim2gp.models.stepping import (
+    Samples,
     Steps,
     ensemble,
+    samples_of,
+    smoothed_states,
     stepping,
     steps_of_grid,
     stride_of,
@@ -43,7 +46,6 @@ from sim2gp.models.windows import Windows, WindowsBelief, fit_windows
 from sim2gp.project import Project, load_project
 from sim2gp.runs import Progress, new_run
 from sim2gp.systems.base import AbstractSystem
-from sim2gp.transitions import Transitions
 
 HORIZONS = (0.2, 0.5)  # s
 STEP = 0.02  # s, the period of one-step models where the log's own is shorter
@@ -74,8 +76,7 @@ class Setup:
     grid: Grid
     stepper: AbstractSystem
     period: float
-    rows: Transitions
-    row_log: np.ndarray
+    samples: Samples  # to train what is learned
     steps: Steps  # to be judged by
     horizons: tuple[float, ...]  # s, in whole periods
     reach: dict[str, float]
@@ -128,7 +129,7 @@ def run(
             "period": setup.period,
             "folds": len(folds),
             "n_logs": len(set(recordings(setup.logs))),
-            "n_transitions": setup.rows.count,
+            "n_transitions": len(setup.samples.first),
             "units": {c.name: c.unit for c in found.system.physical_states},
         }
         summary["warnings"] += [str(note) for log in setup.logs for note in log.notes]
@@ -155,7 +156,8 @@ def prepare(
     grid = windows_for(logs, project, longest, longest)
     windows, of = cut_logs(project, logs)
     stepper = stepping(system, period)
-    rows, row_log = transitions(logs, stepper, period)
+    samples = samples_of(logs, stepper, period)
+    row_log = samples.step_log()
     curve = {round(h / period) for h in (*horizons, *CURVE) if h <= longest + 1e-9}
     steps = steps_of_grid(grid, logs, stepper, period, sorted(curve - {0}))
     for left in folds:
@@ -170,7 +172,7 @@ def prepare(
                 expected=f"stretches longer than the horizon of {longest:g} s",
                 fix="shorten --horizon, or record longer",
             )
-    reach = _reach(stepper, rows)
+    reach = _reach(stepper, samples)
     return Setup(
         project,
         logs,
@@ -179,8 +181,7 @@ def prepare(
         grid,
         stepper,
         period,
-        rows,
-        row_log,
+        samples,
         steps,
         tuple(horizons),
         reach,
@@ -200,10 +201,14 @@ def fold(
     """
     first, *keys = jax.random.split(key, 1 + len(models))
     belief = _fit(setup, left, first)
-    out, test = np.isin(setup.row_log, left), np.isin(setup.steps.log, left)
-    mask = np.asarray(setup.rows.mask)
-    train = eqx.tree_at(lambda t: t.mask, setup.rows, mask & ~out)
-    held = eqx.tree_at(lambda t: t.mask, setup.rows, mask & out)
+    out = np.isin(setup.samples.step_log(), left)
+    test = np.isin(setup.steps.log, left)
+    tt = belief.posterior.mean
+    rows = transitions(
+        setup.samples, smoothed_states(setup.project.system, tt, setup.samples)
+    )
+    train = eqx.tree_at(lambda t: t.mask, rows, ~out)
+    held = eqx.tree_at(lambda t: t.mask, rows, out)
     sim = Sim2GP(setup.stepper, dt=setup.period, prior=belief.posterior, frozen=True)
     start_sd = _start_sd(setup.grid.lag[~test])
     resolution = np.asarray(setup.windows.floor)
@@ -303,17 +308,22 @@ def _check_measured(
         )
 
 
-def _reach(stepper: AbstractSystem, rows: Transitions) -> dict[str, float]:
+def _reach(stepper: AbstractSystem, samples: Samples) -> dict[str, float]:
     """Half-widths of the box of states and inputs that have no limits, from the data.
 
     Angles keep their circle.
     """
-    seen = np.concatenate([np.asarray(rows.state), np.asarray(rows.action)], axis=1)
-    largest = REACH * np.max(np.abs(seen), axis=0)
-    channels = (*stepper.states, *stepper.actions)
+    past = samples.held[:, ::-1].reshape(len(samples.held), -1)
+    # Newest first: the action itself, then what the state carries of the past.
+    m = len(stepper.actions)
+    largest = [
+        *np.max(np.abs(samples.rough), axis=0),
+        *np.max(np.abs(past[:, m:]), axis=0),
+        *np.max(np.abs(past[:, :m]), axis=0),
+    ]
     return {
-        c.name: float(half)
-        for c, half in zip(channels, largest, strict=True)
+        c.name: REACH * float(half)
+        for c, half in zip((*stepper.states, *stepper.actions), largest, strict=True)
         if not (c.angle or math.isfinite(c.high - c.low)) and half > 0.0
     }
 

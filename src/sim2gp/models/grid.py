@@ -124,13 +124,6 @@ def slopes(
     return value, slope
 
 
-def smoothed(
-    y: Float[np.ndarray, "N c"], states: Sequence[str], measured: Sequence[str]
-) -> Float[np.ndarray, "N n"]:
-    """Every sample's state by centred parabolas; NaN where one lacks a sample."""
-    return _states(y, states, measured)[1]
-
-
 def _starts(valid: Bool[np.ndarray, "N c"]) -> Int[np.ndarray, " W"]:
     """Samples at multiples of 0.1 s with a whole past and some future."""
     every = steps_of(SPACING)

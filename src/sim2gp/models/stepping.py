@@ -1,12 +1,15 @@
 """Logs for models of one step: an even period, smoothed states, mean inputs.
 
 A model of one step, ``s' = f(s, a)``, cannot read a log directly: its rows come at the
-log's own stamps, velocities are not measured, inputs change within a step. Here the
-states are the values and slopes of parabolas through 50 ms of samples, centred on the
-sample (a Savitzky-Golay filter), taken every ``period`` seconds, and the input of a
-step is the mean of the held one. A delay stays in the machine: the state then carries
+log's own stamps, velocities are not measured, inputs change within a step. Here a state
+is found every ``period`` seconds from the 50 ms of samples around it, and the input of
+a step is the mean of the held one. A delay stays in the machine: the state then carries
 the inputs of past steps (`Actuated`). The windows to be judged by are those of
 `sim2gp.models.grid`, and start as those do, from the past alone.
+
+The parabola through 50 ms of a fast swing is off by its third derivative, which a model
+of one step would learn as physics. So the parabola is taken of what a simulation of the
+same 50 ms leaves, started where the parabolas say; thrice, as the start improves.
 """
 
 from collections.abc import Sequence
@@ -20,12 +23,15 @@ from jaxtyping import Key as KeyArray
 
 from sim2gp.logs import Log
 from sim2gp.models.base import AbstractBelief
-from sim2gp.models.cutting import knots_of, measured_states
-from sim2gp.models.grid import PERIOD, Grid, on_grid, smoothed
+from sim2gp.models.cutting import inputs_since, knots_of, measured_states
+from sim2gp.models.grid import ORDER, PERIOD, SAMPLES, Grid, on_grid
+from sim2gp.models.windows import Windows, simulate
 from sim2gp.systems.actuator import Actuated
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.transitions import Transitions
 from sim2gp.types import Action, Dynamics, Key, State, in_float64
+
+PASSES = 3  # simulations behind a smoothed state
 
 
 def stepping(system: AbstractSystem, period: float) -> AbstractSystem:
@@ -63,39 +69,147 @@ def stride_of(period: float) -> int:
     return max(1, round(period / PERIOD))
 
 
-def transitions(
-    logs: Sequence[Log], system: AbstractSystem, period: float
-) -> tuple[Transitions, Int[np.ndarray, " N"]]:
-    """All smoothed transitions of the logs, and the log of each.
+class Samples(eqx.Module):
+    """The samples around every state that is wanted, and the steps between states.
 
-    ``system`` is what `stepping` returns. A transition counts where no sample under
-    its two parabolas is masked.
+    windows: 50 ms about each state, rows as in a forecast; the start is a parabola's.
+    rough: the state by parabolas alone. log: of each state.
+    first: of each step, the index of its state; the next state is one index on.
+    held: of each step, the mean inputs of the past ones and its own, oldest first.
     """
-    names = [channel.name for channel in system.physical_states]
-    actions = [channel.name for channel in system.actions]
-    measured = measured_states(logs, system)
-    stride, past = stride_of(period), system.history
-    parts, which = [], []
+
+    windows: Windows
+    rough: Float[np.ndarray, "N n"]
+    log: Int[np.ndarray, " N"]
+    first: Int[np.ndarray, " M"]
+    held: Float[np.ndarray, "M past1 m"]
+
+    def step_log(self) -> Int[np.ndarray, " M"]:
+        """The log of each step."""
+        return self.log[self.first]
+
+
+def samples_of(logs: Sequence[Log], stepper: AbstractSystem, period: float) -> Samples:
+    """All states and steps of the logs for which no sample of their 50 ms is masked.
+
+    ``stepper`` is what `stepping` returns.
+    """
+    names = [channel.name for channel in stepper.physical_states]
+    actions = [channel.name for channel in stepper.actions]
+    measured = measured_states(logs, stepper)
+    stride, half = stride_of(period), SAMPLES // 2
+    near, spans, which, first, held = [], [], [], [], []
     for k, log in enumerate(logs):
         y, valid = on_grid(log, measured)
-        states = smoothed(np.where(valid, y, np.nan), names, measured)
-        rows = np.arange(0, len(y) - stride, stride)
-        whole = np.isfinite(states).all(axis=1)
-        rows = rows[whole[rows] & whole[rows + stride]]
-        held = mean_inputs(log, actions, log.time[0] + PERIOD * rows, period, past, 1)
-        before = held[:, :past][:, ::-1].reshape(len(rows), -1)
-        after = held[:, 1:][:, ::-1].reshape(len(rows), -1)
-        now, then = states[rows], states[rows + stride]
-        parts.append(
-            (
-                np.concatenate([now, before], axis=1),
-                held[:, past],
-                np.concatenate([then, after], axis=1),
-            )
+        at = np.arange(-(-half // stride) * stride, len(y) - half, stride)
+        around = at[:, None] + np.arange(-half, half + 1)[None]
+        whole = valid[around].all(axis=(1, 2))
+        at, around = at[whole], around[whole]
+        follows = np.flatnonzero(np.diff(at) == stride)
+        first.append(sum(map(len, which)) + follows)
+        since = log.time[0] + PERIOD * at
+        held.append(
+            mean_inputs(log, actions, since[follows], period, stepper.history, 1)
         )
-        which.append(np.full(len(rows), k))
-    state, action, then = (np.concatenate(x) for x in zip(*parts, strict=True))
-    return Transitions.of(state, action, then), np.concatenate(which)
+        near.append(y[around])
+        which.append(np.full(len(at), k))
+        spans += [(k, float(s) - PERIOD * half, 2 * PERIOD * half) for s in since]
+    y = np.concatenate(near)
+    knots_by_log = [knots_of(log, actions, stepper.longest_delay) for log in logs]
+    knots, area = inputs_since(knots_by_log, spans, stepper.longest_delay)
+    span = np.full(y.shape[:2], PERIOD)
+    span[:, 0] = 0.0
+    local = _parabolas(y)
+    start = _state(local, -PERIOD * half, names, measured)
+    windows = Windows(
+        y,
+        np.ones(y.shape, bool),
+        span,
+        knots,
+        area,
+        start,
+        np.zeros_like(start),
+        np.zeros(len(measured)),
+        tuple(names.index(name) for name in measured),
+    )
+    return Samples(
+        windows,
+        _state(local, 0.0, names, measured),
+        np.concatenate(which),
+        np.concatenate(first),
+        np.concatenate(held),
+    )
+
+
+@in_float64
+def smoothed_states(
+    system: AbstractSystem, tt: Float[Array, " p"], samples: Samples
+) -> Float[np.ndarray, "N n"]:
+    """The states in the middle of their samples, by simulation and parabola.
+
+    ``system`` and its virtual constants ``tt`` are those of the windows' fit.
+    """
+    names = [channel.name for channel in system.physical_states]
+    w = samples.windows
+    measured = [names[i] for i in w.outputs]
+    start, y, half = w.start, np.asarray(w.y), SAMPLES // 2
+    exact = jax.tree.map(jnp.asarray, w)
+    for _ in range(PASSES):
+        path = np.asarray(_simulated(system, tt, exact, jnp.asarray(start)))
+        left = _parabolas(y - path[..., list(w.outputs)])
+        start = start + _state(left, -PERIOD * half, names, measured)
+        states = path[:, half] + _state(left, 0.0, names, measured)
+    return np.asarray(states)
+
+
+@eqx.filter_jit
+def _simulated(
+    system: AbstractSystem, tt: Array, windows: Windows, start: Float[Array, "N n"]
+) -> Float[Array, "N L n"]:
+    params = system.record(system.parameters.values(tt))
+    found: Array = windows.each(
+        lambda window, x0: simulate(system, params, window, x0), start
+    )
+    return found
+
+
+def transitions(samples: Samples, states: Float[np.ndarray, "N n"]) -> Transitions:
+    """One-step data between the given states, past inputs carried newest first."""
+    now, then = states[samples.first], states[samples.first + 1]
+    held, count = samples.held, len(samples.first)
+    before = held[:, :-1][:, ::-1].reshape(count, -1)
+    after = held[:, 1:][:, ::-1].reshape(count, -1)
+    return Transitions.of(
+        np.concatenate([now, before], axis=1),
+        held[:, -1],
+        np.concatenate([then, after], axis=1),
+    )
+
+
+def _parabolas(y: Float[np.ndarray, "N L c"]) -> Float[np.ndarray, "N 3 c"]:
+    """Coefficients of the parabola through each window, time from its middle."""
+    half = SAMPLES // 2
+    age = PERIOD * np.arange(-half, half + 1)
+    weights = np.linalg.pinv(np.vander(age, ORDER + 1, increasing=True))
+    return np.asarray(np.einsum("kl,nlc->nkc", weights, y))
+
+
+def _state(
+    local: Float[np.ndarray, "N 3 c"],
+    t: float,
+    names: Sequence[str],
+    measured: Sequence[str],
+) -> Float[np.ndarray, "N n"]:
+    """The state at ``t`` by parabolas: values, and slopes for unmeasured velocities."""
+    value = local[:, 0] + t * (local[:, 1] + t * local[:, 2])
+    slope = local[:, 1] + 2.0 * t * local[:, 2]
+    out = np.zeros((len(local), len(names)))
+    for i, name in enumerate(names):
+        if name in measured:
+            out[:, i] = value[:, measured.index(name)]
+        elif name.removesuffix(".velocity") in measured:
+            out[:, i] = slope[:, measured.index(name.removesuffix(".velocity"))]
+    return out
 
 
 def steps_of_grid(
