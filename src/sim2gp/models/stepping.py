@@ -98,7 +98,8 @@ def samples_of(logs: Sequence[Log], stepper: AbstractSystem, period: float) -> S
     actions = [channel.name for channel in stepper.actions]
     measured = measured_states(logs, stepper)
     stride, half = stride_of(period), SAMPLES // 2
-    near, spans, which, first, held = [], [], [], [], []
+    parts: list[tuple[np.ndarray, ...]] = []
+    spans: list[tuple[int, float, float]] = []
     for k, log in enumerate(logs):
         y, valid = on_grid(log, measured)
         at = np.arange(-(-half // stride) * stride, len(y) - half, stride)
@@ -106,15 +107,12 @@ def samples_of(logs: Sequence[Log], stepper: AbstractSystem, period: float) -> S
         whole = valid[around].all(axis=(1, 2))
         at, around = at[whole], around[whole]
         follows = np.flatnonzero(np.diff(at) == stride)
-        first.append(sum(map(len, which)) + follows)
         since = log.time[0] + PERIOD * at
-        held.append(
-            mean_inputs(log, actions, since[follows], period, stepper.history, 1)
-        )
-        near.append(y[around])
-        which.append(np.full(len(at), k))
+        inputs = since[follows], period, stepper.history, 1
+        held = mean_inputs(log, actions, *inputs)
+        parts.append((y[around], np.full(len(at), k), len(spans) + follows, held))
         spans += [(k, float(s) - PERIOD * half, 2 * PERIOD * half) for s in since]
-    y = np.concatenate(near)
+    y, which, first, held = (np.concatenate(x) for x in zip(*parts, strict=True))
     knots_by_log = [knots_of(log, actions, stepper.longest_delay) for log in logs]
     knots, area = inputs_since(knots_by_log, spans, stepper.longest_delay)
     span = np.full(y.shape[:2], PERIOD)
@@ -135,9 +133,9 @@ def samples_of(logs: Sequence[Log], stepper: AbstractSystem, period: float) -> S
     return Samples(
         windows,
         _state(local, 0.0, names, measured),
-        np.concatenate(which),
-        np.concatenate(first),
-        np.concatenate(held),
+        which,
+        first,
+        held,
     )
 
 
@@ -309,8 +307,8 @@ def _ensemble(
     steps: tuple[int, ...],
     outputs: tuple[int, ...],
 ) -> tuple[Array, Array]:
-    noise = belief.noise.astype(jnp.float32)  # type: ignore[attr-defined]
-    d, at = noise.size, np.asarray(steps) - 1
+    noise = belief.noise.astype(jnp.float32)[None, None]  # type: ignore[attr-defined]
+    (W, K, _), d, at = action.shape, noise.size, np.asarray(steps) - 1
 
     def rolled(f: Dynamics, s: State, actions: Array, noises: Array) -> Array:
         def step(s: State, row: tuple[Action, Array]) -> tuple[State, State]:
@@ -322,14 +320,21 @@ def _ensemble(
         states = jax.lax.scan(step, s, (actions, noises))[1]
         return states[at][:, np.asarray(outputs)]
 
-    every = jax.vmap(rolled, in_axes=(None, 0, 0, 0))
-    shape = (*action.shape[:2], d)
+    def one(each: tuple[Dynamics, Array, Array]) -> Array:
+        f, key, spread = each  # the point has no spread
+        begin, process = jax.random.split(key)
+        starts = spread * start_sd[None] * jax.random.normal(begin, (W, d), jnp.float32)
+        steps = spread * noise * jax.random.normal(process, (W, K, d), jnp.float32)
+        every = jax.vmap(lambda s, a, e: rolled(f, s, a, e))
+        return every(start.at[:, :d].add(starts), action, steps)
 
-    def one(key: Key) -> Array:
-        function, begin, process = jax.random.split(key, 3)
-        e = jax.random.normal(begin, (len(start), d), jnp.float32) * start_sd[None]
-        steps = jax.random.normal(process, shape, jnp.float32) * noise[None, None]
-        return every(belief.sample(function), start.at[:, :d].add(e), action, steps)
-
-    point = every(belief.point(), start, action, jnp.zeros(shape, jnp.float32))
-    return point, jax.lax.map(one, keys)
+    function, own = jax.vmap(jax.random.split, out_axes=1)(keys)
+    # The point stands first among the draws: one rollout is compiled, not two.
+    functions = jax.tree.map(
+        lambda point, drawn: jnp.concatenate([point[None], drawn]),
+        belief.point(),
+        jax.vmap(belief.sample)(function),
+    )
+    spread = jnp.ones(len(keys) + 1, jnp.float32).at[0].set(0.0)
+    found = jax.lax.map(one, (functions, jnp.concatenate([own[:1], own]), spread))
+    return found[0], found[1:]
