@@ -18,11 +18,13 @@ from sim2gp.systems import Perturbed, UniformRodArm
 from sim2gp.systems.effects import Spring
 
 QUIET = Progress(quiet=True)
-#: The simulator and one learned model: each model more is half a minute of compiling.
+#: The simulator and one learned model: each model more is half a minute of compiling,
+#: and so is a box of its own for each of the two arms.
+BOX = {"q1.velocity": 12.0, "q2.velocity": 20.0}
 SOME: compare.Makers = {
     "SIM2GP": compare.MODELS["SIM2GP"],
     "RES-FS": lambda sim, reach: ResidualFunctionSpace(
-        sim, hidden=(32, 32), steps=900, reach=reach
+        sim, hidden=(32, 32), steps=900, reach=BOX
     ),
 }
 SPRINGS = {"q1.spring": 2.0, "q2.spring": 1.0}  # N m/rad
@@ -210,6 +212,10 @@ def test_one_recording_leaves_out_its_last_quarter(folder: Path) -> None:
     setup, folds = compare.prepare(found, logs, (0.2,))
     assert [log.name for log in setup.logs] == ["log0", "log0, last quarter"]
     assert folds == [[1]]
+    # The box of states without limits holds all that was seen.
+    assert list(setup.reach) == list(BOX)
+    seen = np.abs(setup.samples.rough[:, 2:]).max(axis=0)
+    np.testing.assert_allclose(list(setup.reach.values()), 1.2 * seen)
     before, after = setup.logs
     assert len(before) + len(after) == len(logs[0])
     assert before.time[-1] < after.time[0]

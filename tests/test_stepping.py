@@ -1,5 +1,6 @@
 """Logs at an even period: inputs, states and rollouts, each computed another way."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,8 +8,8 @@ import pytest
 
 from sim2gp.gaussian import Gaussian
 from sim2gp.logs import Log
-from sim2gp.models import Sim2GP
-from sim2gp.models.forecast import forecast
+from sim2gp.models import Sim2GP, Sim2GPBelief
+from sim2gp.models.base import AbstractBelief
 from sim2gp.models.grid import evaluation_windows, steps_of
 from sim2gp.models.stepping import (
     Steps,
@@ -20,9 +21,10 @@ from sim2gp.models.stepping import (
     steps_of_grid,
     transitions,
 )
-from sim2gp.systems import Actuated, Furuta, actuator_prior
+from sim2gp.models.windows import Windows, simulate
+from sim2gp.systems import AbstractSystem, Actuated, Furuta, actuator_prior
 from sim2gp.transitions import Transitions
-from sim2gp.types import in_float64
+from sim2gp.types import Dynamics, in_float64
 from simulated_logs import pendulum, simulated
 
 PERIOD = 0.02
@@ -141,58 +143,91 @@ def test_rollouts_are_the_windows_forecasts(log: Log) -> None:
     steps = steps_of_grid(grid, [log], stepper, PERIOD, (5, 10))
     posterior = known(system)
     rows = np.asarray([steps_of(0.1), steps_of(0.2)])
-    fine = forecast(system, posterior, grid.windows, rows)
-    np.testing.assert_array_equal(steps.y, fine.mean - fine.error)
-    np.testing.assert_array_equal(steps.valid, fine.valid)
+    fine = simulated_at(system, posterior, grid.windows, rows)
+    np.testing.assert_array_equal(steps.y, np.asarray(grid.windows.y)[:, rows])
+    np.testing.assert_array_equal(steps.valid, np.asarray(grid.windows.mask)[:, rows])
     belief = frozen(stepper, posterior)
     key = jax.random.key(0)
     found = ensemble(belief, steps, np.zeros(4), draws=2, key=key)
-    np.testing.assert_allclose(found.point, fine.mean, atol=4e-3)
-    moved = np.abs(fine.mean - np.asarray(grid.windows.start)[:, None, :2])
+    np.testing.assert_allclose(found.point, fine, atol=4e-3)
+    moved = np.abs(fine - np.asarray(grid.windows.start)[:, None, :2])
     assert moved.max() > 0.3
 
 
 @in_float64
-def frozen(stepper: Actuated | Furuta, prior: Gaussian, noise: float = 0.0):
-    """A simulator with its constants given, and a noise by hand."""
-    model = Sim2GP(stepper, dt=PERIOD, prior=prior, frozen=True)
-    belief = model.init(jax.random.key(0))
-    given = jnp.full(4, noise)
-    return type(belief)(
-        **{f: getattr(belief, f) for f in belief.__dataclass_fields__ if f != "noise"},
-        noise=given,
+def simulated_at(
+    system: Actuated, posterior: Gaussian, windows: Windows, rows: np.ndarray
+) -> np.ndarray:
+    """Angles at rows of the grid, every window at 2 ms under the recorded inputs."""
+    params = system.record(system.parameters.values(posterior.mean))
+    exact = jax.tree.map(jnp.asarray, windows)
+    run = jax.jit(
+        lambda w: w.each(lambda one: simulate(system, params, one, one.start))
     )
+    return np.asarray(run(exact))[:, rows, :2]
 
 
-def test_draws_spread_by_start_and_noise() -> None:
-    """Of a machine at rest: variances add up as a random walk's."""
-    system = pendulum()
-    with jax.enable_x64(True):
-        nominal = system.parameters.nominal()
-        theta = jnp.asarray([nominal[n] for n in system.parameters.names])
-        tt = system.parameters.unconstrain(theta)
-        prior = Gaussian(tt, 1e-9 * jnp.eye(tt.size))
+@in_float64
+def frozen(stepper: AbstractSystem, prior: Gaussian) -> Sim2GPBelief:
+    """A simulator with its constants given, and no noise."""
+    belief = Sim2GP(stepper, dt=PERIOD, prior=prior).init(jax.random.key(0))
+    return eqx.tree_at(lambda b: b.noise, belief, jnp.zeros(4))
+
+
+class Standing(AbstractBelief):
+    """A machine that stays where it is but for the noise of a step."""
+
+    noise: jax.Array
+
+    def point(self) -> Dynamics:
+        return Stays(jnp.zeros((), jnp.float32))
+
+    def sample(self, key: jax.Array) -> Dynamics:
+        return Stays(0.1 * jax.random.normal(key, (), jnp.float32))
+
+    def latent(self, s: jax.Array, a: jax.Array) -> Gaussian:
+        raise AssertionError("not of interest here")
+
+    predict = information_gain = latent
+    trajectory_information_gain = latent
+
+
+class Stays(eqx.Module):
+    """A draw: where it is, moved by a constant of its own."""
+
+    off: jax.Array
+
+    def __call__(self, s: jax.Array, a: jax.Array) -> jax.Array:
+        return s + self.off * jnp.asarray([0.0, 0.0, 1.0, 0.0], jnp.float32)
+
+
+def test_draws_spread_by_function_start_and_noise() -> None:
+    """Variances add up as a random walk's; a draw's function is one for all windows."""
     W = 1500
     windows = Steps(
         np.zeros((W, 4)),
-        np.zeros((W, 1, 1)),
-        np.zeros((W, 1, 2)),
-        np.ones((W, 1, 2), bool),
+        np.zeros((W, 4, 1)),
+        np.zeros((W, 2, 3)),
+        np.ones((W, 2, 3), bool),
         np.zeros(W, int),
-        (1,),
-        (0, 1),
+        (1, 4),
+        (0, 1, 2),
     )
     start_sd = np.asarray([0.03, 0.0, 0.0, 0.0])
-    belief = frozen(system, prior, noise=0.04)
-    key = jax.random.key(1)
-    found = ensemble(belief, windows, start_sd, draws=4, key=key)
-    np.testing.assert_allclose(found.point, 0.0, atol=1e-7)
-    sd = found.draws.std(axis=(0, 1))[0]
-    np.testing.assert_allclose(sd, [0.05, 0.04], rtol=0.06)
-    # Every draw has a start and a noise of its own.
-    assert (
-        abs(np.corrcoef(found.draws[0, :, 0, 0], found.draws[1, :, 0, 0])[0, 1]) < 0.1
-    )
+    with jax.enable_x64(True):
+        belief = Standing(jnp.asarray([0.04, 0.04, 0.0, 0.0]))
+    found = ensemble(belief, windows, start_sd, draws=4, key=jax.random.key(1))
+    np.testing.assert_array_equal(found.point, 0.0)
+    sd = found.draws.std(axis=(0, 1))
+    np.testing.assert_allclose(sd[0, :2], [0.05, 0.04], rtol=0.05)
+    np.testing.assert_allclose(sd[1, :2], [np.hypot(0.03, 0.08), 0.08], rtol=0.05)
+    # Every draw and window has a start and a noise of its own.
+    one, other = found.draws[:2, :, 0, 0]
+    assert abs(np.corrcoef(one, other)[0, 1]) < 0.1
+    assert np.ptp(found.draws[:, :, 0, 2], axis=1).max() == 0.0
+    off = found.draws[:, 0, 0, 2]
+    assert len(set(off)) == 4
+    np.testing.assert_allclose(found.draws[:, 0, 1, 2], 4.0 * off, rtol=1e-5)
 
 
 def test_given_constants_are_not_learned_twice() -> None:
