@@ -38,8 +38,9 @@ lint: $(VENV)/.test
 types: $(VENV)/.test
 	$(BIN)/mypy
 
+# Two processes, whole files each: what a file compiles is compiled once.
 unit: $(VENV)/.test
-	$(BIN)/python -m pytest -m "not nightly" $(ARGS)
+	$(BIN)/python -m pytest -m "not nightly" -n 2 --dist loadfile $(ARGS)
 
 nightly: $(VENV)/.test
 	$(BIN)/python -m pytest -m nightly $(ARGS)
