@@ -4,6 +4,7 @@ float64 is never switched on here: the library scopes it, and the tests must see
 user sees. Shapes and types are checked by jaxtyping and beartype (pyproject.toml).
 """
 
+import gc
 import itertools
 import os
 import sys
@@ -39,6 +40,21 @@ sys.addaudithook(refuse)
 hypothesis.settings.register_profile("unit", deadline=None, derandomize=True)
 hypothesis.settings.register_profile("nightly", deadline=None, max_examples=2000)
 hypothesis.settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "unit"))
+
+
+#: Linux gives a process 65,530 memory maps by default, and compiled code takes several
+#: each: XLA crashes inside a compilation when they run out.
+MAPS = Path("/proc/self/maps")
+MANY_MAPS = 30_000
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_memory_maps() -> Iterator[None]:
+    """Forget compiled code between files, once there is much of it."""
+    yield
+    if MAPS.exists() and MAPS.read_bytes().count(b"\n") > MANY_MAPS:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture
