@@ -11,7 +11,7 @@ from collections.abc import Iterator
 LAYERS: tuple[frozenset[str], ...] = (
     frozenset(
         "types errors gaussian least_squares arrowhead laplace parameters "
-        "transitions".split()
+        "transitions ahead".split()
     ),
     frozenset({"systems", "logs"}),
     frozenset({"models", "tasks", "planning"}),
@@ -27,6 +27,7 @@ SIBLINGS: frozenset[tuple[str, str]] = frozenset(
         ("cli", "experiments"),
         ("cli", "report"),
         ("experiments", "report"),
+        ("ahead", "types"),
         ("gaussian", "types"),
         ("gaussian", "errors"),
         ("parameters", "types"),

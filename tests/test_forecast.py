@@ -11,7 +11,13 @@ from oracles import log_protocol as protocol
 from oracles import plain_least_squares as plain
 from sim2gp.gaussian import Gaussian
 from sim2gp.logs import Log
-from sim2gp.models.forecast import Band, fit_band, forecast
+from sim2gp.models.forecast import (
+    Band,
+    _forecast,
+    compile_forecast,
+    fit_band,
+    forecast,
+)
 from sim2gp.models.grid import CURVE, evaluation_windows, slopes, steps_of
 from sim2gp.systems import TwoLink
 from sim2gp.types import in_float64
@@ -114,6 +120,21 @@ def test_slopes_know_the_past_alone() -> None:
     t = 0.002 * np.arange(80)[:, None]
     _, centred = slopes(1.0 + 3.0 * t - 4.0 * t**2, causal=False)
     np.testing.assert_allclose(centred[12:-12], 3.0 - 8.0 * t[12:-12], rtol=1e-9)
+
+
+def test_a_forecast_compiled_in_advance_is_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    system = arm(NUMBERS)
+    windows = evaluation_windows([moved(2)], system, longest=0.2).windows
+    belief, rows = certain(system, NUMBERS[5]), np.asarray([50])
+    plain = forecast(system, belief, windows, rows)
+    compile_forecast(system, windows)
+    forecast(system, belief, windows, rows)
+    monkeypatch.setattr(_forecast, "_jitted", None)  # nothing is left to compile with
+    again = forecast(system, belief, windows, rows)
+    np.testing.assert_array_equal(again.mean, plain.mean)
+    np.testing.assert_array_equal(again.by_constants, plain.by_constants)
 
 
 def test_sensitivities_are_differences() -> None:

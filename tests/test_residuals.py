@@ -19,7 +19,13 @@ from sim2gp.diagnose.residuals import (
 from sim2gp.gaussian import Gaussian
 from sim2gp.models import Sim2GP
 from sim2gp.models.cutting import cut
-from sim2gp.models.windows import Windows, WindowsBelief
+from sim2gp.models.windows import (
+    Windows,
+    WindowsBelief,
+    _linearise,
+    compile_linearise,
+    linearise,
+)
 from sim2gp.systems import Channel, Furuta
 from sim2gp.types import in_float64
 from simulated_logs import pendulum, simulated
@@ -93,6 +99,20 @@ def test_one_step_rows_with_noisy_states_are_named() -> None:
     assert found.tests["ljung_box"].alarm
     assert "sensor noise on the states" in found.verdict
     assert "likelihood.window" in found.verdict
+
+
+def test_windows_compiled_in_advance_are_linearised_alike(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    log = simulated(seconds=0.6, seed=1, noise=1e-4, velocities=True)
+    windows, _ = cut([log], pendulum(), window=0.1)
+    fitted = at_the_truth(windows, 1e-4, windows.start)
+    plain = linearise(fitted, windows, fitted.posterior.mean)
+    compile_linearise(fitted.system, windows)
+    linearise(fitted, windows, fitted.posterior.mean)
+    monkeypatch.setattr(_linearise, "_jitted", None)  # nothing is left to compile with
+    again = linearise(fitted, windows, fitted.posterior.mean)
+    jax.tree.map(np.testing.assert_array_equal, again, plain)
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.01])

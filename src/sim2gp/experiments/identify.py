@@ -27,9 +27,15 @@ from sim2gp.experiments.prediction import (
 )
 from sim2gp.experiments.record import provenance
 from sim2gp.logs import Log
-from sim2gp.models.forecast import Band, fit_band, forecast
+from sim2gp.models.forecast import Band, compile_forecast, fit_band, forecast
 from sim2gp.models.grid import CURVE, Grid, evaluation_windows
-from sim2gp.models.windows import Windows, WindowsBelief, fit_windows, information_at
+from sim2gp.models.windows import (
+    Windows,
+    WindowsBelief,
+    compile_linearise,
+    fit_windows,
+    information_at,
+)
 from sim2gp.project import Project, load_project
 from sim2gp.runs import Progress, new_run
 
@@ -46,9 +52,11 @@ def run(project: Path, *, out: Path, seed: int, progress: Progress) -> dict[str,
         task.advance(f"{len(windows)} windows")
         key = jax.random.key(seed)
         robust = found.spec.likelihood.robust
+        grid = evaluation_windows(logs, found.system, longest=CURVE[-1])
+        compile_forecast(found.system, grid.windows)
+        compile_linearise(found.system, windows)
         belief = fit_windows(found.system, windows, key=key, robust=robust)
         task.advance("posterior")
-        grid = evaluation_windows(logs, found.system, longest=CURVE[-1])
         band = band_of(belief, grid, logs)
         names = channels(found.system, windows)
         picture = drawn(found.system, belief.posterior, band, grid)

@@ -29,6 +29,7 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Array, Bool, Float
 
+from sim2gp.ahead import ahead
 from sim2gp.gaussian import LOG_2PI, Gaussian
 from sim2gp.models.grid import Grid
 from sim2gp.models.linearized import value_and_jacobian
@@ -94,7 +95,14 @@ def forecast(
     return Forecast(mean, mean - y, valid, by_start, by_input, by_constants, at)
 
 
-@eqx.filter_jit
+@in_float64
+def compile_forecast(system: AbstractSystem, windows: Windows) -> None:
+    """Start to compile `forecast` for windows like these and a posterior to come."""
+    prior = system.parameters.prior()
+    _forecast.compile_for(system, prior, _some(windows, np.zeros(_BATCH, int)))
+
+
+@ahead
 def _forecast(
     system: AbstractSystem, posterior: Gaussian, windows: Windows
 ) -> tuple[Array, Array, Array, Array]:

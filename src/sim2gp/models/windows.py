@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from sim2gp.ahead import ahead
 from sim2gp.arrowhead import Blocks, Noise, eliminate
 from sim2gp.gaussian import LOG_2PI, Gaussian
 from sim2gp.laplace import AbstractLikelihood, Fit, expectation, multi_start
@@ -243,14 +244,27 @@ def linearise(
 ) -> Linearised:
     """The windows' simulation at virtual values ``tt``, and its derivatives."""
     exact = jax.tree.map(jnp.asarray, windows)
-    return _linearise(belief, exact, jnp.asarray(tt, float))
+    start = jnp.asarray(belief.starts)
+    return _linearise(belief.system, belief.prior, exact, start, jnp.asarray(tt, float))
 
 
-@eqx.filter_jit
+@in_float64
+def compile_linearise(system: AbstractSystem, windows: Windows) -> None:
+    """Start to compile `linearise` for windows like these and a belief to come."""
+    prior = system.parameters.prior()
+    exact = jax.tree.map(jnp.asarray, windows)
+    _linearise.compile_for(system, prior, exact, exact.start, prior.mean)
+
+
+@ahead
 def _linearise(
-    belief: WindowsBelief, windows: Windows, tt: Float[Array, " p"]
+    system: AbstractSystem,
+    prior: Gaussian,
+    windows: Windows,
+    starts: Float[Array, "W n"],
+    tt: Float[Array, " p"],
 ) -> Linearised:
-    system, prior, n = belief.system, belief.prior, windows.start.shape[1]
+    n = windows.start.shape[1]
 
     def rows(x: Array) -> tuple[Array, ...]:
         params = system.record(system.parameters.values(tt + prior.scale @ x[:-n]))
@@ -261,7 +275,7 @@ def _linearise(
             u = inputs_of(window, system.delays(params))
             return jnp.where(window.mask, r, 0.0), states, u
 
-        found: tuple[Array, ...] = windows.each(one, belief.starts)
+        found: tuple[Array, ...] = windows.each(one, starts)
         return found
 
     # One column after the other: the code of a single one takes a third of the time to

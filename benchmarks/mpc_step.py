@@ -1,0 +1,108 @@
+"""What one planned action costs, by the model whose draw it is planned in.
+
+    python benchmarks/mpc_step.py [--steps N]
+
+iCEM with 128 sequences, 30 steps ahead, 4 rounds, on the Furuta; the worlds take turns
+in one run, so that ratios hold on a busy machine too. Each model was fitted to one
+episode of random input. Medians over steps, without compilation.
+"""
+
+import argparse
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sim2gp.flight import oracle_world, world_of
+from sim2gp.models import NLM, FunctionSpace, Residual, ResidualFunctionSpace, Sim2GP
+from sim2gp.planning import MPC, MarkovObjective, World
+from sim2gp.planning.icem import ICEM
+from sim2gp.planning.noise import coloured_noise
+from sim2gp.systems import Furuta
+from sim2gp.tasks import Task, furuta_swingup
+from sim2gp.transitions import Transitions
+
+SIMULATOR, LINEAR = "plain simulator", "SIM2GP"
+PLANNER = MPC(update=ICEM(samples=128, iterations=4), horizon=30)
+#: The project's goals: neural draws, and linearised draws beside the simulator.
+MILLISECONDS, TIMES = 25.0, 3.0
+
+
+def random_data(task: Task) -> Transitions:
+    """One episode of coloured noise over half the input's range."""
+    key = jax.random.key(0)
+    shape = jnp.zeros((task.horizon, 1), jnp.float32)
+    A = task.limit(0.5 * task.actions.high * coloured_noise(key, 1, shape, 1.0)[0])
+
+    def step(s: Any, row: Any) -> Any:
+        a, k = row
+        s2 = task.step(s, a, key=k)
+        return s2, (s, a, s2)
+
+    keys = jax.random.split(key, task.horizon)
+    rows = jax.jit(lambda: jax.lax.scan(step, task.reset(key), (A, keys))[1])()
+    data = Transitions.empty(task.horizon, task.size, 1)
+    return data.extend(*(np.asarray(x, float) for x in rows))
+
+
+def worlds(task: Task) -> dict[str, World]:
+    """A draw of each fitted model as a world, beside the simulator itself."""
+    system, data, key = Furuta(), random_data(task), jax.random.key(1)
+    sim = Sim2GP(system)
+    models = {
+        LINEAR: sim,
+        "NLM": NLM(system),
+        "RES": Residual(sim),
+        "FS": FunctionSpace(sim),
+        "RES-FS": ResidualFunctionSpace(sim),
+    }
+    found = {SIMULATOR: oracle_world(task)}
+    for name, model in models.items():
+        belief = model.fit(model.init(key), data, key=key)
+        objective = MarkovObjective(task.reward)
+        found[name] = world_of(task, belief.sample(key), objective, history=0)
+    return found
+
+
+def measured(found: Mapping[str, World], task: Task, steps: int) -> dict[str, list]:
+    """Seconds of each planned action; one action in every world, then the next."""
+    act = eqx.filter_jit(PLANNER.act)
+    key, s = jax.random.key(2), task.reset(jax.random.key(3))
+    states = {name: PLANNER.init(w, key=key) for name, w in found.items()}
+    for name, world in found.items():
+        jax.block_until_ready(act(states[name], world, s, key=key))
+    spent: dict[str, list] = {name: [] for name in found}
+    for t in range(steps):
+        for name, world in found.items():
+            started = time.perf_counter()
+            plan = act(states[name], world, s, key=jax.random.fold_in(key, t))
+            _, states[name] = jax.block_until_ready(plan)
+            spent[name].append(time.perf_counter() - started)
+    return spent
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--steps", type=int, default=200)
+    arguments = parser.parse_args()
+    task = furuta_swingup()
+    spent = measured(worlds(task), task, arguments.steps)
+    half = {name: 1e3 * float(np.median(row)) for name, row in spent.items()}
+    print(f"{'world':16s} {'p50, ms':>8s} {'p95, ms':>8s} {'of the simulator':>17s}")
+    for name, row in spent.items():
+        tail, times = 1e3 * np.quantile(row, 0.95), half[name] / half[SIMULATOR]
+        print(f"{name:16s} {half[name]:8.1f} {tail:8.1f} {times:17.2f}")
+    slowest = max(half[name] for name in ("NLM", "RES", "FS"))
+    for what, holds in (
+        (f"NLM, RES and FS draws within {MILLISECONDS:g} ms", slowest <= MILLISECONDS),
+        (f"{LINEAR} within {TIMES:g} times", half[LINEAR] <= TIMES * half[SIMULATOR]),
+    ):
+        print(f"{what}: {'holds' if holds else 'does not hold'}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,63 @@
+"""Compile a function in another thread, while this one computes something else.
+
+A command that fits and then forecasts would compile first the one, then the other, and
+leave a core idle through both. Only the compiler runs in the thread (XLA works without
+the interpreter's lock); nothing is executed there, for programs that run side by side
+have deadlocked on few cores.
+"""
+
+import functools
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, Generic, ParamSpec, TypeVar
+
+import equinox as eqx
+import jax
+
+from sim2gp.types import in_float64
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+_COMPILER = ThreadPoolExecutor(1, thread_name_prefix="compiler")
+
+
+class ahead(Generic[P, R]):
+    """A jitted function of arrays and static values that can be compiled in advance.
+
+    Called with what was announced by `compile_for`, it waits for that compilation and
+    uses it; called with anything else, it is `equinox.filter_jit`.
+    """
+
+    def __init__(self, function: Callable[P, R]):
+        functools.update_wrapper(self, function)
+        self._jitted: Any = eqx.filter_jit(function)
+        self._announced: dict[Any, Future[Callable[P, R]]] = {}
+
+    @in_float64
+    def compile_for(self, *args: P.args, **kwargs: P.kwargs) -> None:
+        """Start to compile, in float64, for arguments of these shapes and types."""
+        key = _signature((args, kwargs))
+        if key not in self._announced:
+
+            @in_float64
+            def work() -> Callable[P, R]:
+                compiled: Callable[P, R] = self._jitted.lower(*args, **kwargs).compile()
+                return compiled
+
+            self._announced[key] = _COMPILER.submit(work)
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        if self._announced:  # the signature costs time; most programs announce nothing
+            found = self._announced.get(_signature((args, kwargs)))
+            if found is not None:
+                return found.result()(*args, **kwargs)
+        return self._jitted(*args, **kwargs)
+
+
+def _signature(tree: Any) -> Any:
+    """What a compilation depends on: structure, static values, shapes and types."""
+    leaves, structure = jax.tree.flatten(tree)
+    return structure, tuple(
+        jax.typeof(leaf) if eqx.is_array(leaf) else leaf for leaf in leaves
+    )
