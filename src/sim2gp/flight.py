@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from sim2gp.errors import NotFinite, warn
 from sim2gp.planning import AbstractObjective, AbstractPlanner, MarkovObjective, World
 from sim2gp.tasks import Task
+from sim2gp.transitions import with_history
 from sim2gp.types import Dynamics, Key, Scalar, State
 
 
@@ -63,12 +64,7 @@ class Trajectory(eqx.Module):
     ]:
         """``(s, a, s')`` of every step; states carry ``history`` past actions."""
         S, A = np.asarray(self.state), np.asarray(self.action)
-        T, m = A.shape
-        # Row history + t of `done` is the action of step t.
-        done = np.concatenate([np.zeros((history, m), A.dtype), A])
-        past = [done[history - k : history - k + T + 1] for k in range(1, history + 1)]
-        full = np.concatenate([S, *past], axis=1)
-        return full[:-1], A, full[1:]
+        return with_history(S, A, history)
 
 
 def world_of(

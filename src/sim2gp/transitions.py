@@ -78,3 +78,21 @@ class Transitions(eqx.Module):
     def delta(self) -> Float[Array, "capacity n"]:
         """The regression target ``y = s' - s``."""
         return jnp.asarray(self.next_state) - jnp.asarray(self.state)
+
+
+def with_history(
+    S: Float[np.ndarray, "times n"], A: Float[np.ndarray, "T m"], history: int
+) -> tuple[
+    Float[np.ndarray, "T k"], Float[np.ndarray, "T m"], Float[np.ndarray, "T k"]
+]:
+    """``(s, a, s')`` of one episode's T + 1 states and T actions.
+
+    States carry ``history`` past actions, newest first, zero before the episode:
+    k = n + history m columns.
+    """
+    T, m = A.shape
+    # Row history + t of `done` is the action of step t.
+    done = np.concatenate([np.zeros((history, m), A.dtype), A])
+    past = [done[history - k : history - k + T + 1] for k in range(1, history + 1)]
+    full = np.concatenate([S, *past], axis=1)
+    return full[:-1], A, full[1:]

@@ -25,7 +25,7 @@ from sim2gp.models import sim2gp, windows
 from sim2gp.models.sim2gp import FLOOR, Sim2GP
 from sim2gp.models.windows import FREEDOM, Windows, WindowsBelief, fit_windows
 from sim2gp.systems.base import AbstractSystem
-from sim2gp.transitions import Transitions
+from sim2gp.transitions import Transitions, with_history
 from sim2gp.types import Scalar, in_float64
 
 
@@ -280,16 +280,3 @@ class WindowData(AbstractData):
             jnp.asarray(fitted.log_evidence),
         )
         return misfit_of_windows(belief, found)
-
-
-def with_history(
-    S: Float[np.ndarray, "times n"], A: Float[np.ndarray, "T m"], history: int
-) -> tuple[
-    Float[np.ndarray, "T k"], Float[np.ndarray, "T m"], Float[np.ndarray, "T k"]
-]:
-    """``(s, a, s')`` of one episode; states carry past actions, newest first."""
-    T, m = A.shape
-    done = np.concatenate([np.zeros((history, m)), A])
-    past = [done[history - k : history - k + T + 1] for k in range(1, history + 1)]
-    full = np.concatenate([S, *past], axis=1)
-    return full[:-1], A, full[1:]
