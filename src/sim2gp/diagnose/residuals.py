@@ -7,9 +7,6 @@ simulation whose model errs at all drifts, so that on real machines these tests
 raise the alarm as a rule: that is right, the posterior counts every sample as new.
 """
 
-from collections.abc import Callable
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -17,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sim2gp.diagnose.misfit import Misfit, misfit
+from sim2gp.models.linearized import jacobian_by_columns
 from sim2gp.models.sim2gp import Sim2GPBelief
 from sim2gp.models.windows import Windows, WindowsBelief, linearise
 from sim2gp.systems.base import Channel
@@ -33,7 +31,8 @@ def misfit_of_transitions(belief: Sim2GPBelief, data: Transitions) -> Misfit:
     An episode goes on where a row starts in the state in which the last one ended.
     """
     system, N = belief.system, data.count
-    r, J = (np.asarray(x)[:N] for x in _one_step(belief, _on_device(data)))
+    exact = jax.tree.map(jnp.asarray, data)
+    r, J = (np.asarray(x)[:N] for x in _one_step(belief, exact))
     sd = np.asarray(belief.noise)
     s, a, s2 = (np.asarray(x)[:N] for x in (data.state, data.action, data.next_state))
     episode = _episodes(s, s2)
@@ -115,27 +114,6 @@ def _episodes(
     return np.concatenate([np.zeros(min(len(start), 1), int), np.cumsum(breaks)])
 
 
-def _on_device(tree: Any) -> Any:
-    return jax.tree.map(jnp.asarray, tree)
-
-
-def _columns(
-    f: Callable[[Array], tuple[Array, ...]], x: Float[Array, " p"]
-) -> tuple[Float[Array, "*N p"], tuple[Array, ...]]:
-    """Jacobian of the first output of ``f``, and all its values.
-
-    One column after the other: the code of a single one takes a third of the time to
-    compile, and it runs only once.
-    """
-
-    def column(v: Array) -> tuple[Array, tuple[Array, ...]]:
-        values, slopes = jax.jvp(f, (x,), (v,))
-        return slopes[0], values
-
-    J, values = jax.lax.map(column, jnp.eye(x.size, dtype=x.dtype))
-    return jnp.moveaxis(J, 0, -1), jax.tree.map(lambda a: a[0], values)
-
-
 @eqx.filter_jit
 def _one_step(belief: Sim2GPBelief, data: Transitions) -> tuple[Array, Array]:
     """Residuals ``f - s'`` and their Jacobian, per prior standard deviation."""
@@ -146,5 +124,5 @@ def _one_step(belief: Sim2GPBelief, data: Transitions) -> tuple[Array, Array]:
         f = jax.vmap(lambda s, a: system.transition(tt, s, a, belief.dt))
         return ((f(data.state, data.action) - data.next_state)[:, :d],)
 
-    J, (r,) = _columns(residual, jnp.zeros_like(prior.mean))
+    J, (r,) = jacobian_by_columns(residual, jnp.zeros_like(prior.mean))
     return r, J

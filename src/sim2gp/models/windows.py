@@ -27,7 +27,7 @@ from sim2gp.arrowhead import Blocks, Noise, eliminate
 from sim2gp.gaussian import LOG_2PI, Gaussian
 from sim2gp.laplace import AbstractLikelihood, Fit, expectation, multi_start
 from sim2gp.least_squares import factor
-from sim2gp.models.linearized import value_and_jacobian
+from sim2gp.models.linearized import jacobian_by_columns, value_and_jacobian
 from sim2gp.systems.base import AbstractSystem, rk4
 from sim2gp.types import AnyArray, Key, Scalar, in_float64
 
@@ -278,15 +278,9 @@ def _linearise(
         found: tuple[Array, ...] = windows.each(one, starts)
         return found
 
-    # One column after the other: the code of a single one takes a third of the time to
-    # compile, and few points are ever asked for.
-    def column(v: Array) -> tuple[Array, tuple[Array, ...]]:
-        values, slopes = jax.jvp(rows, (jnp.zeros(prior.mean.size + n),), (v,))
-        return slopes[0], values
-
-    J, values = jax.lax.map(column, jnp.eye(prior.mean.size + n))
-    r, states, inputs = jax.tree.map(lambda x: x[0], values)
-    return Linearised(r, jnp.moveaxis(J, 0, -1), states, inputs)
+    nowhere = jnp.zeros(prior.mean.size + n)
+    J, (r, states, inputs) = jacobian_by_columns(rows, nowhere)
+    return Linearised(r, J, states, inputs)
 
 
 def information_at(
