@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp.arrowhead import Blocks, Elimination, Noise, eliminate
 from sim2gp.errors import DeadParameters, NotConverged, NotFinite
-from sim2gp.gaussian import Gaussian
+from sim2gp.gaussian import LOG_2PI, Gaussian
 from sim2gp.least_squares import (
     Factor,
     log_joint,
@@ -141,6 +141,18 @@ class Fit(eqx.Module):
         """
         pivots = jnp.diagonal(self.arrow.R11, axis1=1, axis2=2)
         return log_joint(self.full) - jnp.sum(jnp.log(pivots))
+
+    def log_evidence(self, noise: Noise, count: Float[Array, "W c"]) -> Scalar:
+        """Laplace's evidence of ``count`` samples per window and channel, nats.
+
+            log_joint - sum_wc count_wc [log sig_c + 1/2 log(2 pi) - 1/2 log w_w]
+
+        ``noise`` is that of the fit.
+        """
+        N = jnp.sum(count, axis=0)
+        normaliser = jnp.sum(N * (jnp.log(noise.sd) + 0.5 * LOG_2PI))
+        weighted = 0.5 * jnp.sum(jnp.sum(count, axis=1) * jnp.log(noise.weights))
+        return self.log_joint() - normaliser + weighted
 
     def squares(self) -> tuple[Float[Array, "W c"], Float[Array, "W c"]]:
         """Squared residuals, and squares that the posterior's own spread adds."""

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int
 from sim2gp.arrowhead import Noise
 from sim2gp.diagnose.misfit import Misfit
 from sim2gp.diagnose.residuals import misfit_of_transitions, misfit_of_windows
-from sim2gp.gaussian import LOG_2PI, Gaussian
+from sim2gp.gaussian import Gaussian
 from sim2gp.laplace import AbstractLikelihood, Fit, expectation, multi_start
 from sim2gp.models import sim2gp, windows
 from sim2gp.models.sim2gp import FLOOR, Sim2GP
@@ -139,9 +139,7 @@ def _refit(
     """Fit, noise and log evidence, as `Sim2GP.fit` and `fit_windows` define it."""
     update = expectation(count, floor, freedom)
     fit, noise, _ = multi_start(likelihood, starts, e, noise, update, rounds=rounds)
-    normaliser = jnp.sum(count * (jnp.log(noise.sd) + 0.5 * LOG_2PI)[None])
-    weighted = 0.5 * jnp.sum(jnp.sum(count, axis=1) * jnp.log(noise.weights))
-    return fit, noise, fit.log_joint() - normaliser + weighted
+    return fit, noise, fit.log_evidence(noise, count)
 
 
 def scores_of(fit: Fit, noise: Noise) -> Float[np.ndarray, "W p"]:

@@ -112,7 +112,7 @@ def score(
 
 @dataclass(frozen=True)
 class _Linearised:
-    """Log evidence up to a constant, MAP, and the last unknown's sd and inflation."""
+    """Log evidence, MAP, and the last unknown's sd and inflation."""
 
     evidence: float
     z: Float[np.ndarray, " p"]
@@ -172,9 +172,7 @@ def _linear_fit(
         expectation(count, floor, freedom),
         rounds=ROUNDS,
     )
-    weighted = 0.5 * jnp.sum(jnp.sum(count, axis=1) * jnp.log(noise.weights))
-    normaliser = jnp.sum(jnp.sum(count, axis=0) * jnp.log(noise.sd))
-    return fit, noise, fit.log_joint() - normaliser + weighted
+    return fit, noise, fit.log_evidence(noise, count)
 
 
 def _alias(blocks: np.ndarray, bare: Fitted) -> tuple[float, list[int]]:

@@ -243,7 +243,7 @@ def _fit(
     model: Sim2GP, data: Transitions, starts: Float[Array, "starts p"]
 ) -> tuple[Fit, Sim2GPBelief]:
     d, N = len(model.system.physical_states), jnp.sum(data.mask, dtype=float)
-    change = _rms_change(data, d)
+    change, count = _rms_change(data, d), jnp.full((1, d), N)
 
     # Start from a large noise, so that the first MAP is not trapped.
     fit, noise, _ = multi_start(
@@ -251,17 +251,16 @@ def _fit(
         starts,
         jnp.zeros((1, 0)),
         Noise(change, jnp.ones(1)),
-        expectation(jnp.full((1, d), N), FLOOR * change),
+        expectation(count, FLOOR * change),
         rounds=NOISE_ROUNDS,
     )
-    normaliser = N * jnp.sum(jnp.log(noise.sd) + 0.5 * LOG_2PI)
     belief = Sim2GPBelief(
         model.system,
         model.prior,
         fit.posterior(model.prior),
         noise.sd,
         fit.data[:-1, :-1],
-        fit.log_joint() - normaliser,
+        fit.log_evidence(noise, count),
         jnp.sum(data.mask),
         model.dt,
         model.linear,

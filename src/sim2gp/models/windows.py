@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float
 
 from sim2gp.ahead import ahead
 from sim2gp.arrowhead import Blocks, Noise, eliminate
-from sim2gp.gaussian import LOG_2PI, Gaussian
+from sim2gp.gaussian import Gaussian
 from sim2gp.laplace import AbstractLikelihood, Fit, expectation, multi_start
 from sim2gp.least_squares import factor
 from sim2gp.models.linearized import jacobian_by_columns, value_and_jacobian
@@ -207,11 +207,6 @@ def _fit(
         expectation(count, windows.floor, freedom),
         rounds=NOISE_ROUNDS,
     )
-    log_evidence = (
-        fit.log_joint()
-        - jnp.sum(N * (jnp.log(noise.sd) + 0.5 * LOG_2PI))
-        + 0.5 * jnp.sum(jnp.sum(count, axis=1) * jnp.log(noise.weights))
-    )
     belief = WindowsBelief(
         system,
         prior,
@@ -220,7 +215,7 @@ def _fit(
         fit.data[:-1, :-1],
         noise.weights,
         windows.start + windows.start_sd * fit.e,
-        log_evidence,
+        fit.log_evidence(noise, count),
     )
     return fit, belief
 
