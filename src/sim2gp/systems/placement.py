@@ -4,15 +4,22 @@ Effects on the geometry: the equations stay those of the bare machine, at anothe
 configuration, under another gravity, or with one more mass.
 """
 
+import math
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+from equinox import AbstractClassVar
 
 from sim2gp.errors import InputError
 from sim2gp.systems.base import AbstractMechanism, Inertia
 from sim2gp.systems.cartpole import CartPole
-from sim2gp.systems.effects import AbstractGeometry, Pair, gravity_of
+from sim2gp.systems.effects import (
+    AbstractForce,
+    AbstractGeometry,
+    Pair,
+    gravity_of,
+)
 from sim2gp.systems.furuta import Furuta
 from sim2gp.types import Scalar
 
@@ -54,58 +61,52 @@ class EncoderOffset(AbstractGeometry):
         return q.at[system.joint(self.where)].add(x)
 
 
-class BaseTilt(AbstractGeometry):
+class AbstractBaseTilt(AbstractForce):
     """A Furuta's base that is tilted by ``magnitude`` radians.
 
-    The side that the arm points to at zero rises; with ``b`` the tilt and ``r`` the
-    horizontal place of the pendulum's centre, the potential gains
-    ``m g [sin(b) r_x - (1 - cos(b)) z]``. The arm is balanced about its axis, as
-    ``Jr = Mr Lr^2 / 12`` says.
+    The side that the arm points to at ``towards`` radians rises; with ``b`` the tilt
+    and ``r`` the horizontal place of the pendulum's centre along that direction, the
+    potential gains ``m g [sin(b) r - (1 - cos(b)) z]``. The arm is balanced about its
+    axis, as ``Jr = Mr Lr^2 / 12`` says.
     """
+
+    towards: AbstractClassVar[float]
+    max_substep: ClassVar[float] = _SUBSTEP
+
+    def unit(self, system: AbstractMechanism) -> str:
+        return _only(system, (Furuta,), self.what, "rad")
+
+    def force(
+        self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
+    ) -> Pair:
+        # Weight of a tilted machine's pendulum less that of an upright one's, N m.
+        p, turned = params, q[0] - self.towards
+        weight = p.pendulum_mass * gravity_of(system)
+        l = 0.5 * p.pendulum_length
+        sin, cos = jnp.sin(q[1]), jnp.cos(q[1])
+        up, lost = weight * jnp.sin(x), weight * 2.0 * jnp.sin(0.5 * x) ** 2
+        arm = p.arm_length * jnp.sin(turned) + l * sin * jnp.cos(turned)
+        return jnp.stack([up * arm, l * (up * cos * jnp.sin(turned) + lost * sin)])
+
+
+class BaseTilt(AbstractBaseTilt):
+    """The side that the arm points to at zero rises."""
 
     where: str = eqx.field(static=True, default="theta")
     magnitude: float = eqx.field(static=True, default=0.0175)
     what: ClassVar[str] = "base_tilt"
     meaning: ClassVar[str] = "tilt of the base towards the arm's zero"
-    max_substep: ClassVar[float] = _SUBSTEP
-
-    def unit(self, system: AbstractMechanism) -> str:
-        return _only(system, (Furuta,), self.what, "rad")
-
-    def inertia(
-        self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair
-    ) -> Inertia:
-        none = jnp.zeros_like(x)
-        return none, none, none
-
-    def force(
-        self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
-    ) -> Pair:
-        return _tilted(system, params, x, q, 0.0)
+    towards: ClassVar[float] = 0.0
 
 
-class BaseTiltSide(AbstractGeometry):
-    """As `BaseTilt`, about the other axis: the side at ``theta = pi/2`` rises."""
+class BaseTiltSide(AbstractBaseTilt):
+    """The side that the arm points to at a quarter turn rises."""
 
     where: str = eqx.field(static=True, default="theta")
     magnitude: float = eqx.field(static=True, default=0.0175)
     what: ClassVar[str] = "base_tilt_side"
     meaning: ClassVar[str] = "tilt of the base across the arm's zero"
-    max_substep: ClassVar[float] = _SUBSTEP
-
-    def unit(self, system: AbstractMechanism) -> str:
-        return _only(system, (Furuta,), self.what, "rad")
-
-    def inertia(
-        self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair
-    ) -> Inertia:
-        none = jnp.zeros_like(x)
-        return none, none, none
-
-    def force(
-        self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
-    ) -> Pair:
-        return _tilted(system, params, x, q, 0.5 * jnp.pi)
+    towards: ClassVar[float] = 0.5 * math.pi
 
 
 class Payload(AbstractGeometry):
@@ -144,19 +145,6 @@ class Payload(AbstractGeometry):
             first, second = x * end * sin * v[1] ** 2, jnp.zeros_like(x)
         weight = x * end * gravity_of(system) * sin
         return jnp.stack([first, second - weight])
-
-
-def _tilted(
-    system: AbstractMechanism, params: Any, x: Scalar, q: Pair, towards: float
-) -> Pair:
-    """Weight of a tilted Furuta's pendulum less that of an upright one's, N m."""
-    p, turned = params, q[0] - towards
-    weight = p.pendulum_mass * gravity_of(system)
-    l = 0.5 * p.pendulum_length
-    sin, cos = jnp.sin(q[1]), jnp.cos(q[1])
-    up, lost = weight * jnp.sin(x), weight * 2.0 * jnp.sin(0.5 * x) ** 2
-    arm = p.arm_length * jnp.sin(turned) + l * sin * jnp.cos(turned)
-    return jnp.stack([up * arm, l * (up * cos * jnp.sin(turned) + lost * sin)])
 
 
 def _only(
