@@ -16,6 +16,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+from equinox import AbstractVar
 from jaxtyping import Array, Float
 
 from sim2gp.errors import InputError
@@ -35,7 +36,39 @@ class ActuatedParams(eqx.Module):
     delay: Float[Array, " m"]
 
 
-class Actuated(AbstractSystem):
+class AbstractInputPath(AbstractSystem):
+    """A system behind something that remembers its inputs.
+
+    The state carries ``past`` actions, newest first, as channels ``voltage[-1]``,
+    ``voltage[-2]``, ...
+    """
+
+    system: AbstractVar[AbstractSystem]
+    past: AbstractVar[int]
+
+    @property
+    def states(self) -> tuple[Channel, ...]:
+        past = tuple(
+            dataclasses.replace(channel, name=f"{channel.name}[-{k}]")
+            for k in range(1, self.past + 1)
+            for channel in self.actions
+        )
+        return self.system.states + past
+
+    @property
+    def actions(self) -> tuple[Channel, ...]:
+        return self.system.actions
+
+    @property
+    def max_substep(self) -> float:
+        return self.system.max_substep
+
+    @property
+    def history(self) -> int:
+        return self.past
+
+
+class Actuated(AbstractInputPath):
     """A system behind its actuators.
 
     ``actuators`` maps names such as ``voltage.delay`` to a `Parameter` (free) or a
@@ -77,27 +110,6 @@ class Actuated(AbstractSystem):
                     expected="a delay of zero or more",
                     fix="give it a box [0, high]",
                 )
-
-    @property
-    def states(self) -> tuple[Channel, ...]:
-        past = tuple(
-            dataclasses.replace(channel, name=f"{channel.name}[-{k}]")
-            for k in range(1, self.past + 1)
-            for channel in self.actions
-        )
-        return self.system.states + past
-
-    @property
-    def actions(self) -> tuple[Channel, ...]:
-        return self.system.actions
-
-    @property
-    def max_substep(self) -> float:
-        return self.system.max_substep
-
-    @property
-    def history(self) -> int:
-        return self.past
 
     @property
     def longest_delay(self) -> float:

@@ -10,7 +10,6 @@ where input ``k`` is held from ``t_k`` on for one period. The state carries the 
 actions that still matter; the oldest one counts as held for ever before.
 """
 
-import dataclasses
 import math
 from collections.abc import Mapping
 from typing import Any, NoReturn
@@ -21,7 +20,8 @@ from jaxtyping import Array, Float
 
 from sim2gp.errors import InputError
 from sim2gp.parameters import Parameter, Parameters
-from sim2gp.systems.base import AbstractSystem, Channel, index_of
+from sim2gp.systems.actuator import AbstractInputPath
+from sim2gp.systems.base import AbstractSystem, index_of
 from sim2gp.types import Action, Scalar, State
 
 FADED = 5.0  # time constants after which a past input counts for less than 1 %
@@ -34,7 +34,7 @@ class LaggedParams(eqx.Module):
     lag: Scalar
 
 
-class Lagged(AbstractSystem):
+class Lagged(AbstractInputPath):
     """A system one of whose inputs passes a low pass, for one-step prediction.
 
     ``lag`` is the time constant: a number of seconds, or a `Parameter`, of the constant
@@ -74,27 +74,6 @@ class Lagged(AbstractSystem):
         self.where = where
         self.parameters = table.replace(**{f"{where}.lag": lag}) if free else table
         self.past = math.ceil(FADED * high / period - 1e-9)
-
-    @property
-    def states(self) -> tuple[Channel, ...]:
-        past = tuple(
-            dataclasses.replace(channel, name=f"{channel.name}[-{k}]")
-            for k in range(1, self.past + 1)
-            for channel in self.actions
-        )
-        return self.system.states + past
-
-    @property
-    def actions(self) -> tuple[Channel, ...]:
-        return self.system.actions
-
-    @property
-    def max_substep(self) -> float:
-        return self.system.max_substep
-
-    @property
-    def history(self) -> int:
-        return self.past
 
     @property
     def longest_delay(self) -> float:
