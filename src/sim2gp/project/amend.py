@@ -13,11 +13,10 @@ from pathlib import Path
 
 from sim2gp.errors import InputError, Sim2GPError
 from sim2gp.project.project import load_project
+from sim2gp.project.schema import EFFECT_OPTIONS
 from sim2gp.systems import AbstractEffect, Candidate, InputDelay
 
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
-#: Options of effects that a project file can say.
-_OPTIONS = ("width", "speed", "smoothing")
 
 
 def lines_for(candidate: Candidate) -> tuple[str, list[str]]:
@@ -28,7 +27,7 @@ def lines_for(candidate: Candidate) -> tuple[str, list[str]]:
         lines = ["mean = 0.0", f"sd = {effect.magnitude!r}"]
         for field in dataclasses.fields(effect):
             value = getattr(effect, field.name)
-            if field.name in _OPTIONS and value != field.default:
+            if field.name in EFFECT_OPTIONS and value != field.default:
                 lines.append(f"{field.name} = {value!r}")
         return f"[effects.{where}.{effect.what}]", lines
     if isinstance(effect, InputDelay):

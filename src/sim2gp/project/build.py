@@ -13,7 +13,13 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from sim2gp.errors import InputError, nearest
 from sim2gp.parameters import Parameter, Parameters, unknown_parameter
 from sim2gp.project.priors import located, prior
-from sim2gp.project.schema import ActuatorSpec, EffectSpec, PriorSpec, ProjectSpec
+from sim2gp.project.schema import (
+    EFFECT_OPTIONS,
+    ActuatorSpec,
+    EffectSpec,
+    PriorSpec,
+    ProjectSpec,
+)
 from sim2gp.project.source import Source
 from sim2gp.systems import (
     AbstractMechanism,
@@ -154,8 +160,8 @@ def _effect(
     what: str, where: str, said: EffectSpec | float, line: str
 ) -> AbstractEffect:
     """The effect of a name on a channel, with the options it has (E160)."""
-    known_options = set(EffectSpec.model_fields) - set(PriorSpec.model_fields)
-    given = {} if isinstance(said, float) else said.model_dump(include=known_options)
+    stated = () if isinstance(said, float) else EFFECT_OPTIONS
+    given = {name: getattr(said, name) for name in stated}
     options = {name: value for name, value in given.items() if value is not None}
     known = [f.name for f in dataclasses.fields(EFFECTS[what])]
     for name in options:

@@ -49,6 +49,12 @@ class EffectSpec(PriorSpec):
     smoothing: Positive | None = None
 
 
+#: What an effect has beside the prior of its magnitude.
+EFFECT_OPTIONS = tuple(
+    name for name in EffectSpec.model_fields if name not in PriorSpec.model_fields
+)
+
+
 class ColumnSpec(Section):
     """A column of a file, and how its numbers become a channel's."""
 
