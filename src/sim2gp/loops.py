@@ -115,7 +115,7 @@ def posterior_sampling(
         trajectories.append(trajectory)
         summaries.append(_parameters(belief))
         if on_episode is not None:
-            on_episode(Episode(e, trajectories[-1], belief))
+            on_episode(Episode(e, trajectory, belief))
     return _history(trajectories, summaries, belief, data)
 
 
