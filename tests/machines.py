@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+import lagrangians
 from sim2gp import systems as sy
 from sim2gp.systems import AbstractMechanism, AbstractSystem
 
@@ -75,6 +76,28 @@ def batch(system: AbstractSystem, count: int, seed: int) -> tuple[Array, ...]:
 def params_at(system: AbstractSystem, tt: Array) -> Any:
     """The record at a virtual point."""
     return system.record(system.parameters.values(tt))
+
+
+def close(got: Any, expected: Any, rtol: float = 1e-11) -> None:
+    """Relative to the largest entry: an entry may vanish by cancellation."""
+    scale = np.max(np.abs(expected))
+    np.testing.assert_allclose(got, expected, rtol=0.0, atol=rtol * scale)
+
+
+def against(machine: str, effect: Any, lagrangian: Any, forces: Any) -> None:
+    """Accelerations of a machine with an effect against Euler-Lagrange."""
+    plain = bare()[machine]
+    system = sy.Perturbed(plain, [effect])
+
+    def both(tt: Array, s: Array, a: Array) -> tuple[Array, Array]:
+        p = params_at(plain, tt)
+        q, v = s[:2], s[2:]
+        got = system.ode(system.with_effects(p), s, a)[2:]
+        return got, lagrangians.acceleration(lagrangian(p), forces(p, v, a), q, v)
+
+    got, expected = jax.jit(jax.vmap(both))(*batch(plain, 100, 4))
+    for row, oracle in zip(got, expected, strict=True):
+        close(row, oracle)
 
 
 def nominal(system: AbstractSystem, **changes: float) -> Any:

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from jaxtyping import Array
 
 from sim2gp.flight import Trajectory, episode, oracle_world
@@ -18,7 +19,18 @@ from sim2gp.types import Box, Dynamics, Key, State
 
 KEY = jax.random.key(0)
 DT = 0.1
+#: What was traced, drawn and fitted in the present test.
 traces: list[str] = []
+draws: list[str] = []
+fits: list[tuple[int, int]] = []
+
+
+@pytest.fixture(autouse=True)
+def fresh_counters() -> None:
+    """Count anew in each test of a file that imports this."""
+    traces.clear()
+    draws.clear()
+    fits.clear()
 
 
 class Mass(eqx.Module):
@@ -91,9 +103,6 @@ class GainBelief(AbstractBelief):
         return self.mean[None], self.sd[None]
 
 
-draws: list[str] = []
-
-
 class GainModel(AbstractModel):
     def init(self, key: Key) -> GainBelief:
         return GainBelief(single(1.0)[0], single(1.0)[0])
@@ -118,9 +127,6 @@ class GainModel(AbstractModel):
         precision = 1.0 / belief.sd**2 + x**2 / 1e-4
         mean = (belief.mean / belief.sd**2 + x * y / 1e-4) / precision
         return GainBelief(mean, precision**-0.5)
-
-
-fits: list[tuple[int, int]] = []
 
 
 def start(task: Task, planner: AbstractPlanner, world: World) -> Any:

@@ -7,6 +7,7 @@ import pytest
 
 import lagrangians
 import machines
+from machines import against
 from sim2gp import systems as sy
 from sim2gp.errors import InputError
 from sim2gp.systems import STRENGTHS
@@ -17,28 +18,6 @@ from test_systems import cartpole_forces, furuta_forces
 def float64():
     with jax.enable_x64(True):
         yield
-
-
-def close(got, expected, rtol=1e-11):
-    np.testing.assert_allclose(
-        got, expected, rtol=0.0, atol=rtol * np.max(np.abs(expected))
-    )
-
-
-def against(machine, effect, lagrangian, forces):
-    """Accelerations of the perturbed machine against Euler-Lagrange."""
-    bare = machines.bare()[machine]
-    system = sy.Perturbed(bare, [effect])
-
-    def both(tt, s, a):
-        p = machines.params_at(bare, tt)
-        q, v = s[:2], s[2:]
-        got = system.ode(system.with_effects(p), s, a)[2:]
-        return got, lagrangians.acceleration(lagrangian(p), forces(p, v, a), q, v)
-
-    got, expected = jax.jit(jax.vmap(both))(*machines.batch(bare, 100, 4))
-    for row, oracle in zip(got, expected, strict=True):
-        close(row, oracle)
 
 
 def test_rod_inertia_is_the_true_rod():

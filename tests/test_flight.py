@@ -14,9 +14,8 @@ from mass_task import (
     SMALL,
     Mass,
     Reach,
-    draws,
-    fits,
     fly_mass,
+    fresh_counters,  # noqa: F401  (a fixture for every test here)
     mass_task,
     same,
     single,
@@ -29,13 +28,6 @@ from sim2gp.flight import Trajectory, episode, fly, oracle_world, world_of
 from sim2gp.planning import AbstractPlanner, MarkovObjective, World
 from sim2gp.systems import InputDelay
 from sim2gp.types import Key, State
-
-
-@pytest.fixture(autouse=True)
-def fresh_counters() -> None:
-    traces.clear()
-    draws.clear()
-    fits.clear()
 
 
 # ------------------------------------------------------------------- one episode

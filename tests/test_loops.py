@@ -17,6 +17,7 @@ from mass_task import (
     draws,
     fits,
     fly_mass,
+    fresh_counters,  # noqa: F401  (a fixture for every test here)
     mass_task,
     same,
     traces,
@@ -30,13 +31,6 @@ from sim2gp.systems import Furuta
 from sim2gp.tasks import Task
 from sim2gp.transitions import Transitions
 from sim2gp.types import Key, State
-
-
-@pytest.fixture(autouse=True)
-def fresh_counters() -> None:
-    traces.clear()
-    draws.clear()
-    fits.clear()
 
 
 # ------------------------------------------------------------------- the loop

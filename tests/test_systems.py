@@ -12,6 +12,7 @@ import pytest
 
 import lagrangians
 import machines
+from machines import close
 from sim2gp import systems as sy
 from sim2gp.parameters import parameters_of
 
@@ -23,12 +24,6 @@ def float64():
 
 
 SEEDS = st.integers(0, 2**31 - 1)
-
-
-def close(got, expected, rtol):
-    """Relative to the largest entry: an entry may vanish by cancellation."""
-    scale = np.max(np.abs(expected))
-    np.testing.assert_allclose(got, expected, rtol=0.0, atol=rtol * scale)
 
 
 def furuta_forces(p, v, a):
