@@ -31,11 +31,16 @@ from sim2gp.systems import (
     Lagged,
     effect,
 )
-from sim2gp.systems.base import AbstractMechanism, index_of
-from sim2gp.systems.effects import AbstractEffect, AbstractForce, Pair
+from sim2gp.systems.base import AbstractMechanism
+from sim2gp.systems.effects import (
+    AbstractEffect,
+    AbstractForce,
+    AbstractInputEffect,
+    Pair,
+)
 from sim2gp.systems.perturbed import perturb
 from sim2gp.tasks import Task, cartpole_swingup, draw_truth, furuta_swingup
-from sim2gp.types import Action, Key, Scalar
+from sim2gp.types import Key, Scalar
 
 Planted = AbstractEffect | InputDelay | InputLag
 MACHINES: dict[str, tuple[Callable[[], AbstractMechanism], Callable[..., Task]]] = {
@@ -71,7 +76,7 @@ class Cogging(AbstractForce):
         return jnp.zeros_like(q).at[i].set(-x * jnp.sin(self.turns * q[i]))
 
 
-class Saturation(AbstractEffect):
+class Saturation(AbstractInputEffect):
     """An amplifier that yields no more than ``magnitude``, smoothly."""
 
     where: str = eqx.field(static=True)
@@ -80,23 +85,8 @@ class Saturation(AbstractEffect):
     meaning: ClassVar[str] = "saturation of the amplifier"
     max_substep: ClassVar[float] = 0.005
 
-    def unit(self, system: AbstractMechanism) -> str:
-        return system.actions[index_of(self.where, system.actions)].unit
-
-    def input(self, system: AbstractMechanism, x: Scalar, a: Action) -> Action:
-        i = index_of(self.where, system.actions)
-        return a.at[i].set(x * jnp.tanh(a[i] / x))
-
-    def inertia(
-        self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair
-    ) -> tuple[Scalar, Scalar, Scalar]:
-        none = jnp.zeros_like(x)
-        return none, none, none
-
-    def force(
-        self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
-    ) -> Pair:
-        return jnp.zeros_like(v)
+    def through(self, x: Scalar, u: Scalar) -> Scalar:
+        return x * jnp.tanh(u / x)
 
 
 class Coupling(AbstractForce):

@@ -101,6 +101,32 @@ class AbstractGeometry(AbstractEffect):
         return a
 
 
+class AbstractInputEffect(AbstractEffect):
+    """An effect on the input ``where`` alone; its magnitude has the input's unit."""
+
+    @abc.abstractmethod
+    def through(self, x: Scalar, u: Scalar) -> Scalar:
+        """What arrives of the input ``u``, for the magnitude ``x``."""
+
+    def unit(self, system: AbstractMechanism) -> str:
+        return system.actions[index_of(self.where, system.actions)].unit
+
+    def input(self, system: AbstractMechanism, x: Scalar, a: Action) -> Action:
+        i = index_of(self.where, system.actions)
+        return a.at[i].set(self.through(x, a[i]))
+
+    def inertia(
+        self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair
+    ) -> Inertia:
+        none = jnp.zeros_like(x)
+        return none, none, none
+
+    def force(
+        self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
+    ) -> Pair:
+        return jnp.zeros_like(v)
+
+
 class Coulomb(AbstractForce):
     """Dry friction of a joint, ``-magnitude tanh(v / width)``."""
 
@@ -319,7 +345,7 @@ class PoleGeometry(AbstractGeometry):
         return jnp.stack([first * v[1] ** 2, -first * gravity_of(system)])
 
 
-class DeadZone(AbstractEffect):
+class DeadZone(AbstractInputEffect):
     """An input without effect below ``magnitude``, in the input's unit."""
 
     where: str = eqx.field(static=True)
@@ -329,23 +355,8 @@ class DeadZone(AbstractEffect):
     meaning: ClassVar[str] = "dead zone of the input"
     max_substep: ClassVar[float] = _SUBSTEP
 
-    def unit(self, system: AbstractMechanism) -> str:
-        return system.actions[index_of(self.where, system.actions)].unit
-
-    def input(self, system: AbstractMechanism, x: Scalar, a: Action) -> Action:
-        i = index_of(self.where, system.actions)
-        return a.at[i].set(dead_zone(a[i], x, self.smoothing))
-
-    def inertia(
-        self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair
-    ) -> Inertia:
-        none = jnp.zeros_like(x)
-        return none, none, none
-
-    def force(
-        self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
-    ) -> Pair:
-        return jnp.zeros_like(v)
+    def through(self, x: Scalar, u: Scalar) -> Scalar:
+        return dead_zone(u, x, self.smoothing)
 
 
 def _on_joint(i: int, f: Scalar) -> Pair:
