@@ -19,6 +19,7 @@ from sim2gp.experiments import explain_study as study
 from sim2gp.runs import Progress
 from sim2gp.runs.cells import Cells
 from sim2gp.runs.plain import to_json
+from sim2gp.tasks import MACHINES
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -30,7 +31,7 @@ def main() -> None:
     parser.add_argument("--strength", type=float, default=1.0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=float("inf"))
-    parser.add_argument("--machines", nargs="+", default=list(study.MACHINES))
+    parser.add_argument("--machines", nargs="+", default=list(MACHINES))
     parser.add_argument("--out", type=Path, default=ROOT / "runs" / "explain-study")
     options = parser.parse_args()
     started, store = time.perf_counter(), Cells(options.out)

@@ -16,6 +16,7 @@ from sim2gp.diagnose.missing import Refitted, Search, search
 from sim2gp.diagnose.score import Scored, inflation_of, score, tempered, widened
 from sim2gp.experiments import explain_study as study
 from sim2gp.experiments.explain_words import candidate_rows, headline, table
+from sim2gp.tasks import MACHINES
 from sim2gp.types import in_float64
 
 
@@ -216,9 +217,9 @@ def test_the_study_plants_what_it_says(machine: str, name: str) -> None:
         assert float(value) == float(other.truth[constant])
 
 
-@pytest.mark.parametrize("machine", study.MACHINES)
+@pytest.mark.parametrize("machine", MACHINES)
 def test_the_library_holds_what_is_planted_and_not_the_others(machine: str) -> None:
-    library = {c.name for c in sy.library(study.MACHINES[machine][0]())}
+    library = {c.name for c in sy.library(MACHINES[machine][0]())}
     for planted in study.PLANTED[machine].values():
         assert study.name_of(planted) in library
         half = study.scaled(planted, 0.5)

@@ -9,7 +9,7 @@ descriptions of the two rigs (`sim2gp.systems`). Scores are defined here once.
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -166,6 +166,13 @@ def cartpole_swingup(
         planning_iterations=3,
         noise_colour=2.0,
     )
+
+
+#: Each machine that has a task, and its task: of a record and effects, both optional.
+MACHINES: dict[str, tuple[Callable[[], AbstractMechanism], Callable[..., Task]]] = {
+    "furuta": (Furuta, furuta_swingup),
+    "cartpole": (CartPole, cartpole_swingup),
+}
 
 
 @in_float64

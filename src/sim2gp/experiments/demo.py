@@ -21,22 +21,10 @@ from sim2gp.loops import AcceptedTruth, Episode, History, accept_truth, psrl
 from sim2gp.models import AbstractModel, PointEstimate, PriorMean, Sim2GP, Sim2GPBelief
 from sim2gp.planning import MPC
 from sim2gp.runs import Progress, new_run
-from sim2gp.systems import CartPole, Furuta
 from sim2gp.systems.base import AbstractSystem
-from sim2gp.tasks import (
-    Task,
-    cartpole_swingup,
-    episodes_to_95,
-    furuta_swingup,
-    hanging_return,
-    score,
-)
+from sim2gp.tasks import MACHINES, Task, episodes_to_95, hanging_return, score
 from sim2gp.types import Key
 
-MACHINES: dict[str, tuple[Callable[[], AbstractSystem], Callable[[Any], Task]]] = {
-    "furuta": (Furuta, furuta_swingup),
-    "cartpole": (CartPole, cartpole_swingup),
-}
 LEARNER = "posterior sampling"
 ORACLE_EPISODES = 5
 

@@ -24,9 +24,8 @@ from sim2gp.project import Project, load_project
 from sim2gp.project.amend import amend
 from sim2gp.runs import Progress, load_run, new_run
 from sim2gp.runs.store import Run
-from sim2gp.systems import CartPole, Furuta
+from sim2gp.tasks import MACHINES
 
-MACHINES = {"furuta": Furuta, "cartpole": CartPole}
 SHARED_SECOND = 1.0  # s of windows whose errors may be correlated
 
 
@@ -123,7 +122,8 @@ def _flown(stored: Run) -> OneStepData:
     states = np.split(np.asarray(x["animation/state"], float), count)
     inputs = np.split(np.asarray(x["animation/action"], float), count)
     episodes = [(S, A[:-1]) for S, A in zip(states, inputs, strict=True)]
-    return OneStepData(MACHINES[summary["machine"]](), episodes, dt=dt)
+    make, _ = MACHINES[summary["machine"]]
+    return OneStepData(make(), episodes, dt=dt)
 
 
 def _project(run: Path, stored: Run) -> Project:

@@ -8,7 +8,7 @@ and inputs alone.
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -23,9 +23,7 @@ from sim2gp.planning.noise import coloured_noise
 from sim2gp.systems import (
     AbstractSystem,
     BaseTilt,
-    CartPole,
     EncoderOffset,
-    Furuta,
     InputDelay,
     InputLag,
     Lagged,
@@ -39,14 +37,10 @@ from sim2gp.systems.effects import (
     Pair,
 )
 from sim2gp.systems.perturbed import perturb
-from sim2gp.tasks import Task, cartpole_swingup, draw_truth, furuta_swingup
+from sim2gp.tasks import MACHINES, Task, draw_truth
 from sim2gp.types import Key, Scalar
 
 Planted = AbstractEffect | InputDelay | InputLag
-MACHINES: dict[str, tuple[Callable[[], AbstractMechanism], Callable[..., Task]]] = {
-    "furuta": (Furuta, furuta_swingup),
-    "cartpole": (CartPole, cartpole_swingup),
-}
 EPISODES = 2
 #: Pull back to the middle, V per rad or m; pole speed from which pumping turns round.
 CENTRE = {"furuta": 1.0, "cartpole": 12.0}

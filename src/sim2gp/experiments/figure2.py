@@ -15,7 +15,6 @@ from jaxtyping import Float
 from sim2gp.experiments.record import provenance
 from sim2gp.experiments.swingup import (
     CONDITIONS,
-    MACHINES,
     METHODS,
     WITH_TERM,
     best_seen,
@@ -23,7 +22,7 @@ from sim2gp.experiments.swingup import (
     study,
 )
 from sim2gp.runs import Progress, new_run
-from sim2gp.tasks import SOLVED
+from sim2gp.tasks import MACHINES, SOLVED
 
 SEEDS, EPISODES = 5, 10
 QUICK_SEEDS, QUICK_EPISODES = 2, 4

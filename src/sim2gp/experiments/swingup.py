@@ -34,27 +34,16 @@ from sim2gp.planning import MPC
 from sim2gp.runs import Progress
 from sim2gp.runs.cells import Cells
 from sim2gp.runs.workers import spread
-from sim2gp.systems import Actuated, CartPole, Furuta
+from sim2gp.systems import Actuated
 from sim2gp.systems.base import AbstractMechanism
 from sim2gp.systems.effects import AbstractEffect, RailFriction, Spring
 from sim2gp.systems.perturbed import InputDelay, Perturbed, effect
-from sim2gp.tasks import (
-    Task,
-    cartpole_swingup,
-    draw_truth,
-    furuta_swingup,
-    hanging_return,
-    score,
-)
+from sim2gp.tasks import MACHINES, Task, draw_truth, hanging_return, score
 
-#: Machine, and the physics that the real one has in the mismatched cells of figure 2,
-#: fixed before anything was run: a cable spring (N m/rad), strong Coulomb friction.
-MACHINES: dict[str, tuple[Callable[[], AbstractMechanism], Callable[..., Task]]] = {
-    "furuta": (Furuta, furuta_swingup),
-    "cartpole": (CartPole, cartpole_swingup),
-}
 Effect = AbstractEffect | InputDelay
 Group = TypeVar("Group")
+#: Physics that the real machine has in the mismatched cells of figure 2, fixed before
+#: anything was run: a cable spring (N m/rad), strong Coulomb friction.
 MISSING: dict[str, Effect] = {
     "furuta": Spring("theta", 0.02),
     "cartpole": RailFriction(magnitude=0.1),
