@@ -221,8 +221,8 @@ def test_the_study_plants_what_it_says(machine: str, name: str) -> None:
 def test_the_library_holds_what_is_planted_and_not_the_others(machine: str) -> None:
     library = {c.name for c in sy.library(MACHINES[machine][0]())}
     for planted in study.PLANTED[machine].values():
-        assert study.name_of(planted) in library
+        assert sy.Candidate(planted).name in library
         half = study.scaled(planted, 0.5)
         assert half.magnitude == 0.5 * planted.magnitude
-    assert not {study.name_of(p) for p in study.OUTSIDE[machine].values()} & library
+    assert not {sy.Candidate(p).name for p in study.OUTSIDE[machine].values()} & library
     assert len([*study.cells(machine, 10)]) == 130

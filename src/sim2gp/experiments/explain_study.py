@@ -23,6 +23,7 @@ from sim2gp.planning.noise import coloured_noise
 from sim2gp.systems import (
     AbstractSystem,
     BaseTilt,
+    Candidate,
     EncoderOffset,
     InputDelay,
     InputLag,
@@ -137,13 +138,6 @@ OUTSIDE: dict[str, dict[str, Planted]] = {
 }
 
 
-def name_of(planted: Planted) -> str:
-    """Name that `explain` should answer."""
-    if isinstance(planted, AbstractEffect):
-        return planted.name
-    return f"{planted.where}.{'lag' if isinstance(planted, InputLag) else 'delay'}"
-
-
 def planted_task(machine: str, planted: Planted | None, key: Key) -> Task:
     """The machine's task with hidden constants and one more effect, float32."""
     make, preset = MACHINES[machine]
@@ -244,7 +238,7 @@ def cell(
     ranked = [r.scored.candidate.name for r in found.search.refitted]
     scored = sorted((s for s in found.search.scored if not s.alias), key=_falling)
     inside = name in PLANTED[machine] and planted is not None
-    truth = name_of(planted) if inside and planted is not None else ""
+    truth = Candidate(planted).name if inside and planted is not None else ""
     best = found.search.refitted[0] if ranked else None
     return {
         "machine": machine,

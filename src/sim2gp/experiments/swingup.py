@@ -6,7 +6,7 @@ returns and every argument that made them; a study is a list of cells.
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -29,15 +29,14 @@ from sim2gp.models import (
     ResidualFunctionSpace,
     Sim2GP,
 )
-from sim2gp.parameters import Parameter
 from sim2gp.planning import MPC
 from sim2gp.runs import Progress
 from sim2gp.runs.cells import Cells
 from sim2gp.runs.workers import spread
-from sim2gp.systems import Actuated
+from sim2gp.systems import Candidate
 from sim2gp.systems.base import AbstractMechanism
 from sim2gp.systems.effects import AbstractEffect, RailFriction, Spring
-from sim2gp.systems.perturbed import InputDelay, Perturbed, effect
+from sim2gp.systems.perturbed import InputDelay, effect
 from sim2gp.tasks import MACHINES, Task, draw_truth, hanging_return, score
 
 Effect = AbstractEffect | InputDelay
@@ -51,6 +50,7 @@ MISSING: dict[str, Effect] = {
 CONDITIONS = ("nominal", "mismatch")
 WITH_TERM = "SIM2GP with the term"
 PLANNER = MPC()
+PERIOD = 0.02  # s, of the control on every task
 
 
 #: Half-widths of the box that a learner's inputs are scaled to, by channel.
@@ -61,11 +61,9 @@ def _with_term(
     system: AbstractMechanism, missing: Effect, reach: Reach
 ) -> AbstractModel:
     del reach
-    if isinstance(missing, InputDelay):
-        name, longest = f"{missing.where}.delay", 2.0 * missing.magnitude
-        delay = Parameter(name, "s", "delay of the input", "box", 0.0, longest)
-        return Sim2GP(Actuated(system, {name: delay}, delay_max=longest))
-    return Sim2GP(Perturbed(system, [missing], free=True))
+    if isinstance(missing, InputDelay):  # its magnitude bounds a candidate's delay
+        missing = replace(missing, magnitude=2.0 * missing.magnitude)
+    return Sim2GP(Candidate(missing).freed(system, period=PERIOD))
 
 
 def _auto(system: AbstractMechanism, missing: Effect, reach: Reach) -> AbstractModel:
