@@ -1,18 +1,20 @@
 """The mismatch map: conditions, regrets and the claim, on planted cells."""
 
+import dataclasses
 import json
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
 from sim2gp.errors import InputError
 from sim2gp.experiments import mismatch, swingup
-from sim2gp.experiments.swingup import METHODS, WITH_TERM, Cell
+from sim2gp.experiments.swingup import CONDITIONS, METHODS, WITH_TERM, Cell
 from sim2gp.runs import Progress
 from sim2gp.systems import Actuated, Furuta
 from sim2gp.systems.perturbed import InputDelay, effect
-from sim2gp.tasks import furuta_swingup
+from sim2gp.tasks import MACHINES, furuta_swingup
 
 ORACLE = {"hang_return": 50.0, "oracle_return": 150.0, "redrawn": 0, "returns": [150.0]}
 
@@ -23,9 +25,22 @@ def test_the_map_is_the_registered_catalogue():
         for strength in ("mild", "middle", "strong"):
             (found,) = swingup.effects_of("furuta", f"{name} {strength}")
             assert found == effect("furuta", name, strength)
-    assert swingup.effects_of("furuta", "nominal") == ()
+    (none,) = swingup.effects_of("furuta", "nominal")
+    assert none == dataclasses.replace(swingup.MISSING["furuta"], magnitude=0.0)
     with pytest.raises(InputError, match="did you mean spring"):
         swingup.effects_of("furuta", "sprong mild")
+
+
+def test_conditions_of_a_figure_are_one_program():
+    for machine, (_, preset) in MACHINES.items():
+        tasks = [preset(None, swingup.effects_of(machine, c)) for c in CONDITIONS]
+        nominal, mismatched = map(jax.tree.structure, tasks)
+        assert nominal == mismatched
+        s, a = tasks[0].start + 0.3, tasks[0].actions.high
+        plain = preset().dynamics(s, a)
+        # An effect may ask for shorter substeps: apart by what Runge-Kutta leaves.
+        np.testing.assert_allclose(tasks[0].dynamics(s, a), plain, rtol=1e-4)
+        assert np.any(np.abs(tasks[1].dynamics(s, a) - plain) > 1e-3)
 
 
 def test_the_right_term_is_there_for_delays_as_well():

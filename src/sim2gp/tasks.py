@@ -248,12 +248,18 @@ def _preset(
     **fields: Any,
 ) -> Task:
     """A task on ``bare`` with ``effects``; all arrays float32."""
-    system: AbstractSystem = perturb(bare, effects, period=dt) if effects else bare
+    # Magnitudes are data: one program serves every strength, none included.
+    kinds = [
+        dataclasses.replace(e, magnitude=0.0) if isinstance(e, AbstractEffect) else e
+        for e in effects
+    ]
+    system: AbstractSystem = perturb(bare, kinds, period=dt) if kinds else bare
     record = bare.nominal() if truth is None else truth
     values = _values(record, bare)
     # An effect's magnitude is a fixed constant of the perturbed machine's table.
+    strengths = {e.name: e.magnitude for e in effects if isinstance(e, AbstractEffect)}
     values |= {
-        name: jnp.asarray(value, jnp.float32)
+        name: jnp.asarray(strengths.get(name, value), jnp.float32)
         for name, value in system.parameters.fixed
         if name not in values
     }

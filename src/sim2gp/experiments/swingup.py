@@ -142,8 +142,14 @@ def missing(machine: str, condition: str) -> Effect:
 
 
 def effects_of(machine: str, condition: str) -> tuple[Effect, ...]:
-    """What the real machine has and its simulator lacks."""
-    return () if condition == "nominal" else (missing(machine, condition),)
+    """What the real machine has and its simulator lacks.
+
+    Nominal is figure 2's effect of no magnitude: both conditions are one program.
+    """
+    lacking = missing(machine, condition)
+    if condition == "nominal":
+        lacking = replace(lacking, magnitude=0.0)
+    return (lacking,)
 
 
 def oracle_cell(cell: Cell) -> dict[str, Any]:
