@@ -250,16 +250,19 @@ def fly_cells(
 ) -> dict[Cell, dict[str, Any]]:
     """All of them and their oracles, on ``workers`` processes; finished ones are read.
 
-    One process takes all cells of a learner on a machine, which it compiles once.
+    What one process takes shares its compilations: all cells of a machine, or all of a
+    learner on a machine where there are more processes than machines.
     """
     values: dict[Cell, dict[str, Any]] = {}
     stages = (list(dict.fromkeys(map(reference, cells))), list(cells))
+    whole = workers <= len({cell.machine for cell in cells})
     with progress.task("cells", sum(map(len, stages))) as task:
         for stage in stages:
             groups: dict[Any, list[Cell]] = {}
             for cell in stage:
                 where = cell.condition if cell.method == "oracle" else ""
-                alike = cell.machine, cell.method, cell.update_every, where
+                learner = cell.method, cell.update_every, where
+                alike = cell.machine if whole else (cell.machine, *learner)
                 groups.setdefault(alike, []).append(cell)
             work = partial(fly_cell, out=out)
             for cell, value in spread(work, list(groups.values()), workers):
