@@ -2,6 +2,7 @@
 
 import os
 
+import numpy as np
 import pytest
 
 from sim2gp.errors import InputError, Sim2GPError
@@ -26,6 +27,27 @@ def test_every_job_is_done_once_and_groups_stay_together() -> None:
     for group in groups:
         assert len({found[job][1] for job in group}) <= 1
     assert os.getpid() not in {pid for _, pid in found.values()}
+
+
+def cores_of_threads(job: int) -> list[list[int]]:
+    """The cores that each thread of this process may use."""
+    np.linalg.qr(np.ones((4, 4)))  # whatever makes threads has made them
+    return [sorted(os.sched_getaffinity(int(t))) for t in os.listdir("/proc/self/task")]
+
+
+@pytest.mark.skipif(
+    not os.path.isdir("/proc/self/task") or len(workers._allowed()) < 2,
+    reason="needs two cores and a system that tells of threads",
+)
+def test_no_thread_of_a_worker_leaves_its_core() -> None:
+    mine = workers._allowed()
+    found = dict(spread(cores_of_threads, [[1], [2]], 2))
+    for threads in found.values():
+        assert len(threads) >= 1
+        assert all(thread == threads[0] for thread in threads)
+        assert len(threads[0]) == 1
+    assert {threads[0][0] for threads in found.values()} <= set(mine[:2])
+    assert workers._allowed() == mine
 
 
 def test_one_worker_is_this_process() -> None:
