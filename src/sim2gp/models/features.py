@@ -136,12 +136,14 @@ def held_out_rows(mask: Bool[Array, " N"]) -> Bool[Array, " N"]:
     """
     row = jnp.arange(len(mask))
     chunk = row // CHUNK
-    places = jax.vmap(
-        lambda group: jax.random.randint(
-            jax.random.fold_in(jax.random.key(SPLIT), group), (), 0, HELD_OUT
-        )
-    )(chunk // HELD_OUT)
-    out = mask & (chunk % HELD_OUT == places)
+    groups = len(mask) // (CHUNK * HELD_OUT) + 1
+    with jax.ensure_compile_time_eval():  # no data in it: every program gets numbers
+        places = jax.vmap(
+            lambda group: jax.random.randint(
+                jax.random.fold_in(jax.random.key(SPLIT), group), (), 0, HELD_OUT
+            )
+        )(jnp.arange(groups))
+    out = mask & (chunk % HELD_OUT == places[chunk // HELD_OUT])
     enough = jnp.any(out) & jnp.any(mask & ~out)
     return jnp.where(enough, out, mask & (row == 0) & (jnp.sum(mask) > 1))
 
