@@ -249,12 +249,14 @@ def test_identify_of_a_small_project(
     assert json.loads(stored) == json.loads(said.out)
 
 
-def test_output_into_a_closed_pipe(here: Path) -> None:
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_output_into_a_closed_pipe(unbuffered: str, here: Path) -> None:
     with subprocess.Popen(
         [*START, CALL, "--help"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
     ) as process:
         assert process.stdout is not None
         assert process.stderr is not None
@@ -267,8 +269,10 @@ def test_output_into_a_closed_pipe(here: Path) -> None:
 def test_signals_clean_up(sign: str, code: int, here: Path) -> None:
     """A command that is stopped removes what it had begun to write."""
     script = (
-        "import sys, time\nfrom types import ModuleType\n"
+        "import signal, sys, time\nfrom types import ModuleType\n"
         "from sim2gp.cli import main\nfrom sim2gp.runs import new_run\n"
+        # A shell that runs the tests in the background has it ignored.
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "def run(*, out, progress, **options):\n"
         "    with new_run(out, 'demo') as run:\n"
         "        run.write_text('half', 'x')\n"

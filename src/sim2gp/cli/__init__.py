@@ -41,7 +41,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     debug = "--debug" in args
     try:
         with _terminable():
-            return _run(args)
+            code = _run(args)
+            sys.stdout.flush()  # here a reader that has gone is no fault, at exit it is
+            return code
     except KeyboardInterrupt as error:
         print("interrupted; nothing half-written is left", file=sys.stderr)
         return TERMINATED if isinstance(error, Terminated) else INTERRUPTED
