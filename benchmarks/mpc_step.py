@@ -3,25 +3,23 @@
     python benchmarks/mpc_step.py [--steps N]
 
 iCEM with 128 sequences, 30 steps ahead, 4 rounds, on the Furuta; the worlds take turns
-in one run, so that ratios hold on a busy machine too. Each model was fitted to one
-episode of random input. Medians over steps, without compilation.
+in one run, so that ratios hold on a busy machine too. Each model was fitted to five
+seconds of random input. Medians over steps, without compilation.
 """
 
 import argparse
 import time
 from collections.abc import Mapping
-from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
+from one_step import EPISODES, STEPS, random_episode
 
 from sim2gp.flight import oracle_world, world_of
 from sim2gp.models import NLM, FunctionSpace, Residual, ResidualFunctionSpace, Sim2GP
 from sim2gp.planning import MPC, MarkovObjective, World
 from sim2gp.planning.icem import ICEM
-from sim2gp.planning.noise import coloured_noise
 from sim2gp.systems import Furuta
 from sim2gp.tasks import Task, furuta_swingup
 from sim2gp.transitions import Transitions
@@ -33,20 +31,11 @@ MILLISECONDS, TIMES = 25.0, 3.0
 
 
 def random_data(task: Task) -> Transitions:
-    """One episode of coloured noise over half the input's range."""
-    key = jax.random.key(0)
-    shape = jnp.zeros((task.horizon, 1), jnp.float32)
-    A = task.limit(0.5 * task.actions.high * coloured_noise(key, 1, shape, 1.0)[0])
-
-    def step(s: Any, row: Any) -> Any:
-        a, k = row
-        s2 = task.step(s, a, key=k)
-        return s2, (s, a, s2)
-
-    keys = jax.random.split(key, task.horizon)
-    rows = jax.jit(lambda: jax.lax.scan(step, task.reset(key), (A, keys))[1])()
-    data = Transitions.empty(task.horizon, task.size, 1)
-    return data.extend(*(np.asarray(x, float) for x in rows))
+    """Five seconds of random input."""
+    data = Transitions.empty(EPISODES * STEPS, task.size, 1)
+    for seed in range(EPISODES):
+        data = data.extend(*random_episode(task, seed))
+    return data
 
 
 def worlds(task: Task) -> dict[str, World]:
