@@ -16,8 +16,9 @@ import jax
 import numpy as np
 from one_step import EPISODES, STEPS, random_episode
 
+from sim2gp.experiments.compare import MODELS
 from sim2gp.flight import oracle_world, world_of
-from sim2gp.models import NLM, FunctionSpace, Residual, ResidualFunctionSpace, Sim2GP
+from sim2gp.models import Sim2GP
 from sim2gp.planning import MPC, MarkovObjective, World
 from sim2gp.planning.icem import ICEM
 from sim2gp.systems import Furuta
@@ -40,17 +41,10 @@ def random_data(task: Task) -> Transitions:
 
 def worlds(task: Task) -> dict[str, World]:
     """A draw of each fitted model as a world, beside the simulator itself."""
-    system, data, key = Furuta(), random_data(task), jax.random.key(1)
-    sim = Sim2GP(system)
-    models = {
-        LINEAR: sim,
-        "NLM": NLM(system),
-        "RES": Residual(sim),
-        "FS": FunctionSpace(sim),
-        "RES-FS": ResidualFunctionSpace(sim),
-    }
+    sim, data, key = Sim2GP(Furuta()), random_data(task), jax.random.key(1)
     found = {SIMULATOR: oracle_world(task)}
-    for name, model in models.items():
+    for name, make in MODELS.items():
+        model = make(sim, {})
         belief = model.fit(model.init(key), data, key=key)
         objective = MarkovObjective(task.reward)
         found[name] = world_of(task, belief.sample(key), objective, history=0)

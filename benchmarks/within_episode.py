@@ -19,9 +19,8 @@ from sim2gp.experiments.swingup import (
     Cell,
     best_seen,
     first_at,
-    fly_cells,
-    reference,
-    scores,
+    median_episode,
+    study,
 )
 from sim2gp.runs import Progress
 from sim2gp.runs.workers import cores
@@ -39,25 +38,21 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=cores())
     parser.add_argument("--out", type=Path, default=Path("results/within_episode"))
     arguments = parser.parse_args()
-    E, seeds = arguments.episodes, range(arguments.seeds)
-    rows = {
-        (condition, learner, every): [
-            Cell("furuta", condition, learner, seed, E, every) for seed in seeds
-        ]
+    groups = {
+        (condition, learner, every): Cell(
+            "furuta", condition, learner, 0, arguments.episodes, every
+        )
         for learner in LEARNERS
         for condition in CONDITIONS
         for every in (None, arguments.every)
     }
-    cells = [cell for row in rows.values() for cell in row]
-    flown = fly_cells(
-        cells, arguments.out, workers=arguments.workers, progress=Progress()
+    table, _ = study(
+        groups,
+        range(arguments.seeds),
+        arguments.out,
+        workers=arguments.workers,
+        progress=Progress(),
     )
-    table = {
-        key: scores(
-            [flown[cell] for cell in row], [flown[reference(cell)] for cell in row], E
-        )
-        for key, row in rows.items()
-    }
     text = "\n".join(_lines(table, arguments.every))
     print(text)
     arguments.out.mkdir(parents=True, exist_ok=True)
@@ -83,7 +78,7 @@ def _lines(table: dict, every: int) -> list[str]:
                 score = table[condition, learner, how]
                 best = best_seen(score)
                 early.append(best.mean(axis=1))
-                soon = np.sort(first_at(score, SOLVED))[(len(score) - 1) // 2]
+                soon = median_episode(first_at(score, SOLVED))
                 name = "between" if how is None else f"every {how}"
                 curve = " ".join(f"{x:5.2f}" for x in np.median(best, axis=0))
                 out.append(f"{learner:21s} {name:9s} {curve}   {soon:4g}")

@@ -253,7 +253,7 @@ def _preset(
         dataclasses.replace(e, magnitude=0.0) if isinstance(e, AbstractEffect) else e
         for e in effects
     ]
-    system: AbstractSystem = perturb(bare, kinds, period=dt) if kinds else bare
+    system: AbstractSystem = perturb(bare, kinds, period=dt)
     record = bare.nominal() if truth is None else truth
     values = _values(record, bare)
     # An effect's magnitude is a fixed constant of the perturbed machine's table.

@@ -295,8 +295,11 @@ def _check_measured(
     """One-step models need every state, or the position whose rate it is (E103)."""
     measured = measured_states(logs, system)
     names = [channel.name for channel in system.physical_states]
-    missing = [n for n in names if n.removesuffix(".velocity") not in measured]
-    missing = [n for n in missing if n not in measured]
+    missing = [
+        name
+        for name in names
+        if name not in measured and name.removesuffix(".velocity") not in measured
+    ]
     if missing:
         raise InputError(
             "E103",

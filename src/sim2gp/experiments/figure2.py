@@ -17,8 +17,10 @@ from sim2gp.experiments.swingup import (
     CONDITIONS,
     METHODS,
     WITH_TERM,
+    Cell,
     best_seen,
     first_at,
+    median_episode,
     study,
 )
 from sim2gp.runs import Progress, new_run
@@ -51,13 +53,14 @@ def run(
     seeds = seeds or (QUICK_SEEDS if quick else SEEDS)
     episodes = episodes or (QUICK_EPISODES if quick else EPISODES)
     groups = {
-        (m, c, w): (m, c, w) for m in MACHINES for c in CONDITIONS for w in METHODS
+        (m, c, w): Cell(m, c, w, seed, episodes)
+        for m in MACHINES
+        for c in CONDITIONS
+        for w in METHODS
     }
     numbers = range(seed, seed + seeds)
     with new_run(out, "reproduce fig2") as writer:
-        table, details = study(
-            groups, numbers, episodes, out, workers=workers, progress=progress
-        )
+        table, details = study(groups, numbers, out, workers=workers, progress=progress)
         words = f"sim2gp reproduce fig2 --seed {seed} --seeds {seeds} "
         summary: dict[str, Any] = {
             "command": "reproduce fig2",
@@ -100,7 +103,9 @@ def claims(table: Table, rng: np.random.Generator) -> dict[str, dict[str, Any]]:
     out: dict[str, dict[str, Any]] = {}
     for machine in MACHINES:
         nominal, wrong = (machine, "nominal"), (machine, "mismatch")
-        soon = {m: _median(reached[*nominal, m]) for m in ("SIM2GP", "RES", "NLM")}
+        soon = {
+            m: median_episode(reached[*nominal, m]) for m in ("SIM2GP", "RES", "NLM")
+        }
         best = max(soon["SIM2GP"], soon["RES"])
         out[f"{machine}_physics_learns_twice_as_fast"] = _claim(
             best <= 2.0 and soon["NLM"] >= 2.0 * best,
@@ -120,7 +125,7 @@ def claims(table: Table, rng: np.random.Generator) -> dict[str, dict[str, Any]]:
         out[f"{machine}_literal_function_space_is_best_under_mismatch"] = _best(
             "FS literal", {m: early[*wrong, m] for m in rivals}, rng, "under mismatch"
         )
-        needed = _median(reached[*wrong, "RES-FS"])
+        needed = median_episode(reached[*wrong, "RES-FS"])
         out[f"{machine}_RES_FS_solves_mismatch_in_three"] = _claim(
             needed <= 3.0,
             f"median episode {needed:g}",
@@ -132,11 +137,6 @@ def claims(table: Table, rng: np.random.Generator) -> dict[str, dict[str, Any]]:
 
 def _claim(holds: bool, figure: str, text: str) -> dict[str, Any]:
     return {"holds": bool(holds), "figure": figure, "text": text}
-
-
-def _median(episodes: Float[np.ndarray, " seeds"]) -> float:
-    """The median of what may be infinite: the lower of the two middle ones."""
-    return float(np.sort(episodes)[(len(episodes) - 1) // 2])
 
 
 def interval(
@@ -196,7 +196,7 @@ def _table(table: Table) -> dict[str, Any]:
         row = [method]
         for machine, condition in groups:
             score = table[machine, condition, method]
-            needed = _median(first_at(score, SOLVED))
+            needed = median_episode(first_at(score, SOLVED))
             last = float(np.median(best_seen(score)[:, -1]))
             shown = f"{needed:g}" if np.isfinite(needed) else "never"
             row.append(f"{shown} ({last:.2f})")

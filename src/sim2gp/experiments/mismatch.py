@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sim2gp.experiments.record import provenance
-from sim2gp.experiments.swingup import METHODS, WITH_TERM, first_at, study
+from sim2gp.experiments.swingup import METHODS, WITH_TERM, Cell, first_at, study
 from sim2gp.runs import Progress, new_run
 from sim2gp.systems.perturbed import STRENGTHS
 from sim2gp.tasks import SOLVED
@@ -53,11 +53,11 @@ def run(
         for strength in STRENGTHS
     ]
     numbers = range(seed, seed + seeds)
-    groups = {(c, m): (MACHINE, c, m) for c in conditions for m in METHODS}
+    groups = {
+        (c, m): Cell(MACHINE, c, m, seed, episodes) for c in conditions for m in METHODS
+    }
     with new_run(out, "reproduce mismatch") as writer:
-        table, details = study(
-            groups, numbers, episodes, out, workers=workers, progress=progress
-        )
+        table, details = study(groups, numbers, out, workers=workers, progress=progress)
         words = f"sim2gp reproduce mismatch --seed {seed} --seeds {seeds} "
         words += f"--episodes {episodes}{' --quick' if quick else ''}"
         summary: dict[str, Any] = {

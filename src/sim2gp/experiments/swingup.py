@@ -219,18 +219,17 @@ def fly_cell(cell: Cell, out: Path) -> dict[str, Any]:
 
 
 def study(
-    groups: Mapping[Group, tuple[str, str, str]],
+    groups: Mapping[Group, Cell],
     seeds: Sequence[int],
-    episodes: int,
     out: Path,
     *,
     workers: int,
     progress: Progress,
 ) -> tuple[dict[Group, Float[np.ndarray, "seeds E"]], dict[str, Any]]:
-    """Scores of each group (machine, condition, method), and what a summary tells."""
+    """Scores of each group's cell, flown with every seed, and what a summary tells."""
     cells = {
-        group: [Cell(*where, seed, episodes) for seed in seeds]
-        for group, where in groups.items()
+        group: [replace(cell, seed=seed) for seed in seeds]
+        for group, cell in groups.items()
     }
     every = list(chain.from_iterable(cells.values()))
     flown = fly_cells(every, out, workers=workers, progress=progress)
@@ -238,7 +237,7 @@ def study(
         group: scores(
             [flown[cell] for cell in row],
             [flown[reference(cell)] for cell in row],
-            episodes,
+            groups[group].episodes,
         )
         for group, row in cells.items()
     }
@@ -260,8 +259,9 @@ def fly_cells(
         for stage in stages:
             groups: dict[Any, list[Cell]] = {}
             for cell in stage:
-                where = cell.condition if cell.method == "oracle" else ""
-                learner = cell.method, cell.update_every, where
+                # An oracle plans in the effect itself, at any strength.
+                kind = cell.condition.split()[0] if cell.method == "oracle" else ""
+                learner = cell.method, cell.update_every, kind
                 alike = cell.machine if whole else (cell.machine, *learner)
                 groups.setdefault(alike, []).append(cell)
             work = partial(fly_cell, out=out)
@@ -303,6 +303,11 @@ def first_at(
     """The first episode, from 1, whose score is at least ``solved``; inf if never."""
     reached = np.where(np.isfinite(score), score, -np.inf) >= solved
     return np.where(reached.any(axis=1), 1.0 + reached.argmax(axis=1), np.inf)
+
+
+def median_episode(episodes: Float[np.ndarray, " seeds"]) -> float:
+    """The median of what may be infinite: the lower of the two middle ones."""
+    return float(np.sort(episodes)[(len(episodes) - 1) // 2])
 
 
 def told(flown: Mapping[Cell, Mapping[str, Any]]) -> dict[str, Any]:

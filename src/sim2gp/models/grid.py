@@ -104,6 +104,11 @@ def on_grid(
     return np.stack(y, axis=1), np.stack(bad, axis=1) < 1e-9
 
 
+def parabola(age: Float[np.ndarray, " L"]) -> Float[np.ndarray, "3 L"]:
+    """Weights of samples at ``age``: value, slope and curvature/2 of their parabola."""
+    return np.asarray(np.linalg.pinv(np.vander(age, ORDER + 1, increasing=True)))
+
+
 def slopes(
     y: Float[np.ndarray, "N c"], *, causal: bool
 ) -> tuple[Float[np.ndarray, "N c"], Float[np.ndarray, "N c"]]:
@@ -113,8 +118,7 @@ def slopes(
     """
     half = 0 if causal else SAMPLES // 2
     age = PERIOD * (np.arange(SAMPLES) - (SAMPLES - 1 - half))
-    powers = np.vander(age, ORDER + 1, increasing=True)
-    weights = np.linalg.pinv(powers)[:2]
+    weights = parabola(age)[:2]
     value, slope = np.full_like(y, np.nan), np.full_like(y, np.nan)
     if len(y) < SAMPLES:
         return value, slope
@@ -137,13 +141,25 @@ def _states(
 ) -> tuple[Float[np.ndarray, "N n"], Float[np.ndarray, "N n"]]:
     """Every sample's state as a forecast would start, and its centred estimate."""
     (_, causal), (value, centred) = slopes(y, causal=True), slopes(y, causal=False)
-    start, smooth = np.zeros((2, len(y), len(states)))
+    start = states_from(y, causal, states, measured)
+    return start, states_from(value, centred, states, measured)
+
+
+def states_from(
+    value: Float[np.ndarray, "N c"],
+    slope: Float[np.ndarray, "N c"],
+    states: Sequence[str],
+    measured: Sequence[str],
+) -> Float[np.ndarray, "N n"]:
+    """States by measured values, and by slopes where a velocity is not measured.
+
+    Zero where neither it nor its position is.
+    """
+    out = np.zeros((len(value), len(states)))
     for i, name in enumerate(states):
         position = name.removesuffix(".velocity")
         if name in measured:
-            c = measured.index(name)
-            start[:, i], smooth[:, i] = y[:, c], value[:, c]
+            out[:, i] = value[:, measured.index(name)]
         elif position in measured:
-            c = measured.index(position)
-            start[:, i], smooth[:, i] = causal[:, c], centred[:, c]
-    return start, smooth
+            out[:, i] = slope[:, measured.index(position)]
+    return out

@@ -24,7 +24,14 @@ from jaxtyping import Key as KeyArray
 from sim2gp.logs import Log
 from sim2gp.models.base import AbstractBelief
 from sim2gp.models.cutting import inputs_since, knots_of, measured_states
-from sim2gp.models.grid import ORDER, PERIOD, SAMPLES, Grid, on_grid
+from sim2gp.models.grid import (
+    PERIOD,
+    SAMPLES,
+    Grid,
+    on_grid,
+    parabola,
+    states_from,
+)
 from sim2gp.models.windows import Windows, simulate
 from sim2gp.systems.actuator import Actuated
 from sim2gp.systems.base import AbstractSystem
@@ -188,8 +195,7 @@ def _parabolas(y: Float[np.ndarray, "N L c"]) -> Float[np.ndarray, "N 3 c"]:
     """Coefficients of the parabola through each window, time from its middle."""
     half = SAMPLES // 2
     age = PERIOD * np.arange(-half, half + 1)
-    weights = np.linalg.pinv(np.vander(age, ORDER + 1, increasing=True))
-    return np.asarray(np.einsum("kl,nlc->nkc", weights, y))
+    return np.asarray(np.einsum("kl,nlc->nkc", parabola(age), y))
 
 
 def _state(
@@ -201,13 +207,7 @@ def _state(
     """The state at ``t`` by parabolas: values, and slopes for unmeasured velocities."""
     value = local[:, 0] + t * (local[:, 1] + t * local[:, 2])
     slope = local[:, 1] + 2.0 * t * local[:, 2]
-    out = np.zeros((len(local), len(names)))
-    for i, name in enumerate(names):
-        if name in measured:
-            out[:, i] = value[:, measured.index(name)]
-        elif name.removesuffix(".velocity") in measured:
-            out[:, i] = slope[:, measured.index(name.removesuffix(".velocity"))]
-    return out
+    return states_from(value, slope, names, measured)
 
 
 def steps_of_grid(

@@ -22,9 +22,7 @@ PATIENCE = 1.0  # s between looks at whether the processes still live
 
 def cores() -> int:
     """How many cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return len(_allowed())
 
 
 def spread(
@@ -71,10 +69,10 @@ def spread(
 
 
 def _allowed() -> Sequence[int | None]:
-    """The cores of this process, or no core in particular."""
+    """The cores of this process; None for each where the system does not name them."""
     if hasattr(os, "sched_getaffinity"):
         return sorted(os.sched_getaffinity(0))
-    return [None]
+    return [None] * (os.cpu_count() or 1)
 
 
 def _start(process: Any, core: int | None) -> None:
