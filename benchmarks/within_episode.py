@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sim2gp.experiments.figure2 import interval
+from sim2gp.experiments.claims import interval
 from sim2gp.experiments.swingup import (
     Cell,
     best_seen,

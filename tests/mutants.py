@@ -19,8 +19,9 @@ from mutant_list import MUTANTS as PHYSICS
 from mutant_list import Hunt, Mutant
 from mutant_misfit import MISFIT
 from mutant_networks import NETWORKS
+from mutant_studies import STUDIES
 
-MUTANTS = (*PHYSICS, *NETWORKS, *MISFIT)
+MUTANTS = (*PHYSICS, *NETWORKS, *MISFIT, *STUDIES)
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "src" / "sim2gp"

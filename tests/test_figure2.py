@@ -70,16 +70,6 @@ def test_claims_see_what_was_planted():
         json.dumps(claim, allow_nan=False)
 
 
-def test_a_bootstrap_interval_covers_the_mean():
-    """Of normal samples: the central 95 % is mean -+ 1.96 sd / sqrt(n), nearly."""
-    rng = np.random.default_rng(3)
-    sample = rng.standard_normal(200)
-    low, high = figure2.interval(sample, rng)
-    half = 1.96 * sample.std() / np.sqrt(200)
-    assert low == pytest.approx(sample.mean() - half, abs=0.02)
-    assert high == pytest.approx(sample.mean() + half, abs=0.02)
-
-
 def test_a_finished_cell_is_not_flown_again(tmp_path: Path, monkeypatch):
     cells = Cells(tmp_path / "fig2")
     cell = Cell("furuta", "nominal", "SIM2GP", 3, 2)

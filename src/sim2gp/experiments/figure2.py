@@ -12,6 +12,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from sim2gp.experiments.claims import (
+    SAMPLING_PAYS,
+    at_least_as_good,
+    better_somewhere,
+    claim,
+)
 from sim2gp.experiments.record import provenance
 from sim2gp.experiments.swingup import (
     CONDITIONS,
@@ -29,7 +35,6 @@ from sim2gp.tasks import MACHINES, SOLVED
 SEEDS, EPISODES = 5, 10
 QUICK_SEEDS, QUICK_EPISODES = 2, 4
 CLAIM_EPISODES = 5  # claims compare means of the best-seen score over these
-RESAMPLES = 4000
 
 Table = dict[tuple[str, str, str], Float[np.ndarray, "seeds E"]]
 
@@ -107,7 +112,7 @@ def claims(table: Table, rng: np.random.Generator) -> dict[str, dict[str, Any]]:
             m: median_episode(reached[*nominal, m]) for m in ("SIM2GP", "RES", "NLM")
         }
         best = max(soon["SIM2GP"], soon["RES"])
-        out[f"{machine}_physics_learns_twice_as_fast"] = _claim(
+        out[f"{machine}_physics_learns_twice_as_fast"] = claim(
             best <= 2.0 and soon["NLM"] >= 2.0 * best,
             ", ".join(f"{m} {x:g}" for m, x in soon.items()),
             "without mismatch SIM2GP and RES reach 95 % by episode 2 and NLM needs at "
@@ -117,7 +122,7 @@ def claims(table: Table, rng: np.random.Generator) -> dict[str, dict[str, Any]]:
             "RES", {m: early[*nominal, m] for m in rivals}, rng, "without mismatch"
         )
         share = float(np.mean(np.isfinite(reached[*wrong, "SIM2GP"])))
-        out[f"{machine}_physics_alone_fails_under_mismatch"] = _claim(
+        out[f"{machine}_physics_alone_fails_under_mismatch"] = claim(
             share == 0.0,
             f"{share:.0%} of seeds reach 95 %",
             "under mismatch pure SIM2GP never reaches 95 %",
@@ -126,26 +131,20 @@ def claims(table: Table, rng: np.random.Generator) -> dict[str, dict[str, Any]]:
             "FS literal", {m: early[*wrong, m] for m in rivals}, rng, "under mismatch"
         )
         needed = median_episode(reached[*wrong, "RES-FS"])
-        out[f"{machine}_RES_FS_solves_mismatch_in_three"] = _claim(
+        out[f"{machine}_RES_FS_solves_mismatch_in_three"] = claim(
             needed <= 3.0,
             f"median episode {needed:g}",
             "under mismatch RES-FS reaches 95 % in at most 3 episodes",
         )
-    out["sampling_beats_the_point_estimate_somewhere"] = _sampling(early, rng)
+    pairs = {
+        f"{m}, {c}": (early[m, c, "SIM2GP"], early[m, c, "point estimate"])
+        for m in MACHINES
+        for c in CONDITIONS
+    }
+    out["sampling_beats_the_point_estimate_somewhere"] = better_somewhere(
+        pairs, rng, SAMPLING_PAYS
+    )
     return out
-
-
-def _claim(holds: bool, figure: str, text: str) -> dict[str, Any]:
-    return {"holds": bool(holds), "figure": figure, "text": text}
-
-
-def interval(
-    difference: Float[np.ndarray, " seeds"], rng: np.random.Generator
-) -> tuple[float, float]:
-    """Central 95 % of the bootstrap distribution of a mean over seeds."""
-    which = rng.integers(len(difference), size=(RESAMPLES, len(difference)))
-    low, high = np.quantile(difference[which].mean(axis=1), [0.025, 0.975])
-    return float(low), float(high)
 
 
 def _best(
@@ -154,38 +153,9 @@ def _best(
     rng: np.random.Generator,
     when: str,
 ) -> dict[str, Any]:
-    """No other learner is better by more than chance explains."""
-    worst, figure = np.inf, ""
-    for other, score in early.items():
-        if other != name:
-            difference = early[name] - score
-            low, high = interval(difference, rng)
-            if high < worst:
-                worst = high
-                figure = (
-                    f"{difference.mean():+.3f} [{low:+.3f}, {high:+.3f}] to {other}"
-                )
     text = f"{when} {name} is at least as good as every other learned model"
-    return _claim(worst >= 0.0, figure, f"{text} (mean best-seen score, episodes 1-5)")
-
-
-def _sampling(
-    early: dict[tuple[str, str, str], Float[np.ndarray, " seeds"]],
-    rng: np.random.Generator,
-) -> dict[str, Any]:
-    """The cell where sampling gains most on its own point estimate."""
-    best, figure = -np.inf, ""
-    for machine in MACHINES:
-        for condition in CONDITIONS:
-            sampled = early[machine, condition, "SIM2GP"]
-            difference = sampled - early[machine, condition, "point estimate"]
-            low, high = interval(difference, rng)
-            if low > best:
-                best = low
-                figure = f"{machine}, {condition}: {difference.mean():+.3f} "
-                figure += f"[{low:+.3f}, {high:+.3f}]"
-    text = "posterior sampling is better than its point estimate in some cell"
-    return _claim(best > 0.0, figure, text)
+    score = "(mean best-seen score, episodes 1-5)"
+    return at_least_as_good(name, early, rng, f"{text} {score}")
 
 
 def _table(table: Table) -> dict[str, Any]:

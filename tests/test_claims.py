@@ -1,0 +1,60 @@
+"""Claims of studies: bootstrap intervals, comparisons, looking in many places."""
+
+import numpy as np
+import pytest
+
+from sim2gp.experiments import claims
+
+
+def rng() -> np.random.Generator:
+    return np.random.default_rng(3)
+
+
+def seeds(z: float, count: int = 20) -> np.ndarray:
+    """Differences whose mean is ``z`` standard errors from zero."""
+    x = np.random.default_rng(0).standard_normal(count)
+    x = (x - x.mean()) / x.std()
+    return x + z / np.sqrt(count)
+
+
+@pytest.mark.parametrize(("level", "z"), [(0.95, 1.960), (0.5, 0.674)])
+def test_a_bootstrap_interval_covers_the_mean(level: float, z: float):
+    """Of normal samples: mean -+ z sd / sqrt(n), nearly."""
+    sample = np.random.default_rng(1).standard_normal(200)
+    low, high = claims.interval(sample, rng(), level)
+    half = z * sample.std() / np.sqrt(200)
+    assert low == pytest.approx(sample.mean() - half, abs=0.02)
+    assert high == pytest.approx(sample.mean() + half, abs=0.02)
+
+
+def test_every_resample_has_as_many_seeds():
+    weights = claims.resampled(7, rng())
+    np.testing.assert_array_equal(weights.sum(axis=1), 7.0)
+    assert weights.mean(axis=0) == pytest.approx(np.ones(7), abs=0.05)
+    assert weights.var(axis=0) == pytest.approx(np.full(7, 6 / 7), abs=0.08)
+
+
+def test_the_best_is_asked_of_all_others():
+    base = np.zeros(20)
+    rivals = {"RES": base, "close": base + seeds(1.0), "far": base - 5.0}
+    assert claims.at_least_as_good("RES", rivals, rng(), "")["holds"]
+    rivals["better"] = base + seeds(4.0)
+    found = claims.at_least_as_good("RES", rivals, rng(), "words")
+    assert not found["holds"]
+    assert found["figure"].endswith("to better")
+    assert found["text"] == "words"
+
+
+def test_who_looks_in_many_places_needs_more():
+    """2.4 standard errors are something in one place and nothing in fifteen."""
+    base = np.zeros(20)
+    places = {"here": (seeds(2.4), base)}
+    found = claims.better_somewhere(places, rng(), "")
+    assert found["holds"]
+    assert found["figure"].startswith("here: +0.53")
+    places |= {f"place {i}": (seeds(-1.0), base) for i in range(14)}
+    assert not claims.better_somewhere(places, rng(), "")["holds"]
+    places["there"] = (seeds(6.0), base)
+    found = claims.better_somewhere(places, rng(), "")
+    assert found["holds"]
+    assert found["figure"].startswith("there: ")
