@@ -92,6 +92,31 @@ def test_a_finished_cell_is_not_flown_again(tmp_path: Path, monkeypatch):
     assert cells.load(cell.name, cell.arguments) is None
 
 
+def test_a_quick_look_has_a_planner_and_cells_of_its_own(monkeypatch):
+    """For the oracle as well: a score is relative to the planner that flew."""
+    full = Cell("furuta", "nominal", "SIM2GP", 0, 2)
+    quick = dataclasses.replace(full, quick=True)
+    assert quick.name != full.name
+    assert quick.arguments != full.arguments
+    assert swingup.reference(quick).name != swingup.reference(full).name
+    assert swingup.reference(quick).planner == quick.planner != full.planner
+    used = []
+    fly = lambda task, model, planner, **rest: used.append(planner)  # noqa: E731
+    monkeypatch.setattr(swingup, "psrl", fly)
+    swingup.learner_cell(quick, 0)
+    swingup.learner_cell(full, 0)
+
+    def accept(preset, system, planner, *, key):
+        used.append(planner)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(swingup, "accept_truth", accept)
+    for cell in (quick, full):
+        with pytest.raises(KeyboardInterrupt):
+            swingup.oracle_cell(swingup.reference(cell))
+    assert used == 2 * [swingup.QUICK_PLANNER, swingup.PLANNER]
+
+
 def test_the_figure_goes_on_where_it_was(tmp_path: Path, monkeypatch):
     """Interrupted after seven cells, the second run flies only what is missing."""
     flown: list[str] = []

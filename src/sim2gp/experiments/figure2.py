@@ -52,13 +52,14 @@ def run(
     """Fly the missing cells, check the claims, write the run; returns its summary.
 
     ``seeds`` and ``episodes`` None are the figure's own numbers. The cells of an
-    earlier run with the same ``out`` are used again, also for fewer episodes.
+    earlier run with the same ``out`` are used again, also for fewer episodes. A
+    ``quick`` look is planned with fewer sequences and has cells of its own.
     """
     started = time.perf_counter()
     seeds = seeds or (QUICK_SEEDS if quick else SEEDS)
     episodes = episodes or (QUICK_EPISODES if quick else EPISODES)
     groups = {
-        (m, c, w): Cell(m, c, w, seed, episodes)
+        (m, c, w): Cell(m, c, w, seed, episodes, quick=quick)
         for m in MACHINES
         for c in CONDITIONS
         for w in METHODS
@@ -81,7 +82,7 @@ def run(
             "claims": claims(table, np.random.default_rng(seed)),
             **details,
             "tables": [_table(table)],
-            **provenance(words + f"--episodes {episodes}", started),
+            **provenance(words + f"--episodes {episodes}{' --quick' * quick}", started),
         }
         arrays = {f"figure2/{'/'.join(k)}": v for k, v in table.items()}
         from sim2gp.report import figure2, figure_bytes, write_report

@@ -29,7 +29,7 @@ from sim2gp.models import (
     ResidualFunctionSpace,
     Sim2GP,
 )
-from sim2gp.planning import MPC
+from sim2gp.planning import ICEM, MPC
 from sim2gp.runs import Progress
 from sim2gp.runs.cells import Cells
 from sim2gp.runs.workers import spread
@@ -50,6 +50,8 @@ MISSING: dict[str, Effect] = {
 CONDITIONS = ("nominal", "mismatch")
 WITH_TERM = "SIM2GP with the term"
 PLANNER = MPC()
+#: Of a quick look: three sequences in five, in the same proportions.
+QUICK_PLANNER = MPC(update=ICEM(samples=96, elites=10))
 PERIOD = 0.02  # s, of the control on every task
 
 
@@ -108,6 +110,7 @@ class Cell:
     condition: ``nominal``, ``mismatch`` (figure 2's), or an effect of the catalogue and
         its strength, as in ``coulomb mild``.
     update_every: steps between updates within an episode; None is the paper's way.
+    quick: planned with fewer sequences, by the oracle as well.
     """
 
     machine: str
@@ -116,6 +119,12 @@ class Cell:
     seed: int
     episodes: int
     update_every: int | None = None
+    quick: bool = False
+
+    @property
+    def planner(self) -> MPC:
+        """Whoever learns, it is the same one."""
+        return QUICK_PLANNER if self.quick else PLANNER
 
     @property
     def name(self) -> str:
@@ -123,14 +132,16 @@ class Cell:
         words = [self.machine, self.condition, self.method, str(self.seed)]
         if self.update_every is not None:
             words.append(f"every {self.update_every}")
+        if self.quick:
+            words.append("quick")
         return "_".join(words).replace(" ", "-")
 
     @property
     def arguments(self) -> dict[str, Any]:
         """All that its returns depend on, but for how many of them there are."""
         told = asdict(self)
-        del told["episodes"]
-        return told | {"planner": str(PLANNER)}
+        del told["episodes"], told["quick"]
+        return told | {"planner": str(self.planner)}
 
 
 def missing(machine: str, condition: str) -> Effect:
@@ -159,7 +170,7 @@ def oracle_cell(cell: Cell) -> dict[str, Any]:
     found = accept_truth(
         lambda record: preset(record, effects),
         make(),
-        PLANNER,
+        cell.planner,
         key=jax.random.key(cell.seed),
     )
     return {
@@ -190,7 +201,7 @@ def learner_cell(cell: Cell, redrawn: int) -> dict[str, Any]:
         psrl(
             task,
             model,
-            PLANNER,
+            cell.planner,
             episodes=cell.episodes,
             key=key,
             history=simulator.history,
@@ -274,7 +285,7 @@ def fly_cells(
 
 def reference(cell: Cell) -> Cell:
     """The oracle's cell of the same machine."""
-    return Cell(cell.machine, cell.condition, "oracle", cell.seed, 0)
+    return replace(cell, method="oracle", episodes=0, update_every=None)
 
 
 def scores(
