@@ -1,10 +1,25 @@
-"""Mutants of the studies' verdicts: claims that hold too easily."""
+"""Mutants of plans and of studies' verdicts: worse plans, claims that hold easily."""
 
 from mutant_list import Mutant
 
+PLANS = "planning/mpc.py"
 CLAIMS, MAP = "experiments/claims.py", "experiments/mismatch.py"
 
 STUDIES = (
+    Mutant(
+        "plans: the longest promises most",
+        PLANS,
+        "jnp.argmax(best / jnp.asarray(steps, best.dtype))",
+        "jnp.argmax(best)",
+        ("test_planning.py", "promises_most"),
+    ),
+    Mutant(
+        "plans: an invalid one may promise",
+        PLANS,
+        "jnp.max(masked(r, valid))",
+        "jnp.max(r)",
+        ("test_planning.py", "promises_most"),
+    ),
     Mutant(
         "claims: many places count once",
         CLAIMS,

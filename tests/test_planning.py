@@ -1,5 +1,7 @@
 """Planners against closed forms: Riccati, exact spectra, effective sample sizes."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -30,7 +32,7 @@ from sim2gp.planning import (
     World,
 )
 from sim2gp.planning.base import DIVERGED, masked, rollout
-from sim2gp.planning.mpc import from_unit
+from sim2gp.planning.mpc import from_unit, promising
 from sim2gp.planning.mppi import softmax_of_size
 from sim2gp.planning.noise import colour_factor, coloured_noise
 
@@ -240,21 +242,46 @@ class Steps(AbstractObjective):
 
 
 def test_an_objective_may_carry_state() -> None:
-    total, valid = rollout(world(objective=Steps()), S0, jnp.zeros((9, 1)))
+    rewards, valid = rollout(world(objective=Steps()), S0, jnp.zeros((9, 1)))
     assert valid
-    assert float(total) == 36.0
+    np.testing.assert_array_equal(rewards, np.arange(9.0))
 
 
-def test_rollout_sums_the_rewards_of_the_simulated_states() -> None:
+def test_a_rollout_has_the_rewards_of_the_simulated_states() -> None:
     U = jax.random.normal(KEY, (7, 1))
     w = world()
-    s, expected = np.asarray(S0, float), 0.0
+    s, expected = np.asarray(S0, float), []
     for a in np.asarray(U, float):
         s = A @ s + B @ a
-        expected -= s @ Q @ s + a @ R @ a
-    total, valid = rollout(w, S0, U)
+        expected.append(-(s @ Q @ s + a @ R @ a))
+    rewards, valid = rollout(w, S0, U)
     assert valid
-    assert float(total) == pytest.approx(expected, rel=1e-5)
+    np.testing.assert_allclose(rewards, expected, rtol=1e-5)
+
+
+def test_the_length_that_promises_most_per_step_is_ranked() -> None:
+    """By hand: a valid sequence's best mean decides, all are ranked over its steps."""
+    rewards = jnp.asarray([[1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 4.0, 0.0], [9.0] * 4])
+    valid = jnp.asarray([True, True, False])
+    short = promising(rewards, valid, [2, 4])
+    assert short[:2].tolist() == [2.0, 0.0]  # 2/2 against 4/4: the shorter, on a tie
+    long = promising(rewards.at[1, 3].set(0.1), valid, [2, 4])
+    np.testing.assert_allclose(long[:2], [2.0, 4.1])
+    middle = promising(rewards, valid, [2, 3, 4])
+    assert middle[:2].tolist() == [2.0, 4.0]
+    # One length is the plain return.
+    np.testing.assert_array_equal(promising(rewards, valid, [4]), rewards.sum(axis=1))
+
+
+@pytest.mark.parametrize("planner", PLANNERS, ids=["icem", "mppi"])
+def test_one_length_is_a_plain_planner(planner: MPC) -> None:
+    """Three equal lengths rank as one does: the same actions."""
+    one, same = (
+        dataclasses.replace(planner, lengths=x) for x in ((1.0,), (1.0, 1.0, 1.0))
+    )
+    w = world()
+    first, second = (act(p, p.init(w, key=KEY), w, S0, key=KEY)[0] for p in (one, same))
+    np.testing.assert_array_equal(first, second)
 
 
 @pytest.mark.parametrize("planner", PLANNERS, ids=["icem", "mppi"])

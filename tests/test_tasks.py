@@ -50,7 +50,7 @@ def test_presets_are_as_registered(preset: object) -> None:
         system.parameters.nominal()
     )
     plan = (task.planning_horizon, task.planning_iterations, task.noise_colour)
-    assert plan == ((33, 4, 2.0) if furuta else (50, 3, 2.0))
+    assert plan == ((45, 4, 2.0) if furuta else (50, 3, 2.0))
     bound = [6.0, np.inf, 45.0, 75.0] if furuta else [1.05, np.inf, 4.5, 45.0]
     np.testing.assert_allclose(task.state_bound, bound, rtol=1e-6)
     assert float(task.actions.high[0]) == -float(task.actions.low[0])

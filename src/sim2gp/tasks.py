@@ -140,7 +140,7 @@ def furuta_swingup(
         start=_single(0.0, 0.0, 0.0, 0.0),
         start_sd=_single(0.02, 0.02, 0.02, 0.02),
         state_bound=3.0 * _single(2.0, math.inf, 15.0, 25.0),
-        planning_horizon=33,
+        planning_horizon=45,
         noise_colour=2.0,
     )
 

@@ -100,8 +100,8 @@ class AbstractPlanner(eqx.Module):
 
 def rollout(
     world: World, s: State, actions: Float[Array, "H m"]
-) -> tuple[Scalar, Bool[Array, ""]]:
-    """The return of one action sequence from ``s``, and whether it is valid."""
+) -> tuple[Float[Array, " H"], Bool[Array, ""]]:
+    """The rewards of one action sequence from ``s``, and whether it is valid."""
 
     def step(carry: Any, a: Action) -> tuple[Any, Scalar]:
         s, memory, valid = carry
@@ -111,8 +111,7 @@ def rollout(
 
     start = (s, world.objective.init(), jnp.all(jnp.isfinite(s)))
     (_, _, valid), rewards = jax.lax.scan(step, start, actions)
-    total = jnp.sum(rewards)
-    return total, valid & jnp.isfinite(total)
+    return rewards, valid & jnp.isfinite(jnp.sum(rewards))
 
 
 def masked(returns: Float[Array, " N"], valid: Bool[Array, " N"]) -> Float[Array, " N"]:
