@@ -165,10 +165,10 @@ NETWORKS = (
         ("test_function_space.py", "retrace"),
     ),
     Mutant(
-        "RES-FS: tt varied twice",
+        "RES-FS: constants as narrow as the rows say",
         "models/residual_function_space.py",
-        "return HybridBelief(sim, at_map(sim), kept,",
+        "return HybridBelief(sim, physics, kept,",
         "return HybridBelief(sim, sim.posterior, kept,",
-        ("test_function_space.py", "predictions_are"),
+        ("test_function_space.py", "as_wide_as"),
     ),
 )

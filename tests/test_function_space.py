@@ -256,7 +256,16 @@ def test_it_learns_what_the_simulator_cannot(fitted):
     assert np.all(np.asarray(belief.noise) > 0.04)
 
 
-def test_predictions_are_the_layers(fitted):
+def between(belief, a, b, phi_a, phi_b):
+    """Covariance of the changes at two inputs, of constants and layer, dense."""
+    S = np.asarray(belief.physics.scale) * float(belief.keep)
+    A, B = (np.asarray(x).reshape(D, P) @ S for x in (a, b))
+    c, scale = np.asarray(belief.head.output_scale), np.asarray(belief.head.layer.scale)
+    own = [x**2 * (phi_a @ L) @ (phi_b @ L) for x, L in zip(c, scale, strict=True)]
+    return A @ B.T + np.diag(own)
+
+
+def test_predictions_are_those_of_constants_and_layer(fitted):
     """Mean and variance at a point, from the belief's own arrays; draws likewise."""
     recipe, _, belief = fitted
     head = belief.head
@@ -266,11 +275,13 @@ def test_predictions_are_the_layers(fitted):
     if isinstance(recipe, ResidualFunctionSpace):
         tt = np.asarray(belief.sim.posterior.mean)
         mean = mean + np.asarray(a).reshape(D, P) @ tt
-    V = np.array([np.sum((np.asarray(L).T @ phi) ** 2) for L in head.layer.scale])
+    covariance = between(belief, a, a, phi, phi)
     latent = belief.latent(s, a)
     np.testing.assert_allclose(latent.mean, mean, rtol=1e-9)
-    np.testing.assert_allclose(latent.covariance(), np.diag(c**2 * V), rtol=1e-9)
-    gain = 0.5 * np.sum(np.log1p(c**2 * V / np.asarray(belief.noise) ** 2))
+    np.testing.assert_allclose(latent.covariance(), covariance, rtol=1e-9, atol=1e-15)
+    noise = np.asarray(belief.noise)
+    scaled = np.eye(D) + covariance / np.outer(noise, noise)
+    gain = 0.5 * np.linalg.slogdet(scaled)[1]
     assert float(belief.information_gain(s, a)) == pytest.approx(gain, rel=1e-9)
 
     @eqx.filter_jit
@@ -280,30 +291,27 @@ def test_predictions_are_the_layers(fitted):
 
     n = 10_000
     got = np.asarray(values(jax.random.split(KEY, n)), float)
-    sd = c * np.sqrt(V)
+    sd = np.sqrt(np.diag(covariance))
     assert np.all(np.abs(got.mean(0) - mean) <= 4.5 * sd / np.sqrt(n) + 1e-6)
     np.testing.assert_allclose(got.std(0), sd, rtol=4.5 / np.sqrt(2 * n))
     x = s.astype(jnp.float32), a.astype(jnp.float32)
     np.testing.assert_allclose(belief.point()(*x), mean, rtol=1e-4)
 
 
-def test_update_conditions_the_layer(fitted):
+def test_update_conditions_constants_and_layer(fitted):
     recipe, _, belief = fitted
     s, a, s2 = jnp.zeros(D), jnp.linspace(-0.3, 0.4, D * P), jnp.asarray([0.2, -0.1])
     t, b = jnp.zeros(D), jnp.linspace(0.2, -0.4, D * P)
     later = eqx.filter_jit(recipe.update)(belief, s, a, s2)
-    c, noise = np.asarray(belief.head.output_scale), np.asarray(belief.noise)
+    noise = np.asarray(belief.noise)
     one, two = (np.asarray(belief.head.phi(*x)) for x in ((s, a), (t, b)))
-    expected, var = np.asarray(belief.latent(t, b).mean).copy(), []
-    for k in range(D):
-        S = np.asarray(belief.head.layer.scale[k])
-        S = c[k] ** 2 * S @ S.T
-        gain = two @ S @ one / (one @ S @ one + noise[k] ** 2)
-        expected[k] += gain * (s2[k] - belief.latent(s, a).mean[k])
-        var.append(two @ S @ two - gain * (one @ S @ two))
+    here = between(belief, a, a, one, one) + np.diag(noise**2)
+    gain = between(belief, b, a, two, one) @ np.linalg.inv(here)
+    expected = belief.latent(t, b).mean + gain @ (s2 - belief.latent(s, a).mean)
+    left = between(belief, b, b, two, two) - gain @ between(belief, a, b, one, two)
     got = later.latent(t, b)
     np.testing.assert_allclose(got.mean, expected, rtol=1e-8)
-    np.testing.assert_allclose(np.diag(got.covariance()), var, rtol=1e-8)
+    np.testing.assert_allclose(got.covariance(), left, rtol=1e-7, atol=1e-12)
     # A later fit starts from that posterior in its own coordinates.
     q = module.start(later, later.sim, later.head.output_scale, 0.3)
     L, S = np.asarray(q.factor, float), np.asarray(later.head.layer.scale)

@@ -1,11 +1,12 @@
 """RES-FS: physics plus a residual that is told where it has no business.
 
-    f(x) = f(x, tt*) + c (.) W^T phi(x),        c = 3 sig_sim
+    f(x) = f(x, tt) + c (.) W^T phi(x),        c = 3 sig_sim
 
-The residual is trained as in `matching`, with mean zero and covariance
-``J Sq J^T + Se_sim`` as its target: far from the data it returns to the simulator, with
-the simulator's uncertainty and its fitted discrepancy as *epistemic* variance. That
-variance is the layer's, so a draw varies ``W`` alone.
+The residual is trained as in `matching`, with mean zero and covariance ``Se_sim`` as
+its target: far from the data it returns to the simulator, with the simulator's fitted
+discrepancy as *epistemic* variance. The constants keep their own spread, as wide as
+the data's parts disagree about them (`tempering`): beyond the box that the layer was
+matched on physics says how uncertainty grows, which saturated features cannot.
 """
 
 from collections.abc import Mapping
@@ -18,7 +19,6 @@ from sim2gp.models import features, hybrid, matching, nlm
 from sim2gp.models.base import AbstractBelief, AbstractModel
 from sim2gp.models.features import Encoding
 from sim2gp.models.function_space import (
-    at_map,
     budget_of,
     head_of,
     objective_of,
@@ -28,6 +28,7 @@ from sim2gp.models.hybrid import HybridBelief
 from sim2gp.models.matching import Budget, Objective
 from sim2gp.models.residual import SCALE
 from sim2gp.models.sim2gp import Sim2GP, Sim2GPBelief
+from sim2gp.models.tempering import tempered
 from sim2gp.transitions import Transitions
 from sim2gp.types import Action, Key, State, in_float64
 
@@ -108,15 +109,14 @@ def _fit(
     pool, training = jax.random.split(key)
     head, mask = belief.head, data.mask
     X, y = features.encoded(head.encoding, data)
-    r, _, _ = hybrid.residuals(sim, data, y)
+    r, _, J = hybrid.residuals(sim, data, y)
+    physics, _ = tempered(sim, r, J, mask)
     c = SCALE * sim.noise
     S, A = matching.inputs(pool, head.encoding, data, POOL)
-    every = jnp.ones(len(S), bool)
-    _, J = hybrid.physics_rows(sim, sim.posterior.mean, S, A, every)
     target = matching.targets(
         jax.vmap(head.encoding)(S, A),
         jnp.zeros((len(S), c.size)),
-        (J @ sim.posterior.scale) / c[None, :, None],
+        jnp.zeros((len(S), c.size, 0)),  # the constants' spread is not the layer's
         sim.noise / c,
         objective.sets,
     )
@@ -132,4 +132,4 @@ def _fit(
     )
     head = head_of(belief, q, noise, c)
     kept = jnp.ones(())
-    return HybridBelief(sim, at_map(sim), kept, head, noise * c, jnp.sum(mask))
+    return HybridBelief(sim, physics, kept, head, noise * c, jnp.sum(mask))

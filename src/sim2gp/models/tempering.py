@@ -1,0 +1,64 @@
+"""How far a posterior is to be trusted elsewhere: parts of the data give evidence.
+
+A wrong simulator leaves residuals that are no independent noise: one part of the data
+pulls the constants one way, another part the other way. With ``g_n`` the score of row
+``n`` in whitened coordinates and ``R^T R`` the posterior's precision, the pull of part
+``b`` in posterior standard deviations is ``u_b = R^-T sum_{n in b} g_n``. Where the
+model is right, ``sum_b u_b u_b^T`` has the identity as its mean, but for the prior's
+share (the information identity). Its largest eigenvalue, if above one, is how many rows
+say no more than one; the posterior in which all rows count that much less,
+
+    Sigma_z = (R_d^T R_d / kappa^2 + I)^-1,
+
+is as wide as the parts disagree. Parts are a fixed share of the data: where parts keep
+contradicting each other more rows do not make the constants certain. (A power
+posterior: Gruenwald and van Ommen 2017, arXiv 1412.3730; its rate by batch means of
+the scores, as in the magnitude adjustment of composite likelihoods, Ribatet, Cooley and
+Davison 2012, arXiv 0911.5357.)
+"""
+
+import jax
+import jax.numpy as jnp
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, Bool, Float
+
+from sim2gp.gaussian import Gaussian
+from sim2gp.least_squares import stack
+from sim2gp.models.sim2gp import Sim2GPBelief
+from sim2gp.types import Scalar
+
+#: Successive parts of the data, each of as many rows.
+PARTS = 10
+
+
+def tempered(
+    belief: Sim2GPBelief,
+    r: Float[Array, "N d"],
+    J: Float[Array, "N d p"],
+    mask: Bool[Array, " N"],
+) -> tuple[Gaussian, Scalar]:
+    """The constants' posterior as wide as the data's parts disagree, and ``kappa``.
+
+    ``r`` are the residuals of the steps at the MAP and ``J`` their Jacobian in the
+    virtual constants, state units; masked rows are zero.
+    """
+    prior = belief.prior.scale
+    scores = jnp.einsum("ndp,nd->np", J, r / belief.noise[None] ** 2) @ prior
+    kappa = jnp.maximum(1.0, disagreement(belief.information, scores, mask))
+    precision = stack(belief.information / kappa, jnp.eye(len(prior)))
+    scale = solve_triangular(precision, prior.T, trans="T").T
+    return Gaussian(belief.posterior.mean, scale), kappa
+
+
+def disagreement(
+    information: Float[Array, "p p"],
+    scores: Float[Array, "N p"],
+    mask: Bool[Array, " N"],
+) -> Scalar:
+    """The largest pull of the parts together, in posterior standard deviations."""
+    count = jnp.maximum(jnp.sum(mask), 1)
+    part = (jnp.cumsum(mask) - 1) * PARTS // count
+    pulls = jax.ops.segment_sum(scores, part, PARTS)
+    R = stack(information, jnp.eye(scores.shape[1]))
+    pulls = solve_triangular(R, pulls.T, trans="T").T
+    return jnp.linalg.norm(pulls, ord=2)

@@ -1,0 +1,131 @@
+"""How many rows say no more than one: pulls of the data's parts, by other means."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from linear_system import linear, transitions
+from sim2gp.models import ResidualFunctionSpace, Sim2GP, hybrid
+from sim2gp.models.tempering import PARTS, disagreement, tempered
+
+P, D = 3, 2
+KEY = jax.random.key(0)
+
+
+@pytest.fixture(autouse=True)
+def float64():
+    with jax.enable_x64(True):
+        yield
+
+
+def rows(N, seed=0, bent=0.0):
+    """Rows of a linear machine; ``bent`` is what it does that no constants explain."""
+    rng = np.random.default_rng(seed)
+    J = rng.uniform(-1.0, 1.0, (N, D, P))
+    y = J @ np.array([0.7, -0.4, 1.1]) + 0.1 * rng.standard_normal((N, D))
+    # Slowly, so that whole parts of the data are off to the same side.
+    y += bent * np.sin(2 * np.pi * np.arange(N) / N)[:, None] * J[:, :, 0]
+    return J, y
+
+
+def fit(J, y, capacity=None):
+    """SIM2GP's belief, residuals and Jacobians of the rows, and the mask."""
+    data = transitions(J, y)
+    if capacity is not None:
+        empty = type(data).empty(capacity, D, D * P)
+        data = empty.extend(data.state, data.action, data.next_state)
+    model = Sim2GP(linear(P, D), dt=1.0)
+    belief = model.fit(model.init(KEY), data, key=KEY)
+    data = jax.tree.map(jnp.asarray, data)
+    r, _, Jr = hybrid.residuals(belief, data, data.delta()[:, :D])
+    return belief, r, Jr, data.mask
+
+
+def test_pulls_by_hand():
+    """Against dense linear algebra, part by part; an uneven number of rows."""
+    rng = np.random.default_rng(1)
+    R, scores = np.triu(rng.standard_normal((P, P))), rng.standard_normal((73, P))
+    H = R.T @ R + np.eye(P)
+    parts = np.arange(73) * PARTS // 73
+    B = np.zeros((P, P))
+    for b in range(PARTS):
+        g = scores[parts == b].sum(axis=0)
+        B += np.outer(g, g)
+    largest = np.max(np.linalg.eigvals(np.linalg.solve(H, B)).real)
+    padded = jnp.asarray(np.concatenate([scores, np.zeros((55, P))]))
+    mask = jnp.arange(128) < 73
+    got = disagreement(jnp.asarray(R), padded, mask)
+    assert float(got) ** 2 == pytest.approx(largest, rel=1e-10)
+
+
+def test_the_right_model_meets_the_information_identity():
+    """The pulls' second moment is the identity, less one part in all for the MAP."""
+    total, runs = np.zeros((P, P)), 60
+    for seed in range(runs):
+        belief, r, J, mask = fit(*rows(200, seed))
+        g = np.einsum("ndp,nd->np", J, np.asarray(r) / np.asarray(belief.noise) ** 2)
+        g = g @ np.asarray(belief.prior.scale)
+        R = np.asarray(belief.information)
+        L = np.linalg.cholesky(np.linalg.inv(R.T @ R + np.eye(P)))
+        pulls = g.reshape(PARTS, -1, P).sum(axis=1) @ L
+        total += pulls.T @ pulls / runs
+        kappa = float(tempered(belief, r, J, mask)[1])
+        assert kappa == pytest.approx(max(1.0, np.linalg.norm(pulls, 2)), rel=1e-6)
+    # A mean square of 60 x 9 independent pulls, and products that vanish.
+    expected = 1.0 - 1.0 / PARTS
+    np.testing.assert_allclose(np.diag(total), expected, atol=4.5 * 0.06)
+    np.testing.assert_allclose(total - np.diag(np.diag(total)), 0.0, atol=4.5 * 0.045)
+
+
+def test_rows_said_twice_say_nothing_new():
+    """Every row five times over, one after the other: the same posterior as once."""
+    J, y = rows(400, bent=1.0)
+    once, again = fit(J, y), fit(np.repeat(J, 5, axis=0), np.repeat(y, 5, axis=0))
+    (one, kappa), (five, more) = tempered(*once), tempered(*again)
+    assert float(more / kappa) == pytest.approx(np.sqrt(5.0), rel=0.01)
+    np.testing.assert_allclose(five.covariance(), one.covariance(), rtol=0.02)
+    plain = np.diag(again[0].posterior.covariance() / once[0].posterior.covariance())
+    np.testing.assert_allclose(plain, 0.2, rtol=0.02)
+
+
+def test_what_contradicts_itself_stays_wide():
+    """Sixteen times the rows, and as much disagreement between the parts."""
+    spreads, plain = [], []
+    for N in (400, 6400):
+        belief, *arrays = fit(*rows(N, bent=1.0))
+        spreads.append(float(tempered(belief, *arrays)[0].sd()[0]))
+        plain.append(float(belief.posterior.sd()[0]))
+    assert spreads[1] == pytest.approx(spreads[0], rel=0.15)
+    assert plain[1] == pytest.approx(plain[0] / 4.0, rel=0.1)
+
+
+def test_never_narrower_than_the_posterior():
+    belief, r, J, mask = fit(*rows(100), capacity=256)
+    wide, kappa = tempered(belief, 0.0 * r, J, mask)
+    assert float(kappa) == 1.0
+    np.testing.assert_allclose(
+        wide.covariance(), belief.posterior.covariance(), rtol=1e-12
+    )
+    np.testing.assert_array_equal(wide.mean, belief.posterior.mean)
+    assert np.isnan(float(tempered(belief, r.at[3].set(jnp.nan), J, mask)[1]))
+
+
+def test_the_residual_model_is_as_wide_as_its_data_disagree():
+    J, y = rows(300, bent=1.5)
+    options = {"hidden": (8,), "steps": 100, "refit_steps": 100}
+    model = ResidualFunctionSpace(Sim2GP(linear(P, D), dt=1.0), **options)
+    belief = model.fit(model.init(KEY), transitions(J, y), key=KEY)
+    alone, *arrays = fit(J, y)
+    expected, kappa = tempered(alone, *arrays)
+    assert kappa > 3.0
+    np.testing.assert_allclose(
+        belief.physics.covariance(), expected.covariance(), rtol=1e-6
+    )
+    flat = eqx.tree_at(lambda b: b.head.layer.scale, belief, replace_fn=jnp.zeros_like)
+    s, a = jnp.zeros(D), jnp.ones(D * P)
+    A = np.ones((D, P))
+    np.testing.assert_allclose(
+        flat.latent(s, a).covariance(), A @ expected.covariance() @ A.T, rtol=1e-6
+    )
