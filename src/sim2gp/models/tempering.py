@@ -3,10 +3,11 @@
 A wrong simulator leaves residuals that are no independent noise: one part of the data
 pulls the constants one way, another part the other way. With ``g_n`` the score of row
 ``n`` in whitened coordinates and ``R^T R`` the posterior's precision, the pull of part
-``b`` in posterior standard deviations is ``u_b = R^-T sum_{n in b} g_n``. Where the
-model is right, ``sum_b u_b u_b^T`` has the identity as its mean, but for the prior's
-share (the information identity). Its largest eigenvalue, if above one, is how many rows
-say no more than one; the posterior in which all rows count that much less,
+``b`` in posterior standard deviations is ``u_b = R^-T sum_{n in b} g_n``. At the MAP of
+the right model ``sum_b u_b u_b^T`` has the mean ``(1 - 1/B) I``, but for the prior's
+share: the information identity, less one part in ``B`` because all pulls add up to
+nothing. Its largest eigenvalue in these units, if above one, is how many rows say no
+more than one; the posterior in which all rows count that much less,
 
     Sigma_z = (R_d^T R_d / kappa^2 + I)^-1,
 
@@ -27,8 +28,9 @@ from sim2gp.least_squares import stack
 from sim2gp.models.sim2gp import Sim2GPBelief
 from sim2gp.types import Scalar
 
-#: Successive parts of the data, each of as many rows.
-PARTS = 10
+#: Successive parts of the data, each of as many rows: few, for within a part rows may
+#: be as dependent as they like.
+PARTS = 5
 
 
 def tempered(
@@ -55,10 +57,10 @@ def disagreement(
     scores: Float[Array, "N p"],
     mask: Bool[Array, " N"],
 ) -> Scalar:
-    """The largest pull of the parts together, in posterior standard deviations."""
+    """The largest pull of the parts together; one is what the right model expects."""
     count = jnp.maximum(jnp.sum(mask), 1)
     part = (jnp.cumsum(mask) - 1) * PARTS // count
     pulls = jax.ops.segment_sum(scores, part, PARTS)
     R = stack(information, jnp.eye(scores.shape[1]))
     pulls = solve_triangular(R, pulls.T, trans="T").T
-    return jnp.linalg.norm(pulls, ord=2)
+    return jnp.linalg.norm(pulls, ord=2) / jnp.sqrt(1.0 - 1.0 / PARTS)
