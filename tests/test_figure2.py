@@ -13,6 +13,7 @@ from sim2gp.planning import MPC
 from sim2gp.report import figure2 as drawn
 from sim2gp.runs import Progress
 from sim2gp.runs.cells import Cells
+from sim2gp.runs.plain import source
 from sim2gp.tasks import MACHINES
 
 ORACLE = {"hang_return": 50.0, "oracle_return": 150.0, "redrawn": 1, "returns": [150.0]}
@@ -84,12 +85,33 @@ def test_a_finished_cell_is_not_flown_again(tmp_path: Path, monkeypatch):
     monkeypatch.setattr(swingup, "learner_cell", lambda cell, redrawn: {"returns": []})
     monkeypatch.setattr(swingup, "oracle_cell", lambda cell: ORACLE)
     more = dataclasses.replace(cell, episodes=4)
-    assert swingup.fly_cell(more, tmp_path / "fig2") == {"returns": []}
-    monkeypatch.setattr(swingup, "PLANNER", MPC(horizon=7))
-    assert cells.load(cell.name, cell.arguments) is None
+    flown = swingup.fly_cell(more, tmp_path / "fig2")
+    assert flown == {"returns": [], "source": source()}
+    for other in (MPC(horizon=7), MPC(lengths=(0.5, 1.0))):
+        monkeypatch.setattr(swingup, "PLANNER", other)
+        assert cells.load(cell.name, cell.arguments) is None
     # Damaged, it counts as missing.
     (cells.folder / f"{cell.name}.json").write_text('{"arguments": ')
     assert cells.load(cell.name, cell.arguments) is None
+
+
+def test_a_changed_default_of_the_planner_is_another_planner(monkeypatch):
+    """Named by its class and what was passed alone, old cells would count as new."""
+    cell = Cell("furuta", "nominal", "SIM2GP", 3, 2)
+    before = cell.arguments
+    assert before["planner"]["update"]["type"] == "ICEM"
+    assert before["planner"]["lengths"] == MPC().lengths
+    monkeypatch.setattr(swingup, "PLANNER", MPC(lengths=(1.0,)))
+    assert cell.arguments != before
+
+
+def test_cells_that_other_code_flew_are_counted(monkeypatch):
+    cell = Cell("furuta", "nominal", "SIM2GP", 3, 2)
+    value = {"returns": [1.0, 2.0], "failure": None, "seconds": 1.0}
+    older = dataclasses.replace(cell, seed=4)
+    told = swingup.told({cell: value | {"source": source()}, older: value})
+    assert told["source"] == source()
+    assert told["cells_of_other_source"] == 1
 
 
 def test_a_quick_look_has_a_planner_and_cells_of_its_own(monkeypatch):

@@ -16,8 +16,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+import sim2gp
 from sim2gp.errors import InputError, Sim2GPError
-from sim2gp.runs import DiskError, Progress, RunOwned, load_run, new_run
+from sim2gp.runs import DiskError, Progress, RunOwned, load_run, new_run, plain
 from sim2gp.runs.plain import to_json
 
 
@@ -304,3 +305,23 @@ def test_progress_lines(capsys: pytest.CaptureFixture[str]) -> None:
     assert list(quiet.track("abc", "letters")) == ["a", "b", "c"]
     quiet.say("nothing")
     assert capsys.readouterr().err == ""
+
+
+def test_the_source_is_named_by_what_it_says(tmp_path: Path):
+    (tmp_path / "cli").mkdir()
+    code, words = tmp_path / "code.py", tmp_path / "cli" / "words.py"
+    names = []
+    for text in (
+        'def f(x):\n    """Twice."""\n    return 2 * x\n',
+        '"""A file."""\n\ndef f(x):\n    return (2 * x)  # twice\n',
+        "def f(x):\n    return 3 * x\n",
+    ):
+        code.write_text(text)
+        words.write_text(text)
+        plain.source.cache_clear()
+        names.append(plain.source(tmp_path))
+    assert names[0] == names[1] != names[2]
+    words.write_text("")
+    plain.source.cache_clear()
+    assert plain.source(tmp_path) == names[2]
+    assert plain.source() == plain.source(Path(sim2gp.__file__).parent)

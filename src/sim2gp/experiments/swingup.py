@@ -6,7 +6,7 @@ returns and every argument that made them; a study is a list of cells.
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -32,6 +32,7 @@ from sim2gp.models import (
 from sim2gp.planning import ICEM, MPC
 from sim2gp.runs import Progress
 from sim2gp.runs.cells import Cells
+from sim2gp.runs.plain import source
 from sim2gp.runs.workers import spread
 from sim2gp.systems import Candidate
 from sim2gp.systems.base import AbstractMechanism
@@ -141,7 +142,15 @@ class Cell:
         """All that its returns depend on, but for how many of them there are."""
         told = asdict(self)
         del told["episodes"], told["quick"]
-        return told | {"planner": str(self.planner)}
+        return told | {"planner": _described(self.planner)}
+
+
+def _described(value: Any) -> Any:
+    """Its type and every argument, defaults as well: those may change."""
+    if not is_dataclass(value):
+        return value
+    arguments = {f.name: _described(getattr(value, f.name)) for f in fields(value)}
+    return {"type": type(value).__name__} | arguments
 
 
 def missing(machine: str, condition: str) -> Effect:
@@ -215,7 +224,10 @@ def learner_cell(cell: Cell, redrawn: int) -> dict[str, Any]:
 
 
 def fly_cell(cell: Cell, out: Path) -> dict[str, Any]:
-    """A cell's values, from the disk if it was flown for as many episodes."""
+    """A cell's values, from the disk if it was flown for as many episodes.
+
+    They name the code that flew them, which may be an older one's: `told` counts those.
+    """
     cells = Cells(out)
     stored = cells.load(cell.name, cell.arguments)
     if stored is not None and (
@@ -223,10 +235,11 @@ def fly_cell(cell: Cell, out: Path) -> dict[str, Any]:
     ):
         return stored
     if cell.method == "oracle":
-        return cells.save(cell.name, cell.arguments, oracle_cell(cell))
-    oracle = fly_cell(reference(cell), out)
-    values = learner_cell(cell, int(oracle["redrawn"]))
-    return cells.save(cell.name, cell.arguments, values)
+        values = oracle_cell(cell)
+    else:
+        oracle = fly_cell(reference(cell), out)
+        values = learner_cell(cell, int(oracle["redrawn"]))
+    return cells.save(cell.name, cell.arguments, values | {"source": source()})
 
 
 def study(
@@ -339,5 +352,9 @@ def told(flown: Mapping[Cell, Mapping[str, Any]]) -> dict[str, Any]:
             if value.get("failure")
         ],
         "redrawn_truths": redrawn,
+        "source": source(),
+        "cells_of_other_source": sum(
+            value.get("source") != source() for value in flown.values()
+        ),
         "seconds_of_cells": spent,
     }
