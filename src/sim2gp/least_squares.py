@@ -64,10 +64,16 @@ def posterior(full: Factor, z: Float[Array, " p"], prior: Gaussian) -> Gaussian:
 
     ``full`` is their factor at ``z``, which must be where its gradient is zero.
     """
-    return Gaussian(
-        prior.mean + prior.scale @ z,
-        solve_triangular(full[:-1, :-1], prior.scale.T, trans="T").T,
-    )
+    return Gaussian(prior.mean + prior.scale @ z, over(prior.scale, full[:-1, :-1]))
+
+
+def over(A: Float[Array, "q p"], R: Float[Array, "p p"]) -> Float[Array, "q p"]:
+    """``A R^-1`` of an upper-triangular ``R``.
+
+    With a prior's scale as ``A`` it is the posterior's, whose precision in the prior's
+    whitened coordinates is ``R^T R``.
+    """
+    return solve_triangular(R, A.T, trans="T").T
 
 
 def log_joint(full: Factor) -> Scalar:

@@ -16,6 +16,7 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
 from sim2gp.gaussian import LOG_2PI, Gaussian, lower_factor
+from sim2gp.least_squares import over
 from sim2gp.types import Scalar
 
 #: Variances, in units of the output's scale squared, tried when noise is recalibrated.
@@ -133,7 +134,7 @@ def joint_regression(
     table = jnp.concatenate([u_rows, target[:, None]], axis=1)
     R = _triangular(jnp.concatenate([table, eye]))
     u = solve_triangular(R[:p, :p], R[:p, p])
-    scale = solve_triangular(R[:p, :p], prior.scale.T, trans="T").T
+    scale = over(prior.scale, R[:p, :p])
     z = Gaussian(prior.mean + prior.scale @ u, scale)
 
     def back(block: Array) -> tuple[Array, Array, Array]:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 from sim2gp.arrowhead import Blocks, Noise
 from sim2gp.gaussian import LOG_2PI, Gaussian
 from sim2gp.laplace import AbstractLikelihood, Fit, expectation, multi_start
-from sim2gp.least_squares import factor, gauss_newton_step, stack, triangular
+from sim2gp.least_squares import factor, gauss_newton_step, over, stack, triangular
 from sim2gp.models import linearized
 from sim2gp.models.base import AbstractBelief, AbstractModel
 from sim2gp.systems.base import AbstractSystem
@@ -313,7 +313,7 @@ def _update(belief: Sim2GPBelief, s: Array, a: Array, s2: Array) -> Sim2GPBelief
     full = stack(jnp.concatenate([A, r[:, None]], axis=1), identity)
     scale = belief.posterior.scale
     mean = belief.posterior.mean + scale @ gauss_newton_step(full)
-    scale = jax.scipy.linalg.solve_triangular(full[:-1, :-1], scale.T, trans="T").T
+    scale = over(scale, full[:-1, :-1])
     # The same rows, whitened by the prior instead.
     J0 = jnp.linalg.solve(belief.posterior.scale.T, A.T).T @ belief.prior.scale
     predictive = Gaussian(latent.mean[:d], latent.scale[:d])

@@ -20,11 +20,10 @@ Davison 2012, arXiv 0911.5357.)
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
 from sim2gp.gaussian import Gaussian
-from sim2gp.least_squares import stack
+from sim2gp.least_squares import over, stack
 from sim2gp.models.sim2gp import Sim2GPBelief
 from sim2gp.types import Scalar
 
@@ -48,8 +47,7 @@ def tempered(
     scores = jnp.einsum("ndp,nd->np", J, r / belief.noise[None] ** 2) @ prior
     kappa = jnp.maximum(1.0, disagreement(belief.information, scores, mask))
     precision = stack(belief.information / kappa, jnp.eye(len(prior)))
-    scale = solve_triangular(precision, prior.T, trans="T").T
-    return Gaussian(belief.posterior.mean, scale), kappa
+    return Gaussian(belief.posterior.mean, over(prior, precision)), kappa
 
 
 def disagreement(
@@ -62,5 +60,4 @@ def disagreement(
     part = (jnp.cumsum(mask) - 1) * PARTS // count
     pulls = jax.ops.segment_sum(scores, part, PARTS)
     R = stack(information, jnp.eye(scores.shape[1]))
-    pulls = solve_triangular(R, pulls.T, trans="T").T
-    return jnp.linalg.norm(pulls, ord=2) / jnp.sqrt(1.0 - 1.0 / PARTS)
+    return jnp.linalg.norm(over(pulls, R), ord=2) / jnp.sqrt(1.0 - 1.0 / PARTS)
