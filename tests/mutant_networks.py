@@ -169,6 +169,6 @@ NETWORKS = (
         "models/residual_function_space.py",
         "return HybridBelief(sim, physics, kept,",
         "return HybridBelief(sim, sim.posterior, kept,",
-        ("test_function_space.py", "as_wide_as"),
+        ("test_tempering.py", "as_wide_as"),
     ),
 )

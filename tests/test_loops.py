@@ -23,7 +23,7 @@ from mass_task import (
     traces,
 )
 from sim2gp import flight, loops, tasks
-from sim2gp.errors import Sim2GPError
+from sim2gp.errors import NotFinite, Sim2GPError
 from sim2gp.flight import Trajectory, key_for, world_of
 from sim2gp.models.base import AbstractBelief
 from sim2gp.planning import MPC, AbstractPlanner, MarkovObjective, World
@@ -191,6 +191,8 @@ def test_truths_are_redrawn_until_the_oracle_swings_up(
 
     def judge(task: Task, planner: AbstractPlanner, *, key: Key) -> loops.OracleRun:
         asked.append(task)
+        if len(asked) == 1:
+            raise NotFinite("E203", "state 72")
         return loops.OracleRun(np.asarray([1.0, 3.0, 2.0]), len(asked) == 3)
 
     monkeypatch.setattr(loops, "fly_oracle", judge)
@@ -202,5 +204,6 @@ def test_truths_are_redrawn_until_the_oracle_swings_up(
     masses = {float(task.truth["arm_mass"]) for task in asked}
     assert len(masses) == 3
     asked.clear()
-    with pytest.raises(Sim2GPError, match="E204 no truth that MPC can swing up"):
+    told = "E204 no truth that MPC can swing up: got 2 draws .* 1 of them not finite"
+    with pytest.raises(Sim2GPError, match=told):
         loops.accept_truth(*arguments, key=KEY, attempts=2)

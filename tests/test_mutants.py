@@ -1,5 +1,7 @@
 """Every mutant exists in today's code; by night, every one is killed."""
 
+import ast
+import re
 import shutil
 from pathlib import Path
 
@@ -12,6 +14,17 @@ import mutants
 def test_a_mutant_applies_to_the_code_as_it_is(mutant, tmp_path: Path):
     shutil.copytree(mutants.PACKAGE, tmp_path / "sim2gp")
     mutant.apply(tmp_path / "sim2gp")
+
+
+@pytest.mark.parametrize("hunt", sorted({m.hunt for m in mutants.MUTANTS}))
+def test_a_hunt_names_tests_that_exist(hunt: mutants.Hunt):
+    """A renamed test would end the night's hunt, or a mutant would live unseen."""
+    file, only = hunt
+    tree = ast.parse((mutants.ROOT / "tests" / file).read_text())
+    names = [n.name for n in ast.walk(tree) if isinstance(n, ast.FunctionDef)]
+    found = [n for n in names if n.startswith("test_")]
+    for word in re.split(r" or ", only or "test"):
+        assert any(word in name for name in found), (file, word)
 
 
 def test_names_are_unique():

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from sim2gp.errors import Sim2GPError
+from sim2gp.errors import NotFinite, Sim2GPError
 from sim2gp.flight import (
     Purpose,
     Trajectory,
@@ -256,20 +256,27 @@ def accept_truth(
 ) -> AcceptedTruth:
     """Draw truths (`tasks.draw_truth`) until the oracle swings one up.
 
-    ``preset`` makes a task of a record of constants (`tasks.furuta_swingup`). Raises
-    `NotFinite` as `episode`, `Sim2GPError` E204 when ``attempts`` draws all fail.
+    ``preset`` makes a task of a record of constants (`tasks.furuta_swingup`). A truth
+    that the oracle drives to where its integration diverges is one not swung up (far
+    beyond its bounds a machine spins faster than the substeps can follow). Raises
+    `Sim2GPError` E204 when ``attempts`` draws all fail.
     """
+    diverged = 0
     for attempt in range(attempts):
         record = draw_truth(system, key_for(key, attempt, Purpose.TRUTH), truth)
         task = preset(record)
         key_a = jax.random.fold_in(key, attempt)
-        oracle = fly_oracle(task, planner, key=key_a)
+        try:
+            oracle = fly_oracle(task, planner, key=key_a)
+        except NotFinite:
+            diverged += 1
+            continue
         if oracle.swings_up:
             return AcceptedTruth(task, oracle, attempt)
     raise Sim2GPError(
         "E204",
         f"no truth that {type(planner).__name__} can swing up",
-        got=f"{attempts} draws ({truth})",
+        got=f"{attempts} draws ({truth}), {diverged} of them not finite",
         expected="at least one",
         fix="narrow the prior or give the planner more samples",
     )

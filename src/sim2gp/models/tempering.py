@@ -7,7 +7,10 @@ pulls the constants one way, another part the other way. With ``g_n`` the score 
 the right model ``sum_b u_b u_b^T`` has the mean ``(1 - 1/B) I``, but for the prior's
 share: the information identity, less one part in ``B`` because all pulls add up to
 nothing. Its largest eigenvalue in these units, if above one, is how many rows say no
-more than one; the posterior in which all rows count that much less,
+more than one. It rests on the few parts alone: like a mean over its standard error, an
+offset over it has Student's t with ``B - 1`` degrees of freedom, whose variance is
+``(B - 1) / (B - 3)``. With both in ``kappa^2`` the posterior in which all rows count
+that much less,
 
     Sigma_z = (R_d^T R_d / kappa^2 + I)^-1,
 
@@ -15,7 +18,8 @@ is as wide as the parts disagree. Parts are a fixed share of the data: where par
 contradicting each other more rows do not make the constants certain. (A power
 posterior: Gruenwald and van Ommen 2017, arXiv 1412.3730; its rate by batch means of
 the scores, as in the magnitude adjustment of composite likelihoods, Ribatet, Cooley and
-Davison 2012, arXiv 0911.5357.)
+Davison 2012, arXiv 0911.5357; t of the number of clusters less one, Cameron and Miller
+2015, J. Human Resources 50.)
 """
 
 import jax
@@ -30,6 +34,9 @@ from sim2gp.types import Scalar
 #: Successive parts of the data, each of as many rows: few, for within a part rows may
 #: be as dependent as they like.
 PARTS = 5
+#: Sd of Student's t with ``PARTS - 1`` degrees of freedom. With five parts two normal
+#: sides of 2.5 % are cut where those of t are: ``1.96 sqrt(2) = 2.77``.
+FEW = ((PARTS - 1) / (PARTS - 3)) ** 0.5
 
 
 def tempered(
@@ -45,7 +52,7 @@ def tempered(
     """
     prior = belief.prior.scale
     scores = jnp.einsum("ndp,nd->np", J, r / belief.noise[None] ** 2) @ prior
-    kappa = jnp.maximum(1.0, disagreement(belief.information, scores, mask))
+    kappa = jnp.maximum(1.0, FEW * disagreement(belief.information, scores, mask))
     precision = stack(belief.information / kappa, jnp.eye(len(prior)))
     return Gaussian(belief.posterior.mean, over(prior, precision)), kappa
 
