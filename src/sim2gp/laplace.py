@@ -310,10 +310,10 @@ def _descend(
         lost_in_rounding = (jnp.abs(gained) <= slack) & (there.gradient < here.gradient)
         keep = (gained > slack) | lost_in_rounding
         settled = keep & (gained <= tolerance * (1.0 + there.cost))
-        # A start has nothing to be compared with, and rounding no ratio.
-        ratio = jnp.where(first | lost_in_rounding, 1.0, gained / promise)
+        ratio = jnp.where(lost_in_rounding, 1.0, gained / promise)  # rounding has none
         lowered = damping * jnp.clip(1.0 - (2.0 * ratio - 1.0) ** 3, 0.1, 2.0)
         raised = 4.0 * jnp.maximum(damping, LEAST_DAMPING)
+        # A start has nothing to be compared with.
         damping = jnp.where(first, damping, jnp.where(keep, lowered, raised))
         return _select(keep, there, here), damping, count + 1, settled
 
