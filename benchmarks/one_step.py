@@ -195,7 +195,7 @@ def _goals(medians: dict[tuple[str, str, str], np.ndarray]) -> list[str]:
         f"RES-FS within {WITHIN} nats of the best in every column: "
         f"{say(max(behind) <= WITHIN)} (at most {max(behind):.2f} behind)",
         f"RES-FS covers at least {COVERED:.2f} outside the data: "
-        f"{say(min(covered) >= COVERED)} (at least {min(covered):.2f})",
+        f"{say(min(covered) >= COVERED)} ({min(covered):.3f} or more)",
     ]
 
 

@@ -203,7 +203,7 @@ class Reproduce(Writes):
     episodes: int | None = None
     """Episodes of each seed (not figure 1); default the paper's."""
     quick: bool = False
-    """Fewer seeds and episodes, for a look."""
+    """A look: fewer seeds or arms, fewer episodes (fig2: fewer plans, too)."""
     workers: int | None = None
     """Processes (not figure 1); default one per core."""
 
