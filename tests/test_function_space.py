@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from linear_system import linear, transitions
+from linear_system import Linear, linear, transitions
+from sim2gp.errors import NotFinite
 from sim2gp.gaussian import Gaussian
 from sim2gp.models import (
     FunctionSpace,
@@ -298,20 +299,28 @@ def test_predictions_are_those_of_constants_and_layer(fitted):
     np.testing.assert_allclose(belief.point()(*x), mean, rtol=1e-4)
 
 
-def test_update_conditions_constants_and_layer(fitted):
+def test_an_update_conditions_the_layer_alone(fitted):
+    """The constants, where they are part of the function, wait for the next fit."""
     recipe, _, belief = fitted
+    apart = np.asarray(belief.physics.covariance()) * float(belief.keep)
     s, a, s2 = jnp.zeros(D), jnp.linspace(-0.3, 0.4, D * P), jnp.asarray([0.2, -0.1])
     t, b = jnp.zeros(D), jnp.linspace(0.2, -0.4, D * P)
     later = eqx.filter_jit(recipe.update)(belief, s, a, s2)
+    np.testing.assert_array_equal(later.physics.scale, belief.physics.scale)
+    np.testing.assert_array_equal(later.physics.mean, belief.physics.mean)
+    still = eqx.tree_at(lambda b: b.physics.scale, belief, replace_fn=jnp.zeros_like)
     noise = np.asarray(belief.noise)
     one, two = (np.asarray(belief.head.phi(*x)) for x in ((s, a), (t, b)))
-    here = between(belief, a, a, one, one) + np.diag(noise**2)
-    gain = between(belief, b, a, two, one) @ np.linalg.inv(here)
+    here = between(still, a, a, one, one) + np.diag(noise**2)
+    gain = between(still, b, a, two, one) @ np.linalg.inv(here)
     expected = belief.latent(t, b).mean + gain @ (s2 - belief.latent(s, a).mean)
-    left = between(belief, b, b, two, two) - gain @ between(belief, a, b, one, two)
+    left = between(still, b, b, two, two) - gain @ between(still, a, b, one, two)
     got = later.latent(t, b)
     np.testing.assert_allclose(got.mean, expected, rtol=1e-8)
-    np.testing.assert_allclose(got.covariance(), left, rtol=1e-7, atol=1e-12)
+    B = np.asarray(b).reshape(D, P)
+    np.testing.assert_allclose(
+        got.covariance(), left + B @ apart @ B.T, rtol=1e-7, atol=1e-12
+    )
     # A later fit starts from that posterior in its own coordinates.
     q = module.start(later, later.sim, later.head.output_scale, 0.3)
     L, S = np.asarray(q.factor, float), np.asarray(later.head.layer.scale)
@@ -319,6 +328,16 @@ def test_update_conditions_constants_and_layer(fitted):
         L @ L.swapaxes(1, 2), S @ S.swapaxes(1, 2), rtol=1e-4, atol=1e-6
     )
     np.testing.assert_array_equal(np.triu(L[0], 1), 0.0)
+
+
+def test_before_the_first_fit_the_constants_learn():
+    recipe = model(ResidualFunctionSpace)
+    belief, sim = recipe.init(KEY), recipe.sim.init(KEY)
+    s, a, s2 = jnp.zeros(D), jnp.linspace(-0.3, 0.4, D * P), jnp.asarray([0.2, -0.1])
+    later, alone = recipe.update(belief, s, a, s2), recipe.sim.update(sim, s, a, s2)
+    np.testing.assert_allclose(later.physics.mean, alone.posterior.mean, rtol=1e-8)
+    got, expected = later.physics.covariance(), alone.posterior.covariance()
+    np.testing.assert_allclose(got, expected, rtol=1e-8, atol=1e-12)
 
 
 def test_growing_data_retrace_nothing(fitted):
@@ -353,3 +372,24 @@ def test_options_are_checked():
     literal = FunctionSpace(sim, objective="literal")
     assert literal.pretrain == 0
     assert literal.objective == Objective(1.0, 1, True)
+
+
+class Rooted(Linear):
+    """A machine that is not defined for negative inputs."""
+
+    def ode(self, params, s, a):
+        return super().ode(params, s, a) + 0.0 * jnp.sqrt(a[0] + 0.9)
+
+
+def test_a_simulator_that_is_nowhere_on_the_box_is_said(monkeypatch):
+    """Else its scale becomes the noise, and training skips what it meets."""
+    monkeypatch.setattr(module, "POOL", 2048)
+    system = linear(P, D)
+    recipe = FunctionSpace(
+        Sim2GP(Rooted(system.parameters, D), dt=1.0),
+        hidden=(8,),
+        pretrain=100,
+        steps=100,
+    )
+    with pytest.raises(NotFinite, match=r"E203 the simulator is not finite on its box"):
+        recipe.fit(recipe.init(KEY), padded(*make(100)), key=KEY)

@@ -154,7 +154,7 @@ def _log_scores(belief: AbstractBelief, data: Transitions) -> Float[Array, " cap
 def choose(
     each: Float[Array, "models N"], new: Bool[Array, " N"]
 ) -> tuple[Int[Array, ""], Float[Array, " models"]]:
-    """The first model that none beats by more than a standard error, and all means.
+    """The first model that the best beats by no more than a standard error; all means.
 
     A score that is not finite loses to every finite one.
     """

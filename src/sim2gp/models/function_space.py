@@ -13,8 +13,9 @@ from collections.abc import Mapping
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
+from sim2gp.errors import NotFinite
 from sim2gp.gaussian import Gaussian, lower_factor
 from sim2gp.models import features, hybrid, matching, nlm
 from sim2gp.models.base import AbstractBelief, AbstractModel
@@ -100,7 +101,16 @@ class FunctionSpace(AbstractModel):
         )
         target = self.sim.prior if self.fs_prior == "prior" else sim.posterior
         towards = eqx.tree_at(lambda b: b.posterior, sim, target)
-        fitted = _fit(belief, sim, towards, data, second, budget, self.objective)
+        fitted, lost = _fit(belief, sim, towards, data, second, budget, self.objective)
+        if int(lost):
+            raise NotFinite(
+                "E203",
+                "the simulator is not finite on its box",
+                where="the inputs that a network is matched on",
+                got=f"not so at {int(lost)} of {POOL}",
+                expected="a finite step and Jacobian at each",
+                fix="narrow `reach`, or the channels' limits",
+            )
         return nlm.checked(fitted, data)
 
     def update(
@@ -120,7 +130,8 @@ def _fit(
     key: Key,
     budget: Budget,
     objective: Objective,
-) -> HybridBelief:
+) -> tuple[HybridBelief, Int[Array, ""]]:
+    """The belief, and how many simulated inputs were not finite."""
     pool, training = jax.random.split(key)
     head, mask = belief.head, data.mask
     X, y = features.encoded(head.encoding, data)
@@ -130,6 +141,8 @@ def _fit(
     # Once and for all from the simulator's prior, so that the scales never jump.
     some = matching.inputs(jax.random.key(SCALE_SEED), head.encoding, data, POOL)
     g, _ = hybrid.physics_rows(towards, sim.prior.mean, *some, every)
+    finite = jnp.isfinite(jnp.concatenate([f, g], axis=1)).all(axis=1)
+    lost = jnp.sum(~(finite & jnp.isfinite(J).all(axis=(1, 2))))
     c = jnp.where(belief.count > 0, head.output_scale, jnp.std(g, axis=0))
     c = jnp.where(c > 0.0, c, sim.noise)
     target = matching.targets(
@@ -151,7 +164,8 @@ def _fit(
     )
     head = head_of(belief, q, noise, c)
     replaced = jnp.zeros(())
-    return HybridBelief(sim, at_map(sim), replaced, head, noise * c, jnp.sum(mask))
+    fitted = HybridBelief(sim, at_map(sim), replaced, head, noise * c, jnp.sum(mask))
+    return fitted, lost
 
 
 def objective_of(name: str) -> Objective:

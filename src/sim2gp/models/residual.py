@@ -5,7 +5,8 @@
 Two stages, because a network fitted together with the constants absorbs physics: first
 SIM2GP with its own noise; then features and layer on the residuals, by `nlm.type_two`
 with all its safeguards. An output where the network does not predict held-out rows
-better than the simulator alone keeps the simulator's answer, to the last digit.
+better than the simulator alone keeps the simulator's answer, to the last digit (under
+``joint``, which learns the constants once more, only where no output has a residual).
 """
 
 from collections.abc import Mapping

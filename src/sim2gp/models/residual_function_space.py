@@ -92,9 +92,19 @@ class ResidualFunctionSpace(AbstractModel):
     def update(
         self, belief: AbstractBelief, s: State, a: Action, s2: State
     ) -> HybridBelief:
-        """Condition the layer on one transition; call in float64."""
+        """Condition on one transition; call in float64.
+
+        Before the first fit the constants learn, for there is no residual; from then on
+        the layer alone: the constants' spread is how far whole parts of the data
+        disagree, of which one row knows nothing.
+        """
         assert isinstance(belief, HybridBelief)
-        return hybrid.conditioned(self.sim, belief, s, a, s2)
+        fitted, before = jnp.any(belief.head.output_scale > 0.0), belief.physics
+        scale = jnp.where(fitted, 0.0, before.scale)
+        still = eqx.tree_at(lambda b: b.physics.scale, belief, scale)
+        later = hybrid.conditioned(self.sim, still, s, a, s2)
+        physics = features.chosen(fitted, before, later.physics)
+        return eqx.tree_at(lambda b: b.physics, later, physics)
 
 
 @eqx.filter_jit
@@ -110,7 +120,7 @@ def _fit(
     head, mask = belief.head, data.mask
     X, y = features.encoded(head.encoding, data)
     r, _, J = hybrid.residuals(sim, data, y)
-    physics, _ = tempered(sim, r, J, mask)
+    physics, _ = tempered(sim, r, J)
     c = SCALE * sim.noise
     S, A = matching.inputs(pool, head.encoding, data, POOL)
     target = matching.targets(
