@@ -171,4 +171,32 @@ NETWORKS = (
         "return HybridBelief(sim, sim.posterior, kept,",
         ("test_tempering.py", "as_wide_as"),
     ),
+    Mutant(
+        "tempering: few parts taken for many",
+        "models/tempering.py",
+        "FEW * disagreement(",
+        "disagreement(",
+        ("test_tempering.py", "interval"),
+    ),
+    Mutant(
+        "tempering: parts of rows, whatever they say",
+        "models/tempering.py",
+        "parts(leverage.reshape(N, d).sum(1))",
+        "parts(jnp.ones(N))",
+        ("test_tempering.py", "by_hand"),
+    ),
+    Mutant(
+        "RES-FS: one row makes tempered constants sure",
+        "models/residual_function_space.py",
+        "jnp.where(fitted, 0.0, before.scale)",
+        "before.scale",
+        ("test_function_space.py", "layer_alone"),
+    ),
+    Mutant(
+        "FS: a simulator that is not finite is no matter",
+        "models/function_space.py",
+        "if int(lost):",
+        "if int(lost) < 0:",
+        ("test_function_space.py", "nowhere"),
+    ),
 )
