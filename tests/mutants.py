@@ -3,7 +3,7 @@
     python tests/mutants.py            all of them, a table, exit code 1 if one survives
     python tests/mutants.py prior      those whose name contains "prior"
 
-The lists are in `mutant_list.py`, `mutant_networks.py` and `mutant_misfit.py`.
+The lists are in the files `mutant_*.py` beside this one.
 """
 
 import os
@@ -15,13 +15,14 @@ import time
 from collections.abc import Iterable
 from pathlib import Path
 
+from mutant_descent import DESCENTS
 from mutant_list import MUTANTS as PHYSICS
 from mutant_list import Hunt, Mutant
 from mutant_misfit import MISFIT
 from mutant_networks import NETWORKS
 from mutant_studies import STUDIES
 
-MUTANTS = (*PHYSICS, *NETWORKS, *MISFIT, *STUDIES)
+MUTANTS = (*PHYSICS, *DESCENTS, *NETWORKS, *MISFIT, *STUDIES)
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "src" / "sim2gp"

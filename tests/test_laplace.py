@@ -156,10 +156,27 @@ def test_one_dead_parameter_keeps_its_prior():
 
 def test_a_stalled_descent_is_a_typed_error():
     # A kink: no stationary point exists where the descent ends.
-    fit = minimise(lambda z: 100.0 * jnp.abs(z - 0.3) ** 0.6, jnp.ones(1))
+    fit = minimise(lambda z: 1.0 + 10.0 * jnp.abs(z - 0.3), jnp.ones(1))
+    assert float(fit.left) > 0.5
     assert int(fit.status) != laplace.CONVERGED
     with pytest.raises((NotConverged, NotFinite)):
         fit.raise_unless_converged(("k",), "here")
+
+
+@pytest.mark.parametrize("N", [50, 5000])
+def test_data_almost_free_of_noise_are_no_stall(N):
+    """Rounding leaves a gradient that no descent removes; the way left is nothing."""
+    x = jnp.linspace(-1.0, 1.0, N)
+    truth = jnp.asarray([0.7, -0.4])
+
+    def residuals(z):
+        return 1e5 * (jnp.stack([x, jnp.cos(x)]).T @ (z - truth))
+
+    fit = minimise(residuals, jnp.ones(2))
+    assert float(fit.gradient) > laplace.GRADIENT_TOLERANCE
+    assert int(fit.status) == laplace.CONVERGED
+    assert float(fit.left) < 1e-7
+    np.testing.assert_allclose(fit.z, truth, rtol=1e-9)
 
 
 def test_noise_rounds_follow_their_update():

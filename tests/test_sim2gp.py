@@ -325,3 +325,13 @@ def test_data_that_are_not_finite_are_said(case):
     broken = transitions(case.J, np.where(np.arange(N)[:, None] == 3, np.nan, case.y))
     with pytest.raises(NotFinite, match="E203"):
         case.model.fit(case.model.init(KEY), broken, key=KEY)
+
+
+def test_data_without_noise_are_fitted():
+    """What a first try on simulated data looks like; the truth, to many digits."""
+    rng = np.random.default_rng(3)
+    J, truth = rng.uniform(-1.0, 1.0, (5000, D, P)), np.asarray([0.3, 0.6, 1.0])
+    model = Sim2GP(SYSTEM, dt=1.0)
+    belief = model.fit(model.init(KEY), transitions(J, J @ truth), key=KEY)
+    np.testing.assert_allclose(belief.posterior.mean, truth, rtol=1e-8)
+    assert np.all(np.asarray(belief.posterior.sd()) < 1e-6)

@@ -26,6 +26,7 @@ from sim2gp.errors import DeadParameters, NotConverged, NotFinite
 from sim2gp.gaussian import LOG_2PI, Gaussian
 from sim2gp.least_squares import (
     Factor,
+    gauss_newton_step,
     log_joint,
     posterior,
     stack,
@@ -35,6 +36,9 @@ from sim2gp.types import Scalar
 
 CONVERGED, STALLED, NOT_FINITE = 0, 1, 2
 GRADIENT_TOLERANCE = 1e-8
+#: A descent has arrived as well where so many posterior sds are left: rounding keeps
+#: the gradient of data without noise above its own tolerance.
+STEP_TOLERANCE = 1e-6
 #: Steps of the last descent. Under misfit, and where a bound saturates (measured: by
 #: 0.9 a step), Gauss-Newton converges linearly, not in two.
 MAX_STEPS = 300
@@ -110,6 +114,15 @@ class Fit(eqx.Module):
     def gradient(self) -> Scalar:
         """What remains of the gradient, relative to 1 + cost."""
         return self.at.gradient
+
+    @property
+    def left(self) -> Scalar:
+        """The undamped step that is left, its largest entry, in posterior sd."""
+        arrow, c = self.arrow, self.full[:-1, -1]
+        de = arrow.slope[..., -1] + arrow.slope[..., :-1] @ gauss_newton_step(self.full)
+        own = jnp.einsum("wij,wj->wi", arrow.R11, de)
+        largest = (jnp.max(jnp.abs(x), initial=0.0) for x in (c, own))
+        return jnp.maximum(*largest)
 
     @property
     def data(self) -> Factor:
@@ -190,9 +203,9 @@ class Fit(eqx.Module):
                 "E201",
                 "the MAP did not converge",
                 where=where,
-                got=f"scaled gradient {float(self.gradient):.1e} "
-                f"after {int(self.steps)} steps",
-                expected=f"at most {GRADIENT_TOLERANCE:.0e}",
+                got=f"scaled gradient {float(self.gradient):.1e} and a step of "
+                f"{float(self.left):.1e} posterior sd left after {int(self.steps)}",
+                expected=f"{GRADIENT_TOLERANCE:.0e}, or {STEP_TOLERANCE:.0e} sd",
                 fix="check units and bounds, or add starts",
             )
 
@@ -368,10 +381,12 @@ def _point(
 def _verdict(best: Point, noise: Noise, steps: Int[Array, ""]) -> Fit:
     arrow = eliminate(best.blocks, best.e, noise)
     full = with_prior(arrow.data, best.z)
+    fit = Fit(best, arrow, full, jnp.zeros((), int), steps)
+    there = (best.gradient <= GRADIENT_TOLERANCE) | (fit.left <= STEP_TOLERANCE)
+    status = jnp.where(there, CONVERGED, STALLED)
     finite = jnp.isfinite(best.cost) & jnp.all(jnp.isfinite(full))
-    status = jnp.where(best.gradient <= GRADIENT_TOLERANCE, CONVERGED, STALLED)
     status = jnp.where(finite, status, NOT_FINITE)
-    return Fit(best, arrow, full, status, steps)
+    return eqx.tree_at(lambda f: f.status, fit, status)
 
 
 def _select(yes: Bool[Array, ""], new: Point, old: Point) -> Point:

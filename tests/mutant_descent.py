@@ -1,0 +1,158 @@
+"""Mutants of the descent to the MAP, of what it eliminates, and of its evidence."""
+
+from mutant_list import MODEL, Mutant
+
+LAPLACE, ARROWS = "laplace.py", "arrowhead.py"
+DESCENT = (
+    "test_laplace.py",
+    "finite or last_turn or noise or too_long or gains or stationary",
+)
+ARROW = ("test_laplace.py", "nuisances or expected or weights")
+
+#: Where each quantity is formed.
+CHANNELS = "/ self.sd[None, :, None, None]"
+NORMALISER = "N * (jnp.log(noise.sd) + 0.5 * LOG_2PI)"
+EXPECTED = "noise.weights @ (squares + spread)"
+
+DESCENTS = (
+    Mutant(
+        "variance for sd in the model",
+        ARROWS,
+        CHANNELS,
+        f"{CHANNELS}**2",
+        MODEL,
+    ),
+    Mutant(
+        "root of the sd in the model",
+        ARROWS,
+        CHANNELS,
+        f"{CHANNELS}**0.5",
+        MODEL,
+    ),
+    Mutant(
+        "evidence without the noise's scale",
+        LAPLACE,
+        NORMALISER,
+        NORMALISER.replace("jnp.log(noise.sd) + ", "0.0 * noise.sd + "),
+        MODEL,
+    ),
+    Mutant(
+        "evidence without two pi",
+        LAPLACE,
+        NORMALISER,
+        NORMALISER.replace(" + 0.5 * LOG_2PI", ""),
+        MODEL,
+    ),
+    Mutant(
+        "EM without the posterior's spread",
+        LAPLACE,
+        EXPECTED,
+        EXPECTED.replace("(squares + spread)", "squares"),
+        MODEL,
+    ),
+    Mutant(
+        "EM without its prior",
+        LAPLACE,
+        "/ (2.0 + jnp.sum(count, axis=0))",
+        "/ jnp.sum(count, axis=0)",
+        MODEL,
+    ),
+    Mutant(
+        "noise of the first channel for all",
+        LAPLACE,
+        EXPECTED,
+        EXPECTED.replace("(squares + spread)", "(squares + spread)[:, :1]"),
+        MODEL,
+    ),
+    Mutant(
+        "last turn no better than the others",
+        LAPLACE,
+        "jnp.where(exact, small & (count >= 2), settled | small)",
+        "settled | small",
+        DESCENT,
+    ),
+    Mutant(
+        "the last start wins, finite or not",
+        LAPLACE,
+        "found.cost < best.cost, True)",
+        "True, True)",
+        DESCENT,
+    ),
+    Mutant(
+        "nothing found counts as converged",
+        LAPLACE,
+        "jnp.full(blank.shape, jnp.nan, blank.dtype)",
+        "jnp.full(blank.shape, 0.0, blank.dtype)",
+        DESCENT,
+    ),
+    Mutant(
+        "worst start wins",
+        LAPLACE,
+        "found.cost < best.cost",
+        "~(found.cost < best.cost)",
+        ("test_laplace.py", "best"),
+    ),
+    Mutant(
+        "arrived by the gradient alone",
+        LAPLACE,
+        " | (fit.left <= STEP_TOLERANCE)",
+        "",
+        ("test_sim2gp.py", "without_noise"),
+    ),
+    Mutant(
+        "first start not descended",
+        LAPLACE,
+        "jnp.where(first, damping, jnp.where(keep, lowered, raised))",
+        "jnp.where(keep, lowered, raised)",
+        ("test_laplace.py", "every"),
+    ),
+    Mutant(
+        "steps too long are taken",
+        LAPLACE,
+        "keep = (gained > slack) | lost_in_rounding",
+        "keep = jnp.isfinite(gained) | (here.cost == jnp.inf)",
+        DESCENT,
+    ),
+    Mutant(
+        "nuisances without their prior",
+        ARROWS,
+        "prior = identity.at[:, -1].set(e)",
+        "prior = 1e-9 * identity.at[:, -1].set(e)",
+        ARROW,
+    ),
+    Mutant(
+        "nuisances do not follow",
+        LAPLACE,
+        "de = -(arrow.slope[..., -1] + arrow.slope[..., :-1] @ dz)",
+        "de = -(arrow.slope[..., -1] + 0.0 * arrow.slope[..., :-1] @ dz)",
+        ARROW,
+    ),
+    Mutant(
+        "evidence without the nuisances' determinant",
+        LAPLACE,
+        "log_joint(self.full) - jnp.sum(jnp.log(pivots))",
+        "log_joint(self.full) - 0.0 * jnp.sum(jnp.log(pivots))",
+        ARROW,
+    ),
+    Mutant(
+        "a window's weight squared",
+        ARROWS,
+        "jnp.sqrt(self.weights)[:",
+        "self.weights[:",
+        ARROW,
+    ),
+    Mutant(
+        "spread without the nuisances' own",
+        LAPLACE,
+        "(own @ root[:, None]) ** 2",
+        "0.0 * (own @ root[:, None]) ** 2",
+        ARROW,
+    ),
+    Mutant(
+        "robust weights the wrong way round",
+        LAPLACE,
+        "/ freedom) / (1.0 + misfit / freedom)",
+        "/ freedom) * (1.0 + misfit / freedom)",
+        ARROW,
+    ),
+)
