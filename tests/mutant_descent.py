@@ -95,7 +95,7 @@ DESCENTS = (
     Mutant(
         "arrived by the gradient alone",
         LAPLACE,
-        " | (fit.left <= STEP_TOLERANCE)",
+        " | (left <= GRADIENT_TOLERANCE)",
         "",
         ("test_sim2gp.py", "without_noise"),
     ),
