@@ -32,7 +32,9 @@ def main() -> None:
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", nargs="?", type=Path, default=ROOT / "../shared/data")
-    files = sorted((parser.parse_args().data / "double_pendulum/excitation").glob("*"))
+    files = sorted(
+        (parser.parse_args().data / "double_pendulum/excitation").glob("*.csv")
+    )
     key = jax.random.key(0)
     works: dict[str, Callable[[], object]] = {}
     with tempfile.TemporaryDirectory() as name:
@@ -40,8 +42,9 @@ def main() -> None:
         for times in (1, 2):
             path = project_of(folder / f"{times}", files, times)
             project = load_project(path)
-            windows, _ = cut_logs(project, load(project))
-            rows = sum(len(log) for log in load(project))
+            logs = load(project)
+            windows, _ = cut_logs(project, logs)
+            rows = sum(len(log) for log in logs)
             say(f"{6 * times} logs: {rows} rows, {len(windows)} windows")
             works[f"fit, {6 * times} logs"] = lambda p=project, w=windows: (
                 jax.block_until_ready(fit_windows(p.system, w, key=key).posterior)

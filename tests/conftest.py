@@ -1,7 +1,8 @@
 """What every test runs under: strict promotion, fresh keys, repeatable examples.
 
-float64 is never switched on here: the library scopes it, and the tests must see what a
-user sees. Shapes and types are checked by jaxtyping and beartype (pyproject.toml).
+float64 is switched on for no test that does not ask for it: the library scopes it, and
+tests must see what a user sees. Shapes and types are checked by jaxtyping and beartype
+(pyproject.toml).
 """
 
 import gc
@@ -63,6 +64,13 @@ def getkey(request: pytest.FixtureRequest) -> Callable[[], jax.Array]:
     root = jax.random.key(zlib.crc32(request.node.nodeid.encode()))
     counter = itertools.count()
     return lambda: jax.random.fold_in(root, next(counter))
+
+
+@pytest.fixture
+def float64() -> Iterator[None]:
+    """For tests of mathematics below the library's own scope."""
+    with jax.enable_x64(True):
+        yield
 
 
 @pytest.fixture

@@ -12,10 +12,7 @@ from sim2gp.errors import InputError
 DT = 0.02
 
 
-@pytest.fixture(autouse=True)
-def float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def run(system, params, inputs, s):

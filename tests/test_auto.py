@@ -14,10 +14,7 @@ P, D = 3, 2
 KEY = jax.random.key(0)
 
 
-@pytest.fixture(autouse=True)
-def float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def rows(N, bent, seed):

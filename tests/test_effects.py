@@ -13,11 +13,7 @@ from sim2gp.errors import InputError
 from sim2gp.systems import STRENGTHS
 from test_systems import cartpole_forces, furuta_forces
 
-
-@pytest.fixture(autouse=True)
-def float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def test_rod_inertia_is_the_true_rod():

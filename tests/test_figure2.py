@@ -105,7 +105,7 @@ def test_a_changed_default_of_the_planner_is_another_planner(monkeypatch):
     assert cell.arguments != before
 
 
-def test_cells_that_other_code_flew_are_counted(monkeypatch):
+def test_cells_that_other_code_flew_are_counted():
     cell = Cell("furuta", "nominal", "SIM2GP", 3, 2)
     value = {"returns": [1.0, 2.0], "failure": None, "seconds": 1.0}
     older = dataclasses.replace(cell, seed=4)

@@ -26,10 +26,7 @@ KEY = jax.random.key(0)
 MODELS = (FunctionSpace, ResidualFunctionSpace)
 
 
-@pytest.fixture(autouse=True)
-def float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def a_q(seed=0, m=M, outputs=D, dtype=jnp.float64):

@@ -14,10 +14,7 @@ SCALE = RNG.standard_normal((3, 5))  # wider than the dimension
 COV = SCALE @ SCALE.T
 
 
-@pytest.fixture(autouse=True)
-def float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 @pytest.fixture

@@ -14,11 +14,7 @@ from sim2gp import least_squares as ls
 from sim2gp.errors import DeadParameters, NotConverged, NotFinite
 from sim2gp.gaussian import Gaussian
 
-
-@pytest.fixture(autouse=True)
-def float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def rosenbrock(z):

@@ -21,10 +21,7 @@ SHAPES = [(1, 2, 500), (2, 1, 100), (3, 4, 20), (4, 3, 500), (6, 2, 100)]
 SHAPES += [(8, 1, 20), (11, 4, 100), (14, 3, 100), (17, 2, 20), (20, 1, 500)]
 
 
-@pytest.fixture(autouse=True)
-def float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,7 @@ STATES = 1000
 CONSTANTS = 10  # sets of constants, with a tenth of the states each
 
 
-@pytest.fixture(autouse=True)
-def float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def mujoco_acceleration(model, data, s, a, applied=0.0):

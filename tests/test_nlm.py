@@ -18,10 +18,7 @@ KEY = jax.random.key(0)
 N, M, D = 40, 7, 2
 
 
-@pytest.fixture(autouse=True)
-def float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def table(seed=0, scales=1.0):

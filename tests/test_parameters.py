@@ -35,10 +35,7 @@ EVERY = [BOX, LOG_BOX, SOFTPLUS, LOG, IDENTITY]
 ROUNDED = [Parameter("k", "N", "box", "box", *b) for b in ((0.3, 0.9), (0.7, 1.9))]
 
 
-@pytest.fixture(autouse=True)
-def float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def ids(p):

@@ -14,11 +14,7 @@ from sim2gp.errors import InputError
 from sim2gp.parameters import Parameter
 from test_systems import cartpole_forces, furuta_forces
 
-
-@pytest.fixture(autouse=True)
-def float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def pendulum_at(p, r):

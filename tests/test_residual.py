@@ -16,10 +16,7 @@ P, D, M = 3, 2, 5
 KEY = jax.random.key(0)
 
 
-@pytest.fixture(autouse=True)
-def float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def make(N, bent, seed=1, noise=0.1):

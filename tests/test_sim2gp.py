@@ -23,10 +23,7 @@ KEY = jax.random.key(0)
 SYSTEM = linear(P, D)
 
 
-@pytest.fixture(autouse=True)
-def float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 @dataclasses.dataclass

@@ -21,10 +21,7 @@ DT = 0.02
 NOISE = {"rad": 1e-3, "rad/s": 0.02, "m": 1e-4, "m/s": 5e-3}
 
 
-@pytest.fixture(autouse=True)
-def float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def inputs(system, count, seed):

@@ -11,11 +11,7 @@ from sim2gp.errors import InputError
 from sim2gp.parameters import parameters_of
 from sim2gp.systems.friction import coulomb, coulomb_arctangent, dead_zone
 
-
-@pytest.fixture(autouse=True)
-def float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])

@@ -16,11 +16,7 @@ from machines import close
 from sim2gp import systems as sy
 from sim2gp.parameters import parameters_of
 
-
-@pytest.fixture(autouse=True)
-def float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 SEEDS = st.integers(0, 2**31 - 1)

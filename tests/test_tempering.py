@@ -14,10 +14,7 @@ P, D = 3, 2
 KEY = jax.random.key(0)
 
 
-@pytest.fixture(autouse=True)
-def float64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("float64")
 
 
 def rows(N, seed=0, bent=0.0):
@@ -32,20 +29,15 @@ def rows(N, seed=0, bent=0.0):
 
 def fit(J, y, capacity=None):
     """SIM2GP's belief, and residuals and Jacobians of the rows."""
-    data = transitions(J, y)
+    (_, d, p), data = J.shape, transitions(J, y)
     if capacity is not None:
-        empty = type(data).empty(capacity, D, D * P)
+        empty = type(data).empty(capacity, d, d * p)
         data = empty.extend(data.state, data.action, data.next_state)
-    model = Sim2GP(linear(P, D), dt=1.0)
+    model = Sim2GP(linear(p, d), dt=1.0)
     belief = model.fit(model.init(KEY), data, key=KEY)
     data = jax.tree.map(jnp.asarray, data)
-    r, _, Jr = hybrid.residuals(belief, data, data.delta()[:, :D])
+    r, _, Jr = hybrid.residuals(belief, data, data.delta()[:, :d])
     return belief, r, Jr
-
-
-def fit_one(J, y):
-    model = Sim2GP(linear(1, 1), dt=1.0)
-    return model.fit(model.init(KEY), transitions(J, y), key=KEY)
 
 
 def test_pulls_by_hand():
@@ -136,7 +128,7 @@ def test_an_interval_holds_what_the_parts_scatter_about():
     """
     runs, N = 4000, 50
     J = np.ones((N, 1, 1))
-    template = fit_one(J, np.cos(np.arange(N))[:, None])
+    template, _, _ = fit(J, np.cos(np.arange(N))[:, None])
     rng = np.random.default_rng(0)
     own = np.repeat(0.3 * rng.standard_normal((runs, PARTS)), N // PARTS, axis=1)
     Y = own + 0.1 * rng.standard_normal((runs, N))

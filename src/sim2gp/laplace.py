@@ -35,8 +35,8 @@ from sim2gp.least_squares import (
 from sim2gp.types import Scalar
 
 CONVERGED, STALLED, NOT_FINITE = 0, 1, 2
-#: Of the gradient over ``1 + cost``, or in posterior sds (`Fit.left`): rounding keeps the
-#: first one of data without noise above it.
+#: Of the gradient over ``1 + cost``, or in posterior sds (`Fit.left`): rounding keeps
+#: the first one of data without noise above it.
 GRADIENT_TOLERANCE = 1e-8
 #: Steps of the last descent. Under misfit, and where a bound saturates (measured: by
 #: 0.9 a step), Gauss-Newton converges linearly, not in two.

@@ -107,7 +107,7 @@ class FunctionSpace(AbstractModel):
                 "E203",
                 "the simulator is not finite on its box",
                 where="the inputs that a network is matched on",
-                got=f"not so at {int(lost)} of {POOL}",
+                got=f"NaN or infinity at {int(lost)} of {POOL}",
                 expected="a finite step and Jacobian at each",
                 fix="narrow `reach`, or the channels' limits",
             )

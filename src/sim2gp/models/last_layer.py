@@ -15,8 +15,8 @@ import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
-from sim2gp.gaussian import LOG_2PI, Gaussian, lower_factor
-from sim2gp.least_squares import over
+from sim2gp.gaussian import LOG_2PI, Gaussian
+from sim2gp.least_squares import over, triangular
 from sim2gp.types import Scalar
 
 #: Variances, in units of the output's scale squared, tried when noise is recalibrated.
@@ -56,7 +56,7 @@ def data_factor(
 ) -> Float[Array, "md md"]:
     """Triangular factor of ``[Phi Y]`` over the chosen rows."""
     table = jnp.where(rows[:, None], jnp.concatenate([Phi, Y], axis=1), 0.0)
-    return _triangular(table)
+    return triangular(table)
 
 
 def regression(
@@ -76,7 +76,7 @@ def regression(
 
     def one(y: Array, sd: Array, a: Array) -> tuple[Array, Array, Array]:
         rows = jnp.concatenate([R[:, :m], y[:, None]], axis=1) / sd
-        full = _triangular(jnp.concatenate([rows, jnp.sqrt(a) * eye]))
+        full = triangular(jnp.concatenate([rows, jnp.sqrt(a) * eye]))
         Rk, c, rho = full[:m, :m], full[:m, m], full[m:, m]
         scale = solve_triangular(Rk, jnp.eye(m, dtype=R.dtype))
         evidence = 0.5 * m * jnp.log(a) - jnp.sum(jnp.log(jnp.diag(Rk)))
@@ -122,7 +122,7 @@ def joint_regression(
         table = jnp.concatenate([c * Phi, Jk, y[:, None]], axis=1) / sd
         prior_rows = jnp.sqrt(a) * jnp.eye(m, m + p + 1, dtype=Phi.dtype)
         stacked = jnp.concatenate([jnp.where(valid, table, 0.0), prior_rows])
-        full = _triangular(stacked)
+        full = triangular(stacked)
         return full[:m], full[m:, m:]
 
     top, left = jax.vmap(one, in_axes=(1, 1, 0, 0, 0))(J, Y, noise, alpha, output_scale)
@@ -132,7 +132,7 @@ def joint_regression(
     target = left[:, p] - left[:, :p] @ prior.mean
     eye = jnp.eye(p, p + 1, dtype=Phi.dtype)
     table = jnp.concatenate([u_rows, target[:, None]], axis=1)
-    R = _triangular(jnp.concatenate([table, eye]))
+    R = triangular(jnp.concatenate([table, eye]))
     u = solve_triangular(R[:p, :p], R[:p, p])
     scale = over(prior.scale, R[:p, :p])
     z = Gaussian(prior.mean + prior.scale @ u, scale)
@@ -237,10 +237,3 @@ def recalibrated(
         return jnp.sqrt(grid[best]), losses[best]
 
     return jax.vmap(one, in_axes=(1, 1, 0))(variance, residual, noise)
-
-
-def _triangular(rows: Float[Array, "N k"]) -> Float[Array, "k k"]:
-    """``R`` of the QR decomposition, square for any number of rows."""
-    N, k = rows.shape
-    spare = jnp.zeros((max(0, k - N), k), rows.dtype)
-    return lower_factor(jnp.concatenate([rows, spare]).T).T
