@@ -10,7 +10,7 @@ from collections.abc import Iterator
 #: Imports point down; rooms of one layer do not see each other, but for SIBLINGS.
 LAYERS: tuple[frozenset[str], ...] = (
     frozenset(
-        "types errors gaussian least_squares arrowhead laplace parameters "
+        "types errors linalg gaussian least_squares arrowhead laplace parameters "
         "transitions ahead".split()
     ),
     frozenset({"systems", "logs"}),
@@ -28,6 +28,7 @@ SIBLINGS: frozenset[tuple[str, str]] = frozenset(
         ("cli", "report"),
         ("experiments", "report"),
         ("ahead", "types"),
+        ("gaussian", "linalg"),
         ("gaussian", "types"),
         ("gaussian", "errors"),
         ("parameters", "types"),
@@ -38,10 +39,13 @@ SIBLINGS: frozenset[tuple[str, str]] = frozenset(
         ("laplace", "types"),
         ("laplace", "errors"),
         ("laplace", "gaussian"),
+        ("laplace", "linalg"),
         ("laplace", "least_squares"),
         ("laplace", "arrowhead"),
+        ("arrowhead", "linalg"),
         ("arrowhead", "types"),
         ("arrowhead", "least_squares"),
+        ("least_squares", "linalg"),
         ("least_squares", "types"),
         ("least_squares", "errors"),
         ("least_squares", "gaussian"),

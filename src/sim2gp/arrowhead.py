@@ -16,10 +16,10 @@ Schur complement, without forming it.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
 from sim2gp.least_squares import Factor, triangular
+from sim2gp.linalg import solve_triangular
 from sim2gp.types import Scalar
 
 #: Triangular factors of ``[J_e J_z r]`` per window and channel; k = n + p + 1.
@@ -67,4 +67,4 @@ def eliminate(
     R = jax.vmap(one)(noise.scale(blocks), e)
     R11 = R[:, :n, :n]
     data = triangular(R[:, n:, n:].reshape(W * (k - n), k - n))
-    return Elimination(data, R11, solve_triangular(R11, R[:, :n, n:]))
+    return Elimination(data, R11, jax.vmap(solve_triangular)(R11, R[:, :n, n:]))

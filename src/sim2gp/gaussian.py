@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sim2gp.linalg import qr, solve_triangular
 from sim2gp.types import Key, Scalar
 
 LOG_2PI = 1.8378770664093453
@@ -60,7 +61,7 @@ class Gaussian(eqx.Module):
     def log_prob(self, x: Float[Array, " n"]) -> Scalar:
         """Log density at ``x``, nats."""
         L = self.triangular()
-        z = jax.scipy.linalg.solve_triangular(L, x - self.mean, lower=True)
+        z = solve_triangular(L, x - self.mean, lower=True)
         return -0.5 * (z @ z + z.size * LOG_2PI) - log_det_factor(L)
 
     def entropy(self) -> Scalar:
@@ -71,15 +72,15 @@ class Gaussian(eqx.Module):
     def kl(self, other: "Gaussian") -> Scalar:
         """``KL[self || other]``, nats."""
         L0, L1 = self.triangular(), other.triangular()
-        A = jax.scipy.linalg.solve_triangular(L1, L0, lower=True)
-        e = jax.scipy.linalg.solve_triangular(L1, self.mean - other.mean, lower=True)
+        A = solve_triangular(L1, L0, lower=True)
+        e = solve_triangular(L1, self.mean - other.mean, lower=True)
         quadratic = jnp.sum(A**2) + e @ e - e.size
         return 0.5 * quadratic + log_det_factor(L1) - log_det_factor(L0)
 
 
 def lower_factor(scale: Float[Array, "n k"]) -> Float[Array, "n n"]:
     """Lower-triangular L with ``L L^T = scale scale^T`` and non-negative diagonal."""
-    R = jnp.linalg.qr(scale.T, mode="r")
+    R = qr(scale.T)
     return (jnp.where(jnp.diag(R) < 0.0, -1.0, 1.0)[:, None] * R).T
 
 

@@ -18,7 +18,6 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp.arrowhead import Blocks, Elimination, Noise, eliminate
@@ -32,6 +31,7 @@ from sim2gp.least_squares import (
     stack,
     with_prior,
 )
+from sim2gp.linalg import eigh, solve_triangular
 from sim2gp.types import Scalar
 
 CONVERGED, STALLED, NOT_FINITE = 0, 1, 2
@@ -164,8 +164,8 @@ class Fit(eqx.Module):
         own, rest = self.at.blocks[..., :n], self.at.blocks[..., n:]
         # Rows of (z, r) with the nuisances at their best.
         reduced = rest - own @ self.arrow.slope[:, None]
-        identity = jnp.broadcast_to(jnp.eye(n), (len(own), n, n))
-        root = solve_triangular(self.arrow.R11, identity)
+        eye = jnp.eye(n)
+        root = jax.vmap(lambda R11: solve_triangular(R11, eye))(self.arrow.R11)
         spread = jnp.sum((reduced[..., :-1] @ self.scale()) ** 2, axis=(2, 3))
         spread = spread + jnp.sum((own @ root[:, None]) ** 2, axis=(2, 3))
         return jnp.sum(reduced[..., -1] ** 2, axis=2), spread
@@ -349,8 +349,8 @@ def _step(
     # positive: it may shorten the QR's step; longer ones were measured to go astray.
     R, c = full[:-1, :-1], full[:-1, -1]
     S = likelihood.curvature(here.z, here.by_z - here.z)
-    left = solve_triangular(R, S, trans="T")
-    values, vectors = jnp.linalg.eigh(solve_triangular(R, left.T, trans="T"))
+    left = solve_triangular(R, S, transposed=True)
+    values, vectors = eigh(solve_triangular(R, left.T, transposed=True))
     c = vectors @ ((vectors.T @ c) / (1.0 + jnp.maximum(values, 0.0)))
     dz = -solve_triangular(R, c)
     de = -(arrow.slope[..., -1] + arrow.slope[..., :-1] @ dz)

@@ -12,11 +12,11 @@ A Cholesky of ``Phi^T Phi`` with jitter is not exact to 1e-10, this is.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
 from sim2gp.gaussian import LOG_2PI, Gaussian
 from sim2gp.least_squares import over, triangular
+from sim2gp.linalg import solve_triangular
 from sim2gp.types import Scalar
 
 #: Variances, in units of the output's scale squared, tried when noise is recalibrated.

@@ -17,10 +17,10 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp.gaussian import LOG_2PI, log_det_factor, lower_factor
+from sim2gp.linalg import solve_triangular
 from sim2gp.models import features, last_layer
 from sim2gp.models.features import Encoding, Network
 from sim2gp.transitions import Transitions

@@ -15,11 +15,11 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp.errors import NotFinite
 from sim2gp.gaussian import Gaussian
+from sim2gp.linalg import cholesky, solve_triangular
 from sim2gp.models import features, last_layer, linearized
 from sim2gp.models.base import AbstractBelief, AbstractModel
 from sim2gp.models.features import Encoding, Network, stepped
@@ -317,11 +317,14 @@ def evidence_loss(
     eye = jnp.eye(Phi.shape[1], dtype=Y.dtype)
 
     def posterior(b: Array, sd: Array, a: Array) -> tuple[Array, Array]:
-        factor = jnp.linalg.cholesky(G / sd**2 + a * eye)
-        return cho_solve((factor, True), b / sd**2), cho_solve((factor, True), eye)
+        L = cholesky(still / sd**2 + a * eye)
+        root = solve_triangular(L, eye, lower=True)
+        half = solve_triangular(L, b / sd**2, lower=True)
+        return solve_triangular(L, half, lower=True, transposed=True), root.T @ root
 
     sd, alpha = trained.noise, trained.alpha
-    m, S = jax.lax.stop_gradient(jax.vmap(posterior, in_axes=(1, 0, 0))(b, sd, alpha))
+    still, *rest = jax.lax.stop_gradient((G, b.T, sd, alpha))
+    m, S = jax.vmap(posterior)(*rest)
     misfit = jnp.sum((Y - Phi @ m.T) ** 2, axis=0) / sd**2
     trace = jnp.einsum("dij,ij->d", S, G) / sd**2
     ridge = alpha * (jnp.sum(m**2, axis=1) + jnp.trace(S, axis1=1, axis2=2))
