@@ -93,6 +93,13 @@ DESCENTS = (
         ("test_laplace.py", "best"),
     ),
     Mutant(
+        "large batches for the pool of threads",
+        "linalg.py",
+        "jax.custom_jvp(sequential_vmap(function))",
+        "jax.custom_jvp(function)",
+        ("test_linalg.py", "large_batch"),
+    ),
+    Mutant(
         "arrived by the gradient alone",
         LAPLACE,
         " | (left <= GRADIENT_TOLERANCE)",
