@@ -122,7 +122,7 @@ def work(job: Job) -> list[list[float]]:
     data = Transitions.empty(EPISODES * STEPS, task.size, 1)
     for e in range(EPISODES):
         data = data.extend(*random_episode(task, 1000 * job.seed + e))
-    model = METHODS[job.model](system, friction, reach_of(task, system))
+    model = METHODS[job.model](system, friction, {"reach": reach_of(task, system)})
     belief = model.fit(model.init(key), data, key=key)
     tests = [random_episode(task, 1000 * job.seed + 100 + i) for i in range(20)]
     other: Rows = tuple(np.concatenate(x) for x in zip(*tests, strict=True))  # type: ignore[assignment]

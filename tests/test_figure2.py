@@ -116,17 +116,23 @@ def test_cells_that_other_code_flew_are_counted():
 
 def test_a_quick_look_has_a_planner_and_cells_of_its_own(monkeypatch):
     """For the oracle as well: a score is relative to the planner that flew."""
-    full = Cell("furuta", "nominal", "SIM2GP", 0, 2)
+    full = Cell("furuta", "nominal", "RES-FS", 0, 2)
     quick = dataclasses.replace(full, quick=True)
     assert quick.name != full.name
     assert quick.arguments != full.arguments
     assert swingup.reference(quick).name != swingup.reference(full).name
     assert swingup.reference(quick).planner == quick.planner != full.planner
     used = []
-    fly = lambda task, model, planner, **rest: used.append(planner)  # noqa: E731
+    trained = []
+
+    def fly(task, model, planner, **rest):
+        used.append(planner)
+        trained.append((model.steps, model.refit_steps))
+
     monkeypatch.setattr(swingup, "psrl", fly)
     swingup.learner_cell(quick, 0)
     swingup.learner_cell(full, 0)
+    assert trained[0] == tuple(quick.arguments["training"].values()) < trained[1]
 
     def accept(preset, system, planner, *, key):
         used.append(planner)

@@ -55,6 +55,14 @@ def test_posterior_sampling_learns_the_gain_and_reaches_the_oracle() -> None:
     assert history.data.count == 60
 
 
+def test_the_last_episode_need_not_be_learned_from() -> None:
+    learned, flown = run(), run(final_fit=False)
+    assert fits[3:] == [(20, 60), (40, 60)]
+    np.testing.assert_array_equal(flown.returns, learned.returns)
+    np.testing.assert_array_equal(flown.parameter_mean[3], flown.parameter_mean[2])
+    assert flown.data.count == 60
+
+
 def test_the_closed_form_posterior_is_what_the_loop_reports() -> None:
     history = run()
     x = DT * history.action[..., 0].ravel().astype(float)

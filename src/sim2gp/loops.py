@@ -73,6 +73,7 @@ def posterior_sampling(
     key: Key,
     history: int = 0,
     update_every: int | None = None,
+    final_fit: bool = True,
     on_episode: Callable[[Episode], None] | None = None,
 ) -> History:
     """``episodes`` rounds of: draw a world, act in it on ``task``, fit all data.
@@ -80,8 +81,10 @@ def posterior_sampling(
     ``objective`` makes what is maximised out of the belief at the episode's start.
     The first episode is flown on a draw from the prior. ``history`` is the number of
     past actions that the model's state carries. ``update_every`` is None or a number
-    of steps after which the belief learns within the episode (`within`). ``on_episode``
-    is called after each fit. Raises what the fit raises, and `NotFinite`.
+    of steps after which the belief learns within the episode (`within`). Without a
+    ``final_fit`` the last episode is flown and not learned from: where returns are all
+    that is asked. ``on_episode`` is called after each fit. Raises what the fit raises,
+    and `NotFinite`.
     """
     m = task.actions.low.size
     data = Transitions.empty(episodes * task.horizon, task.size + history * m, m)
@@ -111,7 +114,8 @@ def posterior_sampling(
             world_at=within(model, belief, data, history, world_in, key=fitting),
         )
         data = data.extend(*trajectory.transitions(history))
-        belief = model.fit(belief, data, key=fitting)
+        if final_fit or e < episodes:
+            belief = model.fit(belief, data, key=fitting)
         trajectories.append(trajectory)
         summaries.append(_parameters(belief))
         if on_episode is not None:
@@ -184,6 +188,7 @@ def psrl(
     key: Key,
     history: int = 0,
     update_every: int | None = None,
+    final_fit: bool = True,
     on_episode: Callable[[Episode], None] | None = None,
 ) -> History:
     """Posterior sampling with the task's own reward."""
@@ -196,6 +201,7 @@ def psrl(
         key=key,
         history=history,
         update_every=update_every,
+        final_fit=final_fit,
         on_episode=on_episode,
     )
 

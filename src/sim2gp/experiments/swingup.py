@@ -51,53 +51,53 @@ MISSING: dict[str, Effect] = {
 CONDITIONS = ("nominal", "mismatch")
 WITH_TERM = "SIM2GP with the term"
 PLANNER = MPC()
-#: Of a quick look: three sequences in five, in the same proportions.
-QUICK_PLANNER = MPC(update=ICEM(samples=96, elites=10))
+#: Of a quick look: three sequences in eight, in the same proportions, and networks
+#: trained for half as long or less.
+QUICK_PLANNER = MPC(update=ICEM(samples=60, elites=6))
+QUICK_TRAINING = {"steps": 1000, "refit_steps": 300}
 PERIOD = 0.02  # s, of the control on every task
 
 
-#: Half-widths of the box that a learner's inputs are scaled to, by channel.
-Reach = Mapping[str, float]
+#: Of a learner's network: ``reach`` and, for a quick look, its steps.
+Options = Mapping[str, Any]
 
 
 def _with_term(
-    system: AbstractMechanism, missing: Effect, reach: Reach
+    system: AbstractMechanism, missing: Effect, options: Options
 ) -> AbstractModel:
-    del reach
+    del options
     if isinstance(missing, InputDelay):  # its magnitude bounds a candidate's delay
         missing = replace(missing, magnitude=2.0 * missing.magnitude)
     return Sim2GP(Candidate(missing).freed(system, period=PERIOD))
 
 
-def _auto(system: AbstractMechanism, missing: Effect, reach: Reach) -> AbstractModel:
+def _auto(
+    system: AbstractMechanism, missing: Effect, options: Options
+) -> AbstractModel:
     del missing
     sim = Sim2GP(system)
-    residual, matched = (
-        Residual(sim, reach=reach),
-        ResidualFunctionSpace(sim, reach=reach),
-    )
-    return Auto([sim, residual, matched])
+    return Auto([sim, Residual(sim, **options), ResidualFunctionSpace(sim, **options)])
 
 
-#: Each learner, made of the simulator, the physics that it lacks, and the box.
-METHODS: dict[str, Callable[[AbstractMechanism, Effect, Reach], AbstractModel]] = {
-    "SIM2GP": lambda system, _, reach: Sim2GP(system),
-    "point estimate": lambda system, _, reach: PointEstimate(Sim2GP(system)),
-    "NLM": lambda system, _, reach: NLM(system, reach=reach),
-    "RES": lambda system, _, reach: Residual(Sim2GP(system), reach=reach),
-    "FS literal": lambda system, _, reach: FunctionSpace(
-        Sim2GP(system), objective="literal", reach=reach
+#: Each learner, made of the simulator, the physics that it lacks, and its options.
+METHODS: dict[str, Callable[[AbstractMechanism, Effect, Options], AbstractModel]] = {
+    "SIM2GP": lambda system, _, __: Sim2GP(system),
+    "point estimate": lambda system, _, __: PointEstimate(Sim2GP(system)),
+    "NLM": lambda system, _, options: NLM(system, **options),
+    "RES": lambda system, _, options: Residual(Sim2GP(system), **options),
+    "FS literal": lambda system, _, options: FunctionSpace(
+        Sim2GP(system), objective="literal", **options
     ),
-    "FS": lambda system, _, reach: FunctionSpace(Sim2GP(system), reach=reach),
-    "RES-FS": lambda system, _, reach: ResidualFunctionSpace(
-        Sim2GP(system), reach=reach
+    "FS": lambda system, _, options: FunctionSpace(Sim2GP(system), **options),
+    "RES-FS": lambda system, _, options: ResidualFunctionSpace(
+        Sim2GP(system), **options
     ),
     "Auto": _auto,
     WITH_TERM: _with_term,
 }
 
 
-def reach_of(task: Task, system: AbstractMechanism) -> Reach:
+def reach_of(task: Task, system: AbstractMechanism) -> dict[str, float]:
     """The box of states that models are trusted in, a third of the planner's bound."""
     bound = np.asarray(task.state_bound, float) / 3.0
     pairs = zip(system.states, bound.tolist(), strict=True)
@@ -111,7 +111,7 @@ class Cell:
     condition: ``nominal``, ``mismatch`` (figure 2's), or an effect of the catalogue and
         its strength, as in ``coulomb mild``.
     update_every: steps between updates within an episode; None is the paper's way.
-    quick: planned with fewer sequences, by the oracle as well.
+    quick: planned with fewer sequences, by the oracle as well, and trained for less.
     """
 
     machine: str
@@ -140,9 +140,11 @@ class Cell:
     @property
     def arguments(self) -> dict[str, Any]:
         """All that its returns depend on, but for how many of them there are."""
-        told = asdict(self)
-        del told["episodes"], told["quick"]
-        return told | {"planner": _described(self.planner)}
+        told = asdict(self) | {"planner": _described(self.planner)}
+        del told["episodes"]
+        if not told.pop("quick"):
+            return told
+        return told | {"training": QUICK_TRAINING}
 
 
 def _described(value: Any) -> Any:
@@ -197,7 +199,9 @@ def learner_cell(cell: Cell, redrawn: int) -> dict[str, Any]:
     record = draw_truth(system, key_for(key, redrawn, Purpose.TRUTH))
     task = preset(record, effects_of(cell.machine, cell.condition))
     lacking = missing(cell.machine, cell.condition)
-    model = METHODS[cell.method](system, lacking, reach_of(task, system))
+    options: dict[str, Any] = {"reach": reach_of(task, system)}
+    options |= QUICK_TRAINING if cell.quick else {}
+    model = METHODS[cell.method](system, lacking, options)
     # The past actions that a model of delayed inputs has in its state.
     simulator = getattr(model, "system", system)
     returns: list[float] = []
@@ -215,6 +219,7 @@ def learner_cell(cell: Cell, redrawn: int) -> dict[str, Any]:
             key=key,
             history=simulator.history,
             update_every=cell.update_every,
+            final_fit=False,
             on_episode=note,
         )
     except (NotConverged, NotFinite) as error:

@@ -40,7 +40,8 @@ class FunctionSpace(AbstractModel):
     objective: ``"recommended"``, or ``"literal"`` as the paper prints it: weight 1,
         marginals, the noise learned in the comparison, no distillation.
     fs_prior: compare with the simulator fitted to all data, or with its ``"prior"``.
-    pretrain: steps of distillation before the first fit (none for ``"literal"``).
+    pretrain: steps of distillation before the first fit, three times ``steps`` unless
+        given (none for ``"literal"``).
     steps, refit_steps: as in `ResidualFunctionSpace`; other options as in `NLM`.
     """
 
@@ -60,7 +61,7 @@ class FunctionSpace(AbstractModel):
         objective: str = "recommended",
         fs_prior: str = "posterior",
         hidden: tuple[int, ...] = (128, 128),
-        pretrain: int = 6000,
+        pretrain: int | None = None,
         steps: int = 2000,
         refit_steps: int = 1000,
         reach: Mapping[str, float] | None = None,
@@ -72,6 +73,7 @@ class FunctionSpace(AbstractModel):
         self.encoding = Encoding.of(sim.system, reach or {})
         self.objective = objective_of(objective)
         self.hidden = tuple(hidden)
+        pretrain = 3 * steps if pretrain is None else pretrain
         self.pretrain = 0 if objective == "literal" else pretrain
         self.steps = steps
         self.refit_steps = refit_steps
