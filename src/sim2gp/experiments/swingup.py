@@ -52,9 +52,9 @@ CONDITIONS = ("nominal", "mismatch")
 WITH_TERM = "SIM2GP with the term"
 PLANNER = MPC()
 #: Of a quick look: three sequences in eight, in the same proportions, and networks
-#: trained for half as long or less.
+#: trained for a quarter as long.
 QUICK_PLANNER = MPC(update=ICEM(samples=60, elites=6))
-QUICK_TRAINING = {"steps": 1000, "refit_steps": 300}
+QUICK_TRAINING = {"steps": 500, "refit_steps": 200}
 PERIOD = 0.02  # s, of the control on every task
 
 
