@@ -76,8 +76,9 @@ def large_batches(jaxpr):
     for eqn in jaxpr.eqns:
         if eqn.primitive.name in LAPACK:
             *batch, rows, columns = eqn.invars[0].aval.shape
-            count = math.prod(batch)
-            if count > 1 and count * rows * columns * min(rows, columns) > CUT:
+            count = math.prod(batch)  # jaxlib's cost of any of them is at most
+            cost = 2 * count * rows * columns * min(rows, columns)
+            if count > 1 and cost > CUT:
                 found.append(f"{eqn.primitive.name} of {eqn.invars[0].aval.shape}")
         inner = jax.tree.leaves(eqn.params, is_leaf=lambda x: hasattr(x, "eqns"))
         for part in inner:
