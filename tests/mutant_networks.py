@@ -172,6 +172,20 @@ NETWORKS = (
         ("test_tempering.py", "as_wide_as"),
     ),
     Mutant(
+        "RES-FS: acts on what no data settle",
+        "models/hybrid.py",
+        "self.kappa > 1.0, self.sim.posterior.scale",
+        "self.kappa > 1.0, self.physics.scale",
+        ("test_tempering.py", "not_acted_upon"),
+    ),
+    Mutant(
+        "loops: draws from all that is believed",
+        "loops.py",
+        "belief.learnable().sample(",
+        "belief.sample(",
+        ("test_loops.py", "can_settle"),
+    ),
+    Mutant(
         "tempering: few parts taken for many",
         "models/tempering.py",
         "FEW * disagreement(",

@@ -1,5 +1,6 @@
 """Auto: the data choose, before they are learned from, and ties go to the simpler."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -101,6 +102,21 @@ def test_it_answers_as_the_chosen_model(runs):
         np.testing.assert_array_equal(mine, its)
     gains = belief.information_gain(s, a), chosen.information_gain(s, a)
     assert float(gains[0]) == float(gains[1])
+
+
+def test_it_acts_on_what_each_would(runs):
+    _, _, beliefs = runs[0.6]
+    doubtful = eqx.tree_at(lambda b: b.beliefs[1].kappa, beliefs[-1], jnp.asarray(9.0))
+    wide = eqx.tree_at(
+        lambda b: b.beliefs[1].physics.scale, doubtful, replace_fn=lambda x: 9.0 * x
+    )
+    found = wide.learnable()
+    np.testing.assert_array_equal(
+        found.beliefs[0].posterior.scale, wide.beliefs[0].posterior.scale
+    )
+    np.testing.assert_array_equal(
+        found.beliefs[1].physics.scale, wide.beliefs[1].sim.posterior.scale
+    )
 
 
 def test_updates_reach_every_model(runs):

@@ -20,6 +20,7 @@ from mass_task import (
     fresh_counters,  # noqa: F401  (a fixture for every test here)
     mass_task,
     same,
+    single,
     traces,
 )
 from sim2gp import flight, loops, tasks
@@ -53,6 +54,24 @@ def test_posterior_sampling_learns_the_gain_and_reaches_the_oracle() -> None:
     oracle = float(fly_mass().total)
     assert history.returns[-1] > oracle - 0.5
     assert history.data.count == 60
+
+
+class Doubtful(GainBelief):
+    """Doubts its simulator: what it draws from is not what it acts on."""
+
+    def learnable(self) -> GainBelief:
+        return GainBelief(self.mean, self.sd)
+
+    def sample(self, key: Key) -> Any:
+        raise AssertionError("drawn from what no data settle")
+
+
+def test_it_acts_on_what_data_can_settle(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = run()
+    monkeypatch.setattr(
+        GainModel, "init", lambda self, key: Doubtful(single(1.0)[0], single(1.0)[0])
+    )
+    np.testing.assert_array_equal(run().returns, plain.returns)
 
 
 def test_the_last_episode_need_not_be_learned_from() -> None:

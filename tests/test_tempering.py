@@ -163,20 +163,55 @@ def test_never_narrower_than_the_posterior():
         assert np.isnan(float(tempered(belief, *bad)[1]))
 
 
-def test_the_residual_model_is_as_wide_as_its_data_disagree():
-    J, y = rows(300, bent=1.5)
-    options = {"hidden": (8,), "steps": 100, "refit_steps": 100}
-    model = ResidualFunctionSpace(Sim2GP(linear(P, D), dt=1.0), **options)
-    belief = model.fit(model.init(KEY), transitions(J, y), key=KEY)
-    alone, *arrays = fit(J, y)
-    expected, kappa = tempered(alone, *arrays)
+@pytest.fixture(scope="module")
+def bent():
+    """RES-FS on data whose parts disagree, and the same constants by hand."""
+    with jax.enable_x64(True):
+        J, y = rows(300, bent=1.5)
+        options = {"hidden": (8,), "steps": 100, "refit_steps": 100}
+        model = ResidualFunctionSpace(Sim2GP(linear(P, D), dt=1.0), **options)
+        belief = model.fit(model.init(KEY), transitions(J, y), key=KEY)
+        alone, *arrays = fit(J, y)
+        return belief, alone, tempered(alone, *arrays)
+
+
+def without_its_layer(belief):
+    return eqx.tree_at(lambda b: b.head.layer.scale, belief, replace_fn=jnp.zeros_like)
+
+
+def test_the_residual_model_is_as_wide_as_its_data_disagree(bent):
+    belief, _, (expected, kappa) = bent
     assert kappa > 3.0
+    assert float(belief.kappa) == pytest.approx(float(kappa), rel=1e-6)
     np.testing.assert_allclose(
         belief.physics.covariance(), expected.covariance(), rtol=1e-6
     )
-    flat = eqx.tree_at(lambda b: b.head.layer.scale, belief, replace_fn=jnp.zeros_like)
     s, a = jnp.zeros(D), jnp.ones(D * P)
     A = np.ones((D, P))
+    found = without_its_layer(belief).latent(s, a)
     np.testing.assert_allclose(
-        flat.latent(s, a).covariance(), A @ expected.covariance() @ A.T, rtol=1e-6
+        found.covariance(), A @ expected.covariance() @ A.T, rtol=1e-6
+    )
+
+
+def test_what_no_data_settle_is_not_acted_upon(bent):
+    """Draws to act on: constants as wide as the rows say, the layer as it is."""
+    belief, alone, (_, kappa) = bent
+    to_act = belief.learnable()
+    physics, expected = to_act.physics, alone.posterior
+    np.testing.assert_allclose(physics.covariance(), expected.covariance(), rtol=1e-6)
+    np.testing.assert_array_equal(physics.mean, belief.physics.mean)
+    np.testing.assert_array_equal(to_act.head.layer.scale, belief.head.layer.scale)
+    s, a = jnp.zeros(D, jnp.float32), jnp.ones(D * P, jnp.float32)
+    keys = jax.random.split(KEY, 4000)
+    for which, times in ((belief, float(kappa)), (to_act, 1.0)):
+        flat = without_its_layer(which)
+        draws = jax.vmap(lambda key, flat=flat: flat.sample(key)(s, a))(keys)
+        known = times**2 * float(jnp.sum(expected.covariance()))
+        # The prior's share makes the wide one a little narrower than kappa says.
+        assert np.var(np.asarray(draws)[:, 0]) == pytest.approx(known, rel=0.1)
+    # Nothing was tempered: itself.
+    certain = eqx.tree_at(lambda b: b.kappa, belief, jnp.ones(()))
+    np.testing.assert_array_equal(
+        certain.learnable().physics.scale, belief.physics.scale
     )

@@ -94,7 +94,7 @@ def posterior_sampling(
     for e in range(1, episodes + 1):
 
         def world_in(belief: AbstractBelief, e: int = e) -> World:
-            draw = belief.sample(key_for(key, e, Purpose.DRAW))
+            draw = belief.learnable().sample(key_for(key, e, Purpose.DRAW))
             return world_of(task, draw, objective(belief), history=history)
 
         world = world_in(belief)

@@ -34,6 +34,14 @@ class AbstractBelief(eqx.Module):
     def point(self) -> Dynamics:
         """The best single function, of the same type as a draw."""
 
+    def learnable(self) -> "AbstractBelief":
+        """What posterior sampling draws from: only as wide as more data would settle.
+
+        The belief itself, unless it is wider because its simulator is wrong: acting to
+        find out about that finds out nothing.
+        """
+        return self
+
     @abstractmethod
     def information_gain(self, s: State, a: Action) -> Scalar:
         """Nats that one more transition from here is expected to give."""

@@ -165,8 +165,9 @@ def _fit(
         training,
     )
     head = head_of(belief, q, noise, c)
-    replaced = jnp.zeros(())
-    fitted = HybridBelief(sim, at_map(sim), replaced, head, noise * c, jnp.sum(mask))
+    replaced, plain = jnp.zeros(()), jnp.ones(())
+    count = jnp.sum(mask)
+    fitted = HybridBelief(sim, at_map(sim), replaced, plain, head, noise * c, count)
     return fitted, lost
 
 

@@ -74,11 +74,13 @@ class HybridBelief(AbstractBelief):
     physics: the part of the function that ``tt`` still varies: the posterior, or the
         MAP with no spread where the network's variance has taken it over.
     keep: 1 where the physics is part of the function, 0 where it is replaced.
+    kappa: how much wider ``physics`` is kept than its rows make it; 1 unless tempered.
     """
 
     sim: Sim2GPBelief
     physics: Gaussian
     keep: Scalar
+    kappa: Scalar
     head: Head
     noise: Float[Array, " d"]  # sd of one step, state units
     count: Int[Array, ""]
@@ -106,6 +108,14 @@ class HybridBelief(AbstractBelief):
     def point(self) -> Dynamics:
         nothing = jnp.zeros_like(self.physics.mean)
         return self._draw(nothing, self.head.mean_weights())
+
+    @in_float64
+    def learnable(self) -> "HybridBelief":
+        """Where tempered, the constants' spread is that of independent rows again."""
+        plain = jnp.where(
+            self.kappa > 1.0, self.sim.posterior.scale, self.physics.scale
+        )
+        return eqx.tree_at(lambda b: b.physics.scale, self, plain)
 
     @in_float64
     def information_gain(self, s: State, a: Action) -> Scalar:
@@ -176,9 +186,9 @@ def before_data(
     d, p = encoding.outputs, sim.prior.mean.size
     layer = LastLayer.prior(d, trained.network.features, p, trained.alpha)
     head = Head(trained, layer, jnp.zeros(d), encoding)
-    return HybridBelief(
-        physics, sim.prior, jnp.ones(()), head, physics.noise, jnp.zeros((), int)
-    )
+    one = jnp.ones(())
+    nothing = jnp.zeros((), int)
+    return HybridBelief(physics, sim.prior, one, one, head, physics.noise, nothing)
 
 
 def conditioned(

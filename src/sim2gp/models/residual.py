@@ -128,6 +128,7 @@ def _fit(
         sim,
         physics,
         jnp.ones(()),
+        jnp.ones(()),
         nlm.Head(best.trained, layer, c, head.encoding),
         noise,
         jnp.sum(mask),

@@ -120,7 +120,7 @@ def _fit(
     head, mask = belief.head, data.mask
     X, y = features.encoded(head.encoding, data)
     r, _, J = hybrid.residuals(sim, data, y)
-    physics, _ = tempered(sim, r, J)
+    physics, kappa = tempered(sim, r, J)
     c = SCALE * sim.noise
     S, A = matching.inputs(pool, head.encoding, data, POOL)
     target = matching.targets(
@@ -142,4 +142,4 @@ def _fit(
     )
     head = head_of(belief, q, noise, c)
     kept = jnp.ones(())
-    return HybridBelief(sim, physics, kept, head, noise * c, jnp.sum(mask))
+    return HybridBelief(sim, physics, kept, kappa, head, noise * c, jnp.sum(mask))
