@@ -196,19 +196,19 @@ def test_the_residual_model_is_as_wide_as_its_data_disagree(bent):
 
 def test_what_no_data_settle_is_not_acted_upon(bent):
     """Draws to act on: constants as wide as the rows say, the layer as it is."""
-    belief, alone, (_, kappa) = bent
-    to_act = belief.learnable()
-    physics, expected = to_act.physics, alone.posterior
-    np.testing.assert_allclose(physics.covariance(), expected.covariance(), rtol=1e-6)
-    np.testing.assert_array_equal(physics.mean, belief.physics.mean)
+    belief, alone, (wide, _) = bent
+    to_act, plain = belief.learnable(), alone.posterior
+    np.testing.assert_allclose(
+        to_act.physics.covariance(), plain.covariance(), rtol=1e-6
+    )
+    np.testing.assert_array_equal(to_act.physics.mean, belief.physics.mean)
     np.testing.assert_array_equal(to_act.head.layer.scale, belief.head.layer.scale)
     s, a = jnp.zeros(D, jnp.float32), jnp.ones(D * P, jnp.float32)
     keys = jax.random.split(KEY, 4000)
-    for which, times in ((belief, float(kappa)), (to_act, 1.0)):
-        flat = without_its_layer(which)
+    for drawn, constants in ((belief, wide), (to_act, plain)):
+        flat = without_its_layer(drawn)
         draws = jax.vmap(lambda key, flat=flat: flat.sample(key)(s, a))(keys)
-        known = times**2 * float(jnp.sum(expected.covariance()))
-        # The prior's share makes the wide one a little narrower than kappa says.
+        known = float(jnp.sum(constants.covariance()))
         assert np.var(np.asarray(draws)[:, 0]) == pytest.approx(known, rel=0.1)
     # Nothing was tempered: itself.
     certain = eqx.tree_at(lambda b: b.kappa, belief, jnp.ones(()))
