@@ -18,8 +18,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sim2gp.least_squares import Factor, triangular
-from sim2gp.linalg import solve_triangular
+from sim2gp.least_squares import Factor
+from sim2gp.linalg import solve_triangular, triangular
 from sim2gp.types import Scalar
 
 #: Triangular factors of ``[J_e J_z r]`` per window and channel; k = n + p + 1.

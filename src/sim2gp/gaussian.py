@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sim2gp.linalg import qr, solve_triangular
+from sim2gp.linalg import solve_triangular, triangular
 from sim2gp.types import Key, Scalar
 
 LOG_2PI = 1.8378770664093453
@@ -80,8 +80,7 @@ class Gaussian(eqx.Module):
 
 def lower_factor(scale: Float[Array, "n k"]) -> Float[Array, "n n"]:
     """Lower-triangular L with ``L L^T = scale scale^T`` and non-negative diagonal."""
-    R = qr(scale.T)
-    return (jnp.where(jnp.diag(R) < 0.0, -1.0, 1.0)[:, None] * R).T
+    return triangular(scale.T).T
 
 
 def log_det_factor(L: Float[Array, "n n"]) -> Scalar:

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sim2gp.gaussian import LOG_2PI, Gaussian, log_det_factor
-from sim2gp.linalg import qr, solve_triangular
+from sim2gp.linalg import solve_triangular, triangular
 from sim2gp.types import Scalar
 
 #: Triangular factor of ``[J r]``, shape (p + 1, p + 1), diagonal non-negative.
@@ -32,15 +32,6 @@ RANK_TOLERANCE = 1e-8  # singular values below this share of the largest count a
 def factor(J: Float[Array, "N p"], r: Float[Array, " N"]) -> Factor:
     """Triangular factor of ``[J r]``: the data's square-root information."""
     return triangular(jnp.concatenate([J, r[:, None]], axis=1))
-
-
-def triangular(rows: Float[Array, "N k"]) -> Float[Array, "k k"]:
-    """``R`` of the QR decomposition, square, with non-negative diagonal."""
-    N, k = rows.shape
-    if N < k:
-        rows = jnp.concatenate([rows, jnp.zeros((k - N, k), rows.dtype)])
-    R = qr(rows)
-    return jnp.where(jnp.diag(R) < 0.0, -1.0, 1.0)[:, None] * R
 
 
 def stack(*factors: Float[Array, "_ k"]) -> Float[Array, "k k"]:

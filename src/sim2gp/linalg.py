@@ -4,7 +4,7 @@ jaxlib cuts a large batch of matrices into tasks for the thread pool that its pr
 themselves run on, and waits for them there. As many such batches at once as the pool
 has threads wait for each other for ever: on two cores no fit of RES-FS came to its end
 (jaxlib 0.10.2, where a batch of less than 2e5 operations is not cut).
-A loop costs nothing where processes have a core each, which is how studies run.
+Where processes have a core each, which is how studies run, a loop costs little.
 """
 
 from collections.abc import Callable
@@ -28,6 +28,15 @@ def one_by_one(function: Callable[..., Any]) -> Callable[..., Any]:
 def qr(A: Float[Array, "N k"]) -> Float[Array, "_ k"]:
     """``R`` of the QR decomposition, ``min(N, k)`` rows, signs as LAPACK has them."""
     return _qr(A)
+
+
+def triangular(rows: Float[Array, "N k"]) -> Float[Array, "k k"]:
+    """``R`` of the QR decomposition, square, with non-negative diagonal."""
+    N, k = rows.shape
+    if N < k:
+        rows = jnp.concatenate([rows, jnp.zeros((k - N, k), rows.dtype)])
+    R = qr(rows)
+    return jnp.where(jnp.diag(R) < 0.0, -1.0, 1.0)[:, None] * R
 
 
 def cholesky(A: Float[Array, "n n"]) -> Float[Array, "n n"]:

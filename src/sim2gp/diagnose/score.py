@@ -29,7 +29,7 @@ from jaxtyping import Array, Float, Int
 from sim2gp.arrowhead import Blocks, Noise, eliminate
 from sim2gp.diagnose.evidence import AbstractData, Fitted, scores_of
 from sim2gp.laplace import AbstractLikelihood, Fit, expectation, multi_start
-from sim2gp.least_squares import triangular
+from sim2gp.linalg import triangular
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.effects import AbstractEffect
 from sim2gp.systems.library import Candidate, with_effects

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from sim2gp.gaussian import LOG_2PI, Gaussian
-from sim2gp.least_squares import over, triangular
-from sim2gp.linalg import solve_triangular
+from sim2gp.least_squares import over
+from sim2gp.linalg import solve_triangular, triangular
 from sim2gp.types import Scalar
 
 #: Variances, in units of the output's scale squared, tried when noise is recalibrated.

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sim2gp.gaussian import Gaussian
+from sim2gp.gaussian import Gaussian, log_det_factor
 from sim2gp.linalg import qr
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import Action, Key, Scalar, State
@@ -95,9 +95,8 @@ def information_gain(scaled: Float[Array, "rows p"]) -> Scalar:
     """
     p = scaled.shape[1]
     rows = jnp.concatenate([scaled, jnp.eye(p, dtype=scaled.dtype)])
-    R = qr(rows)
     # Rounding may leave log|1 - eps|; information is never negative.
-    return jnp.maximum(jnp.sum(jnp.log(jnp.abs(jnp.diag(R)))), 0.0)
+    return jnp.maximum(log_det_factor(qr(rows)), 0.0)
 
 
 def draw(

@@ -140,7 +140,7 @@ def divergence(
     U = U.astype(noise.dtype)
     K = jnp.einsum("dij,dkj->dik", U, U)
     K = K + (noise**2)[:, None, None] * jnp.eye(b, dtype=noise.dtype)[None]
-    C = jnp.linalg.cholesky(K)
+    C = jnp.linalg.cholesky(K)  # too small a batch to be cut (`sim2gp.linalg`)
     log_det = jnp.sum(jnp.log(jnp.diagonal(C, axis1=1, axis2=2)))
     return 0.5 * (quadratic - b * d) + target.log_det[g] - log_det
 

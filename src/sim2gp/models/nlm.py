@@ -314,7 +314,9 @@ def evidence_loss(
     Y = jnp.where(valid[:, None], Y, 0.0)
     count = jnp.maximum(jnp.sum(valid, dtype=Y.dtype), 1.0)
     G, b = Phi.T @ Phi, Phi.T @ Y
+    sd, alpha = trained.noise, trained.alpha
     eye = jnp.eye(Phi.shape[1], dtype=Y.dtype)
+    still, *rows = jax.lax.stop_gradient((G, b.T, sd, alpha))
 
     def posterior(b: Array, sd: Array, a: Array) -> tuple[Array, Array]:
         L = cholesky(still / sd**2 + a * eye)
@@ -322,9 +324,7 @@ def evidence_loss(
         half = solve_triangular(L, b / sd**2, lower=True)
         return solve_triangular(L, half, lower=True, transposed=True), root.T @ root
 
-    sd, alpha = trained.noise, trained.alpha
-    still, *rest = jax.lax.stop_gradient((G, b.T, sd, alpha))
-    m, S = jax.vmap(posterior)(*rest)
+    m, S = jax.vmap(posterior)(*rows)
     misfit = jnp.sum((Y - Phi @ m.T) ** 2, axis=0) / sd**2
     trace = jnp.einsum("dij,ij->d", S, G) / sd**2
     ridge = alpha * (jnp.sum(m**2, axis=1) + jnp.trace(S, axis1=1, axis2=2))

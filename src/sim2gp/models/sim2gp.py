@@ -17,7 +17,8 @@ from jaxtyping import Array, Float, Int
 from sim2gp.arrowhead import Blocks, Noise
 from sim2gp.gaussian import LOG_2PI, Gaussian
 from sim2gp.laplace import AbstractLikelihood, Fit, expectation, multi_start
-from sim2gp.least_squares import factor, gauss_newton_step, over, stack, triangular
+from sim2gp.least_squares import factor, gauss_newton_step, over, stack
+from sim2gp.linalg import triangular
 from sim2gp.models import linearized
 from sim2gp.models.base import AbstractBelief, AbstractModel
 from sim2gp.systems.base import AbstractSystem
