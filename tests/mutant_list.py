@@ -50,7 +50,7 @@ EVIDENCE = "return -0.5 * full[:, -1] @ full[:, -1] - log_det"
 RESIDUAL = "jnp.where(valid, value - s2[:d], 0.0)"
 POSTERIOR = "        fit.posterior(model.prior),\n"
 BOX = "low + (high - low) * jax.nn.sigmoid(t), low, high"
-GAIN_SUM = "jnp.maximum(jnp.sum(jnp.log(jnp.abs(jnp.diag(R)))), 0.0)"
+GAIN_SUM = "log_det_factor(qr(rows))"
 HESSIAN = """        Gaussian(
             fit.posterior(model.prior).mean,
             model.prior.scale
