@@ -15,7 +15,7 @@ LAYERS: tuple[frozenset[str], ...] = (
     ),
     frozenset({"systems", "logs"}),
     frozenset({"models", "tasks", "planning"}),
-    frozenset({"flight"}),
+    frozenset({"flight", "exploration"}),
     frozenset({"loops"}),
     frozenset({"project", "runs", "robot", "design", "diagnose"}),
     frozenset({"cli", "experiments", "report"}),

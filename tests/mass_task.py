@@ -93,10 +93,11 @@ class GainBelief(AbstractBelief):
     def point(self) -> Mass:
         return Mass(self.mean)
 
-    def information_gain(self, s: State, a: Array) -> Array:
+    def sensitivity(self, s: State, a: Array) -> tuple[Array, Array]:
         raise NotImplementedError
 
-    def trajectory_information_gain(self, S: Array, A: Array) -> Array:
+    @property
+    def coordinates(self) -> tuple[int, int, int]:
         raise NotImplementedError
 
     def parameters(self) -> tuple[Array, Array]:

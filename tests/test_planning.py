@@ -29,6 +29,7 @@ from sim2gp.planning import (
     AbstractObjective,
     MarkovObjective,
     Plan,
+    Resumed,
     World,
 )
 from sim2gp.planning.base import DIVERGED, masked, rollout
@@ -240,11 +241,17 @@ class Steps(AbstractObjective):
     def step(self, carry: Array, s: Array, a: Array, s2: Array) -> tuple[Array, Array]:
         return carry + 1.0, carry
 
+    def along(self, carry: Array, S: Array, A: Array, S2: Array) -> Array:
+        return carry + jnp.arange(len(A), dtype=carry.dtype)
+
 
 def test_an_objective_may_carry_state() -> None:
     rewards, valid = rollout(world(objective=Steps()), S0, jnp.zeros((9, 1)))
     assert valid
     np.testing.assert_array_equal(rewards, np.arange(9.0))
+    later = Resumed(Steps(), jnp.asarray(4.0))
+    rewards, _ = rollout(world(objective=later), S0, jnp.zeros((9, 1)))
+    np.testing.assert_array_equal(rewards, 4.0 + np.arange(9.0))
 
 
 def test_a_rollout_has_the_rewards_of_the_simulated_states() -> None:

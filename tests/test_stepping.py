@@ -188,8 +188,7 @@ class Standing(AbstractBelief):
     def latent(self, s: jax.Array, a: jax.Array) -> Gaussian:
         raise AssertionError("not of interest here")
 
-    predict = information_gain = latent
-    trajectory_information_gain = latent
+    predict = sensitivity = coordinates = latent
 
 
 class Stays(eqx.Module):

@@ -15,7 +15,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp.errors import NotFinite, warn
-from sim2gp.planning import AbstractObjective, AbstractPlanner, MarkovObjective, World
+from sim2gp.planning import (
+    AbstractObjective,
+    AbstractPlanner,
+    MarkovObjective,
+    Resumed,
+    World,
+)
 from sim2gp.tasks import Task
 from sim2gp.transitions import with_history
 from sim2gp.types import Dynamics, Key, Scalar, State
@@ -96,11 +102,15 @@ def oracle_world(task: Task) -> World:
 
 
 class Moment(eqx.Module):
-    """Everything that an episode carries from one step to the next."""
+    """Everything that an episode carries from one step to the next.
+
+    ``memory`` is the objective's: what was done in this world counts where it plans.
+    """
 
     state: State
     past: Float[Array, " history"]
     planner: Any
+    memory: Any
 
 
 def begin(
@@ -109,7 +119,8 @@ def begin(
     """The episode's first moment, and its start as it is seen."""
     start = task.reset(jax.random.fold_in(key, Purpose.RESET))
     past = jnp.zeros(world.history * task.actions.low.size, task.start.dtype)
-    return Moment(start, past, planner_state), start[: task.size]
+    memory = world.objective.init()
+    return Moment(start, past, planner_state, memory), start[: task.size]
 
 
 def fly_steps(
@@ -131,14 +142,19 @@ def fly_steps(
 
     def step(now: Moment, t: Array) -> tuple[Moment, Any]:
         seen = jnp.concatenate([now.state[: task.size], now.past])
+        objective = Resumed(world.objective, now.memory)
+        here = eqx.tree_at(lambda w: w.objective, world, objective)
         planned, planner_state = planner.act(
-            now.planner, world, seen, key=jax.random.fold_in(plan, t)
+            now.planner, here, seen, key=jax.random.fold_in(plan, t)
         )
         a = task.limit(planned)
         s2 = task.step(now.state, a, key=jax.random.fold_in(noise, t))
         reward, failed = task.reward(now.state, a, s2), planner.failed(planner_state)
         past = jnp.concatenate([a, now.past])[: now.past.size]
-        return Moment(s2, past, planner_state), (s2[: task.size], a, reward, failed)
+        met = jnp.concatenate([s2[: task.size], past])
+        memory, _ = world.objective.step(now.memory, seen, a, met)
+        row = s2[: task.size], a, reward, failed
+        return Moment(s2, past, planner_state, memory), row
 
     return jax.lax.scan(step, moment, steps)
 
@@ -182,6 +198,9 @@ def episode(
     for first in range(0, task.horizon, part):
         if flown is not None and world_at is not None:
             world = world_at(flown)
+            moment = eqx.tree_at(
+                lambda m: m.memory, moment, world.objective.init()
+            )  # what was flown is in the new world's belief
         steps = jnp.arange(first, min(first + part, task.horizon))
         moment, rows = _fly_steps(task, planner, moment, world, steps, key=key)
         flown = extended(flown, start, rows)

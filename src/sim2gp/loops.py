@@ -8,7 +8,7 @@ as well, and the draw moves with it: same random numbers, newer posterior.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import equinox as eqx
 import jax
@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from sim2gp.errors import NotFinite, Sim2GPError
+from sim2gp.exploration import InformationGain, Optimistic, Restrained, single
 from sim2gp.flight import (
     Purpose,
     Trajectory,
@@ -30,7 +31,10 @@ from sim2gp.planning import AbstractObjective, AbstractPlanner, MarkovObjective,
 from sim2gp.systems import AbstractSystem
 from sim2gp.tasks import Task, draw_truth
 from sim2gp.transitions import Transitions
-from sim2gp.types import Key, in_float64
+from sim2gp.types import Dynamics, Key, in_float64
+
+#: Nats a step, of leaving the trusted box by as much again.
+LIMIT_COST = 100.0
 
 
 class Episode(eqx.Module):
@@ -63,6 +67,17 @@ class History(eqx.Module):
         return self.reward.sum(axis=1, dtype=np.float64)
 
 
+def drawn(belief: AbstractBelief, key: Key) -> Dynamics:
+    """Posterior sampling's world: a draw that is as wide as more data would settle."""
+    return belief.learnable().sample(key)
+
+
+def expected(belief: AbstractBelief, key: Key) -> Dynamics:
+    """The mean world, for objectives that themselves look for the unknown."""
+    del key
+    return belief.point()
+
+
 def posterior_sampling(
     task: Task,
     model: AbstractModel,
@@ -75,16 +90,17 @@ def posterior_sampling(
     update_every: int | None = None,
     final_fit: bool = True,
     on_episode: Callable[[Episode], None] | None = None,
+    world: Callable[[AbstractBelief, Key], Dynamics] = drawn,
 ) -> History:
     """``episodes`` rounds of: draw a world, act in it on ``task``, fit all data.
 
-    ``objective`` makes what is maximised out of the belief at the episode's start.
-    The first episode is flown on a draw from the prior. ``history`` is the number of
-    past actions that the model's state carries. ``update_every`` is None or a number
-    of steps after which the belief learns within the episode (`within`). Without a
-    ``final_fit`` the last episode is flown and not learned from: where returns are all
-    that is asked. ``on_episode`` is called after each fit. Raises what the fit raises,
-    and `NotFinite`.
+    ``objective`` makes what is maximised out of the belief at the episode's start,
+    ``world`` what it is planned in. The first episode is flown on the prior.
+    ``history`` is the number of past actions that the model's state carries.
+    ``update_every`` is None or a number of steps after which the belief learns within
+    the episode (`within`). Without a ``final_fit`` the last episode is flown and not
+    learned from: where returns are all that is asked. ``on_episode`` is called after
+    each fit. Raises what the fit raises, and `NotFinite`.
     """
     m = task.actions.low.size
     data = Transitions.empty(episodes * task.horizon, task.size + history * m, m)
@@ -94,21 +110,21 @@ def posterior_sampling(
     for e in range(1, episodes + 1):
 
         def world_in(belief: AbstractBelief, e: int = e) -> World:
-            draw = belief.learnable().sample(key_for(key, e, Purpose.DRAW))
-            return world_of(task, draw, objective(belief), history=history)
+            dynamics = world(belief, key_for(key, e, Purpose.DRAW))
+            return world_of(task, dynamics, objective(belief), history=history)
 
-        world = world_in(belief)
+        start = world_in(belief)
         if planner_state is None:
-            planner_state = planner.init(world, key=key_for(key, 0, Purpose.PREPARE))
+            planner_state = planner.init(start, key=key_for(key, 0, Purpose.PREPARE))
         planner_state = planner.prepare(
-            planner_state, world, data, key=key_for(key, e, Purpose.PREPARE)
+            planner_state, start, data, key=key_for(key, e, Purpose.PREPARE)
         )
         key_e, fitting = key_for(key, e, Purpose.EPISODE), key_for(key, e, Purpose.FIT)
         trajectory, planner_state = episode(
             task,
             planner,
             planner_state,
-            world,
+            start,
             key=key_e,
             part=update_every,
             world_at=within(model, belief, data, history, world_in, key=fitting),
@@ -179,6 +195,15 @@ def _condition(
     return eqx.combine(jax.lax.scan(step, arrays, (S, A, S2))[0], rest)
 
 
+class Options(TypedDict, total=False):
+    """Of `posterior_sampling`, whatever it is for."""
+
+    history: int
+    update_every: int | None
+    final_fit: bool
+    on_episode: Callable[[Episode], None] | None
+
+
 def psrl(
     task: Task,
     model: AbstractModel,
@@ -186,10 +211,7 @@ def psrl(
     *,
     episodes: int,
     key: Key,
-    history: int = 0,
-    update_every: int | None = None,
-    final_fit: bool = True,
-    on_episode: Callable[[Episode], None] | None = None,
+    **options: Unpack[Options],
 ) -> History:
     """Posterior sampling with the task's own reward."""
     return posterior_sampling(
@@ -199,10 +221,67 @@ def psrl(
         objective=lambda belief: MarkovObjective(task.reward),
         episodes=episodes,
         key=key,
-        history=history,
-        update_every=update_every,
-        final_fit=final_fit,
-        on_episode=on_episode,
+        **options,
+    )
+
+
+def psal(
+    task: Task,
+    model: AbstractModel,
+    planner: AbstractPlanner,
+    *,
+    episodes: int,
+    key: Key,
+    together: bool = True,
+    limit_cost: float = LIMIT_COST,
+    **options: Unpack[Options],
+) -> History:
+    """Posterior sampling with information gain for a reward: learn the machine itself.
+
+    ``together`` is `InformationGain`'s. The states stay within the box that models are
+    trusted in; going beyond it by as much again costs ``limit_cost`` nats a step.
+    """
+    bound, cost = task.trusted, jnp.asarray(limit_cost, jnp.float32)
+
+    def objective(belief: AbstractBelief) -> AbstractObjective:
+        gain = InformationGain(single(belief.learnable()), together)
+        return Restrained(gain, bound, cost)
+
+    return posterior_sampling(
+        task,
+        model,
+        planner,
+        objective=objective,
+        episodes=episodes,
+        key=key,
+        **options,
+    )
+
+
+def optimism(
+    task: Task,
+    model: AbstractModel,
+    planner: AbstractPlanner,
+    *,
+    episodes: int,
+    key: Key,
+    weight: float,
+    **options: Unpack[Options],
+) -> History:
+    """Instead of draws, the mean world, its reward raised where it is uncertain.
+
+    ``weight`` is that of one noise sd of doubt about the next state (`Optimistic`).
+    """
+    each = jnp.asarray(weight, jnp.float32)
+    return posterior_sampling(
+        task,
+        model,
+        planner,
+        objective=lambda b: Optimistic(task.reward, single(b.learnable()), each),
+        episodes=episodes,
+        key=key,
+        world=expected,
+        **options,
     )
 
 

@@ -24,6 +24,8 @@ from sim2gp.systems.base import AbstractMechanism
 from sim2gp.systems.perturbed import perturb
 from sim2gp.types import Action, Box, Dynamics, Key, Reward, Scalar, State, in_float64
 
+#: A task's states are bounded at so many times the box that models are trusted in.
+TRUSTED = 3.0
 #: A pole counts as upright below this cosine of its angle (hanging = 0).
 UPRIGHT_COSINE = -0.9
 #: The solved band of the score.
@@ -37,7 +39,7 @@ class Task(eqx.Module):
     """The "real" robot, simulated. All arrays are data: a new truth retraces nothing.
 
     noise: sd of the state increment per step, of the physical states, state units.
-    state_bound: three times the box of states that a model is trusted in.
+    state_bound: `TRUSTED` times the box of states that a model is trusted in.
     horizon: steps of ``dt`` seconds in an episode.
     history: past actions that the state of ``dynamics`` carries (delayed inputs).
     pole: which state is the angle that must end upright.
@@ -86,6 +88,11 @@ class Task(eqx.Module):
         """The next state of the real machine under the limited action."""
         eps = jax.random.normal(key, self.noise.shape, self.noise.dtype)
         return self.dynamics(s, self.limit(a)).at[: self.size].add(self.noise * eps)
+
+    @property
+    def trusted(self) -> Float[Array, " n"]:
+        """Half-widths of the box of states that a model is trusted in."""
+        return self.state_bound / TRUSTED
 
     def upright(self, states: Float[Array, "*T n"]) -> Bool[Array, "*T"]:
         """Whether the pole stands, per state."""
@@ -139,7 +146,7 @@ def furuta_swingup(
         noise=_single(1e-3, 1e-3, 2e-2, 2e-2),
         start=_single(0.0, 0.0, 0.0, 0.0),
         start_sd=_single(0.02, 0.02, 0.02, 0.02),
-        state_bound=3.0 * _single(2.0, math.inf, 15.0, 25.0),
+        state_bound=TRUSTED * _single(2.0, math.inf, 15.0, 25.0),
         planning_horizon=45,
         noise_colour=2.0,
     )
@@ -161,7 +168,7 @@ def cartpole_swingup(
         noise=_single(5e-4, 1e-3, 1e-2, 2e-2),
         start=_single(0.0, 0.0, 0.0, 0.0),
         start_sd=_single(0.0, 0.02, 0.0, 0.02),
-        state_bound=3.0 * _single(0.35, math.inf, 1.5, 15.0),
+        state_bound=TRUSTED * _single(0.35, math.inf, 1.5, 15.0),
         planning_horizon=50,
         planning_iterations=3,
         noise_colour=2.0,

@@ -98,9 +98,9 @@ METHODS: dict[str, Callable[[AbstractMechanism, Effect, Options], AbstractModel]
 
 
 def reach_of(task: Task, system: AbstractMechanism) -> dict[str, float]:
-    """The box of states that models are trusted in, a third of the planner's bound."""
-    bound = np.asarray(task.state_bound, float) / 3.0
-    pairs = zip(system.states, bound.tolist(), strict=True)
+    """The box of states that models are trusted in, by channel."""
+    bound = np.asarray(task.trusted, float).tolist()
+    pairs = zip(system.states, bound, strict=True)
     return {channel.name: half for channel, half in pairs if np.isfinite(half)}
 
 

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp.gaussian import Gaussian
 from sim2gp.models.base import AbstractBelief, AbstractModel
+from sim2gp.models.information import Sensitivity
 from sim2gp.transitions import Transitions
 from sim2gp.types import Action, Dynamics, Key, Scalar, State, in_float64
 
@@ -62,24 +63,27 @@ class AutoBelief(AbstractBelief):
     def point(self) -> Dynamics:
         return AutoDraw(tuple(b.point() for b in self.beliefs), self.index)
 
-    def information_gain(self, s: State, a: Action) -> Scalar:
-        return jnp.stack([b.information_gain(s, a) for b in self.beliefs])[self.index]
+    def sensitivity(self, s: State, a: Action) -> Sensitivity:
+        each = zip(*(b.sensitivity(s, a) for b in self.beliefs), strict=True)
+        shared, own = (_padded(parts)[self.index] for parts in each)
+        return shared, own
 
-    def trajectory_information_gain(
-        self, S: Float[Array, "T n"], A: Float[Array, "T m"]
-    ) -> Scalar:
-        gains = [b.trajectory_information_gain(S, A) for b in self.beliefs]
-        return jnp.stack(gains)[self.index]
+    @property
+    def coordinates(self) -> tuple[int, int, int]:
+        d, p, m = map(max, zip(*(b.coordinates for b in self.beliefs), strict=True))
+        return d, p, m
 
     def _spoken(self, all_of_them: Sequence[Gaussian]) -> Gaussian:
-        """The chosen one; scales are padded by columns of zeros to one width."""
-        width = max(g.scale.shape[1] for g in all_of_them)
+        """The chosen one."""
         means = jnp.stack([g.mean for g in all_of_them])
-        scales = [
-            jnp.pad(g.scale, ((0, 0), (0, width - g.scale.shape[1])))
-            for g in all_of_them
-        ]
-        return Gaussian(means[self.index], jnp.stack(scales)[self.index])
+        scales = _padded([g.scale for g in all_of_them])
+        return Gaussian(means[self.index], scales[self.index])
+
+
+def _padded(scales: Sequence[Float[Array, "d _"]]) -> Float[Array, "models d k"]:
+    """One width for all, by columns of zeros."""
+    width = max(x.shape[1] for x in scales)
+    return jnp.stack([jnp.pad(x, ((0, 0), (0, width - x.shape[1]))) for x in scales])
 
 
 class Auto(AbstractModel):

@@ -7,12 +7,14 @@ stand the point estimate (certainty equivalence) and the unlearned prior mean.
 from abc import abstractmethod
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sim2gp.gaussian import Gaussian
+from sim2gp.models.information import Sensitivity, joint
 from sim2gp.transitions import Transitions
-from sim2gp.types import Action, Dynamics, Key, Scalar, State
+from sim2gp.types import Action, Dynamics, Key, Scalar, State, in_float64
 
 
 class AbstractBelief(eqx.Module):
@@ -43,14 +45,31 @@ class AbstractBelief(eqx.Module):
         return self
 
     @abstractmethod
+    def sensitivity(self, s: State, a: Action) -> Sensitivity:
+        """How ``s'`` moves with the belief's standard normal coordinates, in noise sd.
+
+        Along those that all outputs share, and along each output's own
+        (`models.information`), in the precision of the belief's numbers.
+        """
+
+    @property
+    @abstractmethod
+    def coordinates(self) -> tuple[int, int, int]:
+        """``(d, p, m)``: outputs, shared coordinates, coordinates of each output."""
+
+    @in_float64
     def information_gain(self, s: State, a: Action) -> Scalar:
         """Nats that one more transition from here is expected to give."""
+        s, a = jnp.asarray(s, float), jnp.asarray(a, float)
+        return self.trajectory_information_gain(s[None], a[None])
 
-    @abstractmethod
+    @in_float64
     def trajectory_information_gain(
         self, S: Float[Array, "T n"], A: Float[Array, "T m"]
     ) -> Scalar:
         """Nats that a whole trajectory is expected to give, redundancy removed."""
+        S, A = jnp.asarray(S, float), jnp.asarray(A, float)
+        return joint(*jax.vmap(self.sensitivity)(S, A))
 
 
 class AbstractModel(eqx.Module):
@@ -92,13 +111,13 @@ class DeterministicBelief(AbstractBelief):
     def point(self) -> Dynamics:
         return self.belief.point()
 
-    def information_gain(self, s: State, a: Action) -> Scalar:
-        return jnp.zeros(())
+    def sensitivity(self, s: State, a: Action) -> Sensitivity:
+        nothing = jnp.zeros((self.coordinates[0], 0))
+        return nothing, nothing
 
-    def trajectory_information_gain(
-        self, S: Float[Array, "T n"], A: Float[Array, "T m"]
-    ) -> Scalar:
-        return jnp.zeros(())
+    @property
+    def coordinates(self) -> tuple[int, int, int]:
+        return self.belief.coordinates[0], 0, 0
 
 
 class PointEstimate(AbstractModel):

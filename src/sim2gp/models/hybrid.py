@@ -16,12 +16,12 @@ from sim2gp.gaussian import Gaussian
 from sim2gp.models import last_layer, linearized
 from sim2gp.models.base import AbstractBelief
 from sim2gp.models.features import Encoding, Network, stepped
+from sim2gp.models.information import Sensitivity
 from sim2gp.models.last_layer import LastLayer
 from sim2gp.models.nlm import (
     Head,
     Trained,
     double,
-    joint_gain,
     lifted,
     with_noise,
 )
@@ -117,25 +117,14 @@ class HybridBelief(AbstractBelief):
         )
         return eqx.tree_at(lambda b: b.physics.scale, self, plain)
 
-    @in_float64
-    def information_gain(self, s: State, a: Action) -> Scalar:
-        s, a = double(s, a)
-        return self.trajectory_information_gain(s[None], a[None])
+    def sensitivity(self, s: State, a: Action) -> Sensitivity:
+        _, shared, own = self.parts(s, a)
+        return shared / self.noise[:, None], own / self.noise[:, None]
 
-    @in_float64
-    def trajectory_information_gain(
-        self, S: Float[Array, "T n"], A: Float[Array, "T m"]
-    ) -> Scalar:
-        d, noise = self.noise.size, self.noise[:, None]
-
-        def rows(s: Array, a: Array) -> Array:
-            _, shared, own = self.parts(s, a)
-            # Output k moves with e_0 and with its own e_k alone.
-            blocks = jax.scipy.linalg.block_diag(*(own[k : k + 1] for k in range(d)))
-            return jnp.concatenate([shared, blocks], axis=1) / noise
-
-        scaled = jax.vmap(rows)(*double(S, A))
-        return joint_gain(scaled.reshape(-1, scaled.shape[-1]))
+    @property
+    def coordinates(self) -> tuple[int, int, int]:
+        d, m = self.head.layer.mean.shape
+        return d, self.physics.scale.shape[1], m
 
     @in_float64
     def parameters(self) -> tuple[Float[Array, " p"], Float[Array, " p"]]:

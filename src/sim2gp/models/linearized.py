@@ -15,10 +15,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sim2gp.gaussian import Gaussian, log_det_factor
-from sim2gp.linalg import qr
+from sim2gp.gaussian import Gaussian
 from sim2gp.systems.base import AbstractSystem
-from sim2gp.types import Action, Key, Scalar, State
+from sim2gp.types import Action, Key, State
 
 
 class LinearizedDraw(eqx.Module):
@@ -85,18 +84,6 @@ def latent(f: Callable[[Array], Array], posterior: Gaussian) -> Gaussian:
     """Push a parameter posterior through the linearised function (eq. 2, no noise)."""
     value, J = value_and_jacobian(f, posterior.mean)
     return Gaussian(value, J @ posterior.scale)
-
-
-def information_gain(scaled: Float[Array, "rows p"]) -> Scalar:
-    """``1/2 logdet(I + A A^T)`` of ``A = Se^-1/2 J S``, by QR.
-
-    Stacking a trajectory's rows gives the joint information: what the second visit to
-    one place repeats is not counted twice.
-    """
-    p = scaled.shape[1]
-    rows = jnp.concatenate([scaled, jnp.eye(p, dtype=scaled.dtype)])
-    # Rounding may leave log|1 - eps|; information is never negative.
-    return jnp.maximum(log_det_factor(qr(rows)), 0.0)
 
 
 def draw(

@@ -20,9 +20,10 @@ from jaxtyping import Array, Bool, Float, Int
 from sim2gp.errors import NotFinite
 from sim2gp.gaussian import Gaussian
 from sim2gp.linalg import cholesky, solve_triangular
-from sim2gp.models import features, last_layer, linearized
+from sim2gp.models import features, last_layer
 from sim2gp.models.base import AbstractBelief, AbstractModel
 from sim2gp.models.features import Encoding, Network, stepped
+from sim2gp.models.information import Sensitivity
 from sim2gp.models.last_layer import LastLayer
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.transitions import Transitions
@@ -143,18 +144,14 @@ class NLMBelief(AbstractBelief):
         W = self.head.mean_weights()
         return NeuralDraw(self.head.trained.network, W, self.head.encoding)
 
-    @in_float64
-    def information_gain(self, s: State, a: Action) -> Scalar:
-        s, a = double(s, a)
-        return self.trajectory_information_gain(s[None], a[None])
+    def sensitivity(self, s: State, a: Action) -> Sensitivity:
+        _, shared, own = self.head.moments(s, a)
+        return shared, own / self.noise[:, None]
 
-    @in_float64
-    def trajectory_information_gain(
-        self, S: Float[Array, "T n"], A: Float[Array, "T m"]
-    ) -> Scalar:
-        own = jax.vmap(lambda s, a: self.head.moments(s, a)[2])(*double(S, A))
-        scaled = own / self.noise[None, :, None]
-        return jnp.sum(jax.vmap(joint_gain, in_axes=1)(scaled))
+    @property
+    def coordinates(self) -> tuple[int, int, int]:
+        d, m = self.head.layer.mean.shape
+        return d, 0, m
 
 
 class NLM(AbstractModel):
@@ -384,9 +381,3 @@ def with_noise(latent: Gaussian, noise: Float[Array, " d"]) -> Gaussian:
     """Add one step's noise on the physical states."""
     n, d = latent.mean.size, noise.size
     return latent.plus(jnp.concatenate([jnp.diag(noise), jnp.zeros((n - d, d))]))
-
-
-def joint_gain(scaled: Float[Array, "rows k"]) -> Scalar:
-    """``1/2 logdet(I + A A^T)`` by a QR of the smaller side."""
-    rows, k = scaled.shape
-    return linearized.information_gain(scaled if k <= rows else scaled.T)

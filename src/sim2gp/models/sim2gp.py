@@ -21,6 +21,8 @@ from sim2gp.least_squares import factor, gauss_newton_step, over, stack
 from sim2gp.linalg import triangular
 from sim2gp.models import linearized
 from sim2gp.models.base import AbstractBelief, AbstractModel
+from sim2gp.models.features import Encoding
+from sim2gp.models.information import Sensitivity
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.transitions import Transitions
 from sim2gp.types import Action, Dynamics, Key, Scalar, State, in_float64
@@ -28,6 +30,7 @@ from sim2gp.types import Action, Dynamics, Key, Scalar, State, in_float64
 NOISE_ROUNDS = 5  # EM; the last change of sig is below 1e-3 relative from here on
 STARTS = 4
 FLOOR = 1e-3  # prior guess of the noise, relative to each channel's rms change
+PRIOR_NOISE = 1e-3  # before any data, of half of a channel's box
 
 
 class Sim2GPBelief(AbstractBelief):
@@ -63,16 +66,14 @@ class Sim2GPBelief(AbstractBelief):
         key = jax.random.key(0)  # the scale is zero: no randomness is used
         return linearized.draw(self.system, at_map, self.dt, key, linear=self.linear)
 
-    @in_float64
-    def information_gain(self, s: State, a: Action) -> Scalar:
-        s, a = _double(s, a)
-        return _trajectory_information_gain(self, s[None], a[None])
+    def sensitivity(self, s: State, a: Action) -> Sensitivity:
+        d = self.noise.size
+        shared = _latent(self, s, a).scale[:d] / self.noise[:, None]
+        return shared, jnp.zeros((d, 0), shared.dtype)
 
-    @in_float64
-    def trajectory_information_gain(
-        self, S: Float[Array, "T n"], A: Float[Array, "T m"]
-    ) -> Scalar:
-        return _trajectory_information_gain(self, *_double(S, A))
+    @property
+    def coordinates(self) -> tuple[int, int, int]:
+        return self.noise.size, self.posterior.scale.shape[1], 0
 
     @in_float64
     def parameters(self) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
@@ -122,12 +123,12 @@ class Sim2GP(AbstractModel):
     def init(self, key: Key) -> Sim2GPBelief:
         """The prior itself; needs no key."""
         del key
-        p, d = self.prior.mean.size, len(self.system.physical_states)
+        p = self.prior.mean.size
         return Sim2GPBelief(
             self.system,
             self.prior,
             self.prior,
-            jnp.ones(d),
+            PRIOR_NOISE * Encoding.of(self.system, {}).half_widths(),
             jnp.zeros((p, p)),
             jnp.zeros(()),
             jnp.zeros((), int),
@@ -183,18 +184,6 @@ def _predict(belief: Sim2GPBelief, s: Array, a: Array) -> Gaussian:
     d, n = belief.noise.size, s.size
     noise = jnp.concatenate([jnp.diag(belief.noise), jnp.zeros((n - d, d))])
     return _latent(belief, s, a).plus(noise)
-
-
-def _trajectory_information_gain(
-    belief: Sim2GPBelief, S: Float[Array, "T n"], A: Float[Array, "T m"]
-) -> Scalar:
-    d = belief.noise.size
-
-    def rows(s: Array, a: Array) -> Array:
-        return _latent(belief, s, a).scale[:d] / belief.noise[:, None]
-
-    scaled = jax.vmap(rows)(S, A)
-    return linearized.information_gain(scaled.reshape(-1, scaled.shape[-1]))
 
 
 class _OneStep(AbstractLikelihood):

@@ -4,6 +4,7 @@ from sim2gp.planning.base import (
     AbstractObjective,
     AbstractPlanner,
     MarkovObjective,
+    Resumed,
     World,
 )
 from sim2gp.planning.icem import ICEM
@@ -20,5 +21,6 @@ __all__ = [
     "AbstractUpdate",
     "MarkovObjective",
     "Plan",
+    "Resumed",
     "World",
 ]

@@ -33,6 +33,16 @@ class AbstractObjective(eqx.Module):
     def step(self, carry: Any, s: State, a: Action, s2: State) -> tuple[Any, Scalar]:
         """The next carry and the reward of one step."""
 
+    @abstractmethod
+    def along(
+        self,
+        carry: Any,
+        S: Float[Array, "H n"],
+        A: Float[Array, "H m"],
+        S2: Float[Array, "H n"],
+    ) -> Float[Array, " H"]:
+        """The rewards of a whole trajectory: what `step` gives, one after the other."""
+
 
 class MarkovObjective(AbstractObjective):
     """The sum of a reward ``r(s, a, s')`` that remembers nothing."""
@@ -44,6 +54,37 @@ class MarkovObjective(AbstractObjective):
 
     def step(self, carry: Any, s: State, a: Action, s2: State) -> tuple[Any, Scalar]:
         return carry, self.reward(s, a, s2)
+
+    def along(
+        self,
+        carry: Any,
+        S: Float[Array, "H n"],
+        A: Float[Array, "H m"],
+        S2: Float[Array, "H n"],
+    ) -> Float[Array, " H"]:
+        return jax.vmap(self.reward)(S, A, S2)
+
+
+class Resumed(AbstractObjective):
+    """An objective in the middle of a trajectory: what came before is in ``carry``."""
+
+    objective: AbstractObjective
+    carry: Any
+
+    def init(self) -> Any:
+        return self.carry
+
+    def step(self, carry: Any, s: State, a: Action, s2: State) -> tuple[Any, Scalar]:
+        return self.objective.step(carry, s, a, s2)
+
+    def along(
+        self,
+        carry: Any,
+        S: Float[Array, "H n"],
+        A: Float[Array, "H m"],
+        S2: Float[Array, "H n"],
+    ) -> Float[Array, " H"]:
+        return self.objective.along(carry, S, A, S2)
 
 
 class World(eqx.Module):
@@ -103,14 +144,16 @@ def rollout(
 ) -> tuple[Float[Array, " H"], Bool[Array, ""]]:
     """The rewards of one action sequence from ``s``, and whether it is valid."""
 
-    def step(carry: Any, a: Action) -> tuple[Any, Scalar]:
-        s, memory, valid = carry
+    def step(carry: Any, a: Action) -> tuple[Any, State]:
+        s, valid = carry
         s2, usable = world.step(s, a)
-        memory, reward = world.objective.step(memory, s, a, s2)
-        return (s2, memory, valid & usable), reward
+        return (s2, valid & usable), s2
 
-    start = (s, world.objective.init(), jnp.all(jnp.isfinite(s)))
-    (_, _, valid), rewards = jax.lax.scan(step, start, actions)
+    start = (s, jnp.all(jnp.isfinite(s)))
+    (_, valid), S2 = jax.lax.scan(step, start, actions)
+    S = jnp.concatenate([s[None], S2[:-1]])
+    objective = world.objective
+    rewards = objective.along(objective.init(), S, actions, S2)
     return rewards, valid & jnp.isfinite(jnp.sum(rewards))
 
 
