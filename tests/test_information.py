@@ -63,7 +63,9 @@ def test_what_was_done_leaves_less_to_learn(shape):
 def test_a_second_look_without_noise_tells_nothing_more():
     """Rounding is not information: float32, rows of 300 noise sd, seen 30 times."""
     shared, own, _ = rows(1, 2, 3, 4)
-    many = [jnp.repeat(300.0 * x, 30, axis=0).astype(jnp.float32) for x in (shared, own)]
+    many = [
+        jnp.repeat(300.0 * x, 30, axis=0).astype(jnp.float32) for x in (shared, own)
+    ]
     told = np.asarray(increments(*many))
     assert np.all(told >= 0.0)
     assert told[0] > 10.0

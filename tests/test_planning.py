@@ -28,12 +28,11 @@ from sim2gp.planning import (
     MPPI,
     AbstractObjective,
     MarkovObjective,
-    Plan,
     Resumed,
     World,
 )
 from sim2gp.planning.base import DIVERGED, masked, rollout
-from sim2gp.planning.mpc import from_unit, promising
+from sim2gp.planning.mpc import Underway, from_unit, promising
 from sim2gp.planning.mppi import softmax_of_size
 from sim2gp.planning.noise import colour_factor, coloured_noise
 
@@ -140,7 +139,7 @@ def trap(poison: float, good: float = 1.0, fault: float = 0.0) -> World:
 PLANNERS = [MPC(ICEM(samples=64)), MPC(MPPI(samples=64))]
 
 
-def flat_plan(planner: MPC, w: World, value: float) -> Plan:
+def flat_plan(planner: MPC, w: World, value: float) -> Underway:
     plan = planner.init(w, key=KEY)
     return jax.tree.map(lambda x: x + value if x.ndim > 1 else x, plan)
 
@@ -155,7 +154,7 @@ def test_a_rollout_that_diverges_never_wins(planner: MPC, poison: float) -> None
     assert not planner.failed(plan)
     for leaf in jax.tree.leaves(plan):
         assert np.isfinite(np.asarray(leaf)).all()
-    assert np.asarray(plan.mean).max() <= 0.0
+    assert np.asarray(plan.plan.mean).max() <= 0.0
 
 
 @pytest.mark.parametrize("planner", PLANNERS, ids=["icem", "mppi"])
@@ -164,7 +163,7 @@ def test_a_reward_that_is_not_finite_never_wins(planner: MPC, fault: float) -> N
     w = trap(0.0, fault=fault)
     a, plan = act(planner, flat_plan(planner, w, -0.9), w, S0, key=KEY)
     assert float(a[0]) <= 0.0
-    assert np.asarray(plan.mean).max() <= 0.0
+    assert np.asarray(plan.plan.mean).max() <= 0.0
 
 
 @pytest.mark.parametrize("planner", PLANNERS, ids=["icem", "mppi"])
@@ -175,19 +174,20 @@ def test_all_invalid_is_flagged_and_the_warm_start_survives(planner: MPC) -> Non
     a, after = act(planner, before, dead, S0, key=KEY)
     assert planner.failed(after)
     assert not planner.failed(before)
-    np.testing.assert_array_equal(after.mean, before.shift().mean)
-    np.testing.assert_allclose(a, 3.0 * before.mean[0], rtol=1e-6)
+    np.testing.assert_array_equal(after.plan.mean, before.plan.shift().mean)
+    np.testing.assert_allclose(a, 3.0 * before.plan.mean[0], rtol=1e-6)
     # A state that is not finite is as bad as a draw that is not.
     _, lost = act(planner, before, good, S0 * jnp.nan, key=KEY)
     assert planner.failed(lost)
-    np.testing.assert_array_equal(lost.mean, before.shift().mean)
+    np.testing.assert_array_equal(lost.plan.mean, before.plan.shift().mean)
     # One good world later everything is as if nothing had happened.
     _, again = act(planner, after, good, S0, key=KEY)
     assert not planner.failed(again)
-    direct = act(planner, before.shift(), good, S0, key=KEY)[1]
+    shifted = eqx.tree_at(lambda u: u.plan, before, before.plan.shift())
+    direct = act(planner, shifted, good, S0, key=KEY)[1]
     if planner.update.__class__ is MPPI:  # no elites to lose
-        np.testing.assert_array_equal(again.mean, direct.mean)
-    assert np.isfinite(np.asarray(again.mean)).all()
+        np.testing.assert_array_equal(again.plan.mean, direct.plan.mean)
+    assert np.isfinite(np.asarray(again.plan.mean)).all()
 
 
 def test_masked_returns_are_finite_and_last() -> None:
@@ -309,11 +309,25 @@ def test_actions_stay_in_a_lopsided_box(planner: MPC) -> None:
 
 def test_the_world_knows_the_planning_defaults() -> None:
     w = world(planning_horizon=11)
-    assert MPC().init(w, key=KEY).mean.shape == (11, 1)
-    assert MPC(horizon=4).init(w, key=KEY).mean.shape == (4, 1)
+    assert MPC().init(w, key=KEY).plan.mean.shape == (11, 1)
+    assert MPC(horizon=4).init(w, key=KEY).plan.mean.shape == (4, 1)
     stale = flat_plan(MPC(), w, 0.5)
     fresh = MPC().prepare(stale, w, None, key=KEY)
-    np.testing.assert_array_equal(fresh.mean, 0.0)  # nothing of another world is kept
+    np.testing.assert_array_equal(fresh.plan.mean, 0.0)  # another world's is forgotten
+
+
+def test_a_plan_may_be_followed_for_some_steps() -> None:
+    """The actions of one plan, then those of the next, made where they led."""
+    w, planner = world(), MPC(ICEM(samples=32), every=3)
+    state, s, actions = planner.init(w, key=KEY), S0, []
+    for i in range(4):
+        a, state = act(planner, state, w, s, key=jax.random.fold_in(KEY, i))
+        actions.append(np.asarray(a))
+        s = w.dynamics(s, a)
+        if i == 0:
+            first = np.asarray(from_unit(state.sequence, w.actions))
+    np.testing.assert_allclose(np.concatenate(actions[1:3]), first[:2, 0], rtol=1e-6)
+    assert abs(float(actions[3][0]) - first[2, 0]) > 1e-4
 
 
 def test_a_new_draw_is_data() -> None:

@@ -118,7 +118,9 @@ class Seen(eqx.Module):
         own = jnp.einsum("...dm,dmj->...dj", own, self.layer.scale)
         return shared @ self.z.scale + common, own
 
-    def after(self, shared: Float[Array, "d p"], own: Float[Array, "d features"]) -> "Seen":
+    def after(
+        self, shared: Float[Array, "d p"], own: Float[Array, "d features"]
+    ) -> "Seen":
         """One more transition."""
         nothing, unit = jnp.zeros(len(own), own.dtype), jnp.ones(len(own), own.dtype)
         z, layer = last_layer.condition(self.z, self.layer, shared, own, nothing, unit)

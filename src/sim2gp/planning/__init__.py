@@ -10,6 +10,7 @@ from sim2gp.planning.base import (
 from sim2gp.planning.icem import ICEM
 from sim2gp.planning.mpc import MPC
 from sim2gp.planning.mppi import MPPI
+from sim2gp.planning.signals import Chirp, Multisine, RandomInput
 from sim2gp.planning.update import AbstractUpdate, Plan
 
 __all__ = [
@@ -19,8 +20,11 @@ __all__ = [
     "AbstractObjective",
     "AbstractPlanner",
     "AbstractUpdate",
+    "Chirp",
     "MarkovObjective",
+    "Multisine",
     "Plan",
+    "RandomInput",
     "Resumed",
     "World",
 ]

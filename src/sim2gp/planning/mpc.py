@@ -16,7 +16,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp.planning.base import AbstractPlanner, World, masked, rollout
 from sim2gp.planning.icem import ICEM
@@ -24,28 +24,41 @@ from sim2gp.planning.update import AbstractUpdate, Plan
 from sim2gp.types import Action, Box, Key, State
 
 
+class Underway(eqx.Module):
+    """A plan, the sequence that is being executed, and how many steps were made."""
+
+    plan: Plan
+    sequence: Float[Array, "H m"]
+    steps: Int[Array, ""]
+
+
 class MPC(AbstractPlanner):
     """Sampling MPC; ``horizon`` None takes the world's planning default (in steps).
 
     lengths: of the plans that compete, as shares of the horizon.
+    every: steps of a plan that are executed before the next one is made.
     """
 
     update: AbstractUpdate = ICEM()
     horizon: int | None = eqx.field(static=True, default=None)
     lengths: tuple[float, ...] = eqx.field(static=True, default=(0.5, 0.75, 1.0))
+    every: int = eqx.field(static=True, default=1)
 
-    def init(self, world: World, *, key: Key) -> Plan:
+    def init(self, world: World, *, key: Key) -> Underway:
         box = world.actions
         horizon = self.horizon or world.planning_horizon
-        return self.update.init(horizon, box.low.size, box.low.dtype)
+        plan = self.update.init(horizon, box.low.size, box.low.dtype)
+        return Underway(plan, jnp.zeros_like(plan.mean), jnp.zeros((), int))
 
-    def prepare(self, state: Plan, world: World, data: Any, *, key: Key) -> Plan:
+    def prepare(
+        self, state: Underway, world: World, data: Any, *, key: Key
+    ) -> Underway:
         """Forget: a plan made in one world is no start for another."""
         return self.init(world, key=key)
 
     def act(
-        self, state: Plan, world: World, s: State, *, key: Key
-    ) -> tuple[Action, Plan]:
+        self, state: Underway, world: World, s: State, *, key: Key
+    ) -> tuple[Action, Underway]:
         def evaluate(U: Float[Array, "N H m"]) -> tuple[Array, Array]:
             rewards, valid = jax.vmap(
                 lambda u: rollout(world, s, from_unit(u, world.actions))
@@ -53,11 +66,22 @@ class MPC(AbstractPlanner):
             steps = [max(1, round(x * U.shape[1])) for x in self.lengths]
             return promising(rewards, valid, steps), valid
 
-        sequence, plan = self.update.improve(state, evaluate, world, key=key)
-        return from_unit(sequence[:1], world.actions)[0], plan.shift()
+        def planned() -> tuple[Array, Plan]:
+            return self.update.improve(state.plan, evaluate, world, key=key)
 
-    def failed(self, state: Plan) -> Bool[Array, ""]:
-        return state.valid == 0
+        if self.every == 1:
+            sequence, plan = planned()
+        else:
+            kept = state.sequence, state.plan
+            sequence, plan = jax.lax.cond(
+                state.steps % self.every == 0, planned, lambda: kept
+            )
+        later = jnp.concatenate([sequence[1:], sequence[-1:]])
+        after = Underway(plan.shift(), later, state.steps + 1)
+        return from_unit(sequence[:1], world.actions)[0], after
+
+    def failed(self, state: Underway) -> Bool[Array, ""]:
+        return state.plan.valid == 0
 
 
 def promising(
