@@ -16,7 +16,7 @@ LAYERS: tuple[frozenset[str], ...] = (
     frozenset({"systems", "logs"}),
     frozenset({"models", "tasks", "planning"}),
     frozenset({"flight", "exploration"}),
-    frozenset({"loops"}),
+    frozenset({"loops", "oracle"}),
     frozenset({"project", "runs", "robot", "design", "diagnose"}),
     frozenset({"cli", "experiments", "report"}),
 )

@@ -19,6 +19,7 @@ from sim2gp.types import Box, Dynamics, Key, State
 
 KEY = jax.random.key(0)
 DT = 0.1
+NOISE = 1e-3, 1e-2
 #: What was traced, drawn and fitted in the present test.
 traces: list[str] = []
 draws: list[str] = []
@@ -56,7 +57,7 @@ def mass_task(gain: float = 2.0, dynamics: Dynamics | None = None) -> Task:
     return Task(
         dynamics=Mass(jnp.asarray(gain, jnp.float32)) if dynamics is None else dynamics,
         reward=Reach(),
-        noise=single(1e-3, 1e-2),
+        noise=single(*NOISE),
         start=single(0.0, 0.0),
         start_sd=single(0.01, 0.01),
         state_bound=single(10.0, 10.0),
@@ -94,11 +95,13 @@ class GainBelief(AbstractBelief):
         return Mass(self.mean)
 
     def sensitivity(self, s: State, a: Array) -> tuple[Array, Array]:
-        raise NotImplementedError
+        velocity = DT * a[0] * self.sd / NOISE[1]
+        shared = jnp.stack([jnp.zeros_like(velocity), velocity])[:, None]
+        return shared, jnp.zeros((2, 0), shared.dtype)
 
     @property
     def coordinates(self) -> tuple[int, int, int]:
-        raise NotImplementedError
+        return 2, 1, 0
 
     def parameters(self) -> tuple[Array, Array]:
         return self.mean[None], self.sd[None]

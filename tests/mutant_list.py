@@ -12,7 +12,6 @@ MODEL = (
     "regression or expectation or predictive or function_space or rows",
 )
 UPDATE = ("test_sim2gp.py", "update")
-GAIN = ("test_sim2gp.py", "information_gain")
 DRAWS = ("test_sim2gp.py", "draws")
 CURVED = ("test_sim2gp.py", "gauss or quadrature")
 BOUNDS = ("test_parameters.py", "inside or formulas or slopes")
@@ -50,7 +49,6 @@ EVIDENCE = "return -0.5 * full[:, -1] @ full[:, -1] - log_det"
 RESIDUAL = "jnp.where(valid, value - s2[:d], 0.0)"
 POSTERIOR = "        fit.posterior(model.prior),\n"
 BOX = "low + (high - low) * jax.nn.sigmoid(t), low, high"
-GAIN_SUM = "log_det_factor(qr(rows))"
 HESSIAN = """        Gaussian(
             fit.posterior(model.prior).mean,
             model.prior.scale
@@ -234,14 +232,6 @@ MUTANTS = (
         "@ belief.prior.scale\n",
         "@ belief.posterior.scale\n",
         UPDATE,
-    ),
-    Mutant("gain doubled", LIN, GAIN_SUM, f"2.0 * {GAIN_SUM}", GAIN),
-    Mutant(
-        "gain without the noise",
-        SIM,
-        "scale[:d] / belief.noise[:, None]\n\n",
-        "scale[:d]\n\n",
-        GAIN,
     ),
     Mutant(
         "draws without their slope", LIN, "return mean + slope", "return mean", DRAWS

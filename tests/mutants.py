@@ -16,13 +16,14 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from mutant_descent import DESCENTS
+from mutant_exploring import EXPLORING
 from mutant_list import MUTANTS as PHYSICS
 from mutant_list import Hunt, Mutant
 from mutant_misfit import MISFIT
 from mutant_networks import NETWORKS
 from mutant_studies import STUDIES
 
-MUTANTS = (*PHYSICS, *DESCENTS, *NETWORKS, *MISFIT, *STUDIES)
+MUTANTS = (*PHYSICS, *DESCENTS, *NETWORKS, *MISFIT, *STUDIES, *EXPLORING)
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "src" / "sim2gp"

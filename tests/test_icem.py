@@ -64,7 +64,7 @@ def test_scanned_and_unrolled_iterations_agree() -> None:
         for plan in [MPC(ICEM()).init(world(), key=KEY)]
     )
     np.testing.assert_allclose(scanned[0], unrolled[0], atol=1e-5)
-    np.testing.assert_allclose(scanned[1].mean, unrolled[1].mean, atol=1e-5)
+    np.testing.assert_allclose(scanned[1].plan.mean, unrolled[1].plan.mean, atol=1e-5)
 
 
 def test_decay_shrinks_the_population_down_to_two_elites() -> None:

@@ -24,6 +24,7 @@ from mass_task import (
     traces,
 )
 from sim2gp import flight, loops, tasks
+from sim2gp import oracle as references
 from sim2gp.errors import NotFinite, Sim2GPError
 from sim2gp.flight import Trajectory, key_for, world_of
 from sim2gp.models.base import AbstractBelief
@@ -100,7 +101,7 @@ def test_what_is_added_to_a_run_changes_nothing() -> None:
     def evaluate(report: loops.Episode) -> None:
         seen.append(report.index)
         task = mass_task()
-        loops.fly_oracle(task, SMALL, key=KEY, episodes=1)
+        references.fly_oracle(task, SMALL, key=KEY, episodes=1)
         assert report.belief.parameters()[0].shape == (1,)
 
     assert same(plain, run(on_episode=evaluate))
@@ -204,7 +205,7 @@ def test_keys_differ_by_episode_and_purpose() -> None:
 def test_the_oracle_swings_up_the_published_machine(
     preset: Callable[[], Task], least: float
 ) -> None:
-    oracle = loops.fly_oracle(preset(), MPC(), key=KEY)
+    oracle = references.fly_oracle(preset(), MPC(), key=KEY)
     assert len(oracle.returns) == 5
     assert oracle.swings_up
     assert oracle.oracle_return == np.median(oracle.returns)
@@ -216,15 +217,17 @@ def test_truths_are_redrawn_until_the_oracle_swings_up(
 ) -> None:
     asked: list[Task] = []
 
-    def judge(task: Task, planner: AbstractPlanner, *, key: Key) -> loops.OracleRun:
+    def judge(
+        task: Task, planner: AbstractPlanner, *, key: Key
+    ) -> references.OracleRun:
         asked.append(task)
         if len(asked) == 1:
             raise NotFinite("E203", "state 72")
-        return loops.OracleRun(np.asarray([1.0, 3.0, 2.0]), len(asked) == 3)
+        return references.OracleRun(np.asarray([1.0, 3.0, 2.0]), len(asked) == 3)
 
-    monkeypatch.setattr(loops, "fly_oracle", judge)
+    monkeypatch.setattr(references, "fly_oracle", judge)
     arguments = (tasks.furuta_swingup, Furuta(), MPC())
-    accepted = loops.accept_truth(*arguments, key=KEY)
+    accepted = references.accept_truth(*arguments, key=KEY)
     assert accepted.redrawn == 2
     assert accepted.oracle.oracle_return == 2.0
     assert accepted.task is asked[2]
@@ -233,4 +236,4 @@ def test_truths_are_redrawn_until_the_oracle_swings_up(
     asked.clear()
     told = "E204 no truth that MPC can swing up: got 2 draws .* 1 of them not finite"
     with pytest.raises(Sim2GPError, match=told):
-        loops.accept_truth(*arguments, key=KEY, attempts=2)
+        references.accept_truth(*arguments, key=KEY, attempts=2)

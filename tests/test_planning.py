@@ -78,7 +78,7 @@ def riccati_cost(s0: np.ndarray) -> float:
 
 @eqx.filter_jit
 def closed_loop(planner: MPC, w: World, s0: Array, key: Array) -> Array:
-    def step(carry: tuple[Array, Plan], key: Array) -> tuple[object, Array]:
+    def step(carry: tuple[Array, Underway], key: Array) -> tuple[object, Array]:
         s, state = carry
         a, state = planner.act(state, w, s, key=key)
         s2 = w.dynamics(s, a)

@@ -40,6 +40,7 @@ class Purpose(enum.IntEnum):
     RESET = 7
     NOISE = 8
     PLAN = 9
+    TEST = 10
 
 
 def key_for(key: Key, episode: int, purpose: Purpose) -> Key:

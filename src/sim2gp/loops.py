@@ -16,20 +16,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from sim2gp.errors import NotFinite, Sim2GPError
 from sim2gp.exploration import InformationGain, Optimistic, Restrained, single
 from sim2gp.flight import (
     Purpose,
     Trajectory,
     episode,
     key_for,
-    oracle_world,
     world_of,
 )
 from sim2gp.models.base import AbstractBelief, AbstractModel
 from sim2gp.planning import AbstractObjective, AbstractPlanner, MarkovObjective, World
-from sim2gp.systems import AbstractSystem
-from sim2gp.tasks import Task, draw_truth
+from sim2gp.tasks import Task
 from sim2gp.transitions import Transitions
 from sim2gp.types import Dynamics, Key, in_float64
 
@@ -202,6 +199,7 @@ class Options(TypedDict, total=False):
     update_every: int | None
     final_fit: bool
     on_episode: Callable[[Episode], None] | None
+    world: Callable[[AbstractBelief, Key], Dynamics]
 
 
 def psrl(
@@ -280,90 +278,7 @@ def optimism(
         objective=lambda b: Optimistic(task.reward, single(b.learnable()), each),
         episodes=episodes,
         key=key,
-        world=expected,
-        **options,
-    )
-
-
-class OracleRun(eqx.Module):
-    """Episodes of a planner that knows the truth; fewer than asked if one fell."""
-
-    returns: Float[np.ndarray, " E"]
-    swings_up: bool = eqx.field(static=True)
-
-    @property
-    def oracle_return(self) -> float:
-        """Median of the returns."""
-        return float(np.median(self.returns))
-
-
-def fly_oracle(
-    task: Task, planner: AbstractPlanner, *, key: Key, episodes: int = 5
-) -> OracleRun:
-    """The upper reference: ``planner`` in a world made of the true dynamics.
-
-    It plans without noise and flies the noisy task. It swings up when the pole stands
-    over the last second of every episode; the first one that does not ends the run.
-    """
-    world = oracle_world(task)
-    planner_state = planner.init(world, key=key_for(key, 0, Purpose.PREPARE))
-    data = Transitions.empty(1, task.size, task.actions.low.size)
-    ready = planner.prepare(
-        planner_state, world, data, key=key_for(key, 1, Purpose.PREPARE)
-    )
-    returns, up = [], True
-    for e in range(1, episodes + 1):
-        key_e = key_for(key, e, Purpose.ORACLE)
-        trajectory, _ = episode(task, planner, ready, world, key=key_e)
-        returns.append(float(trajectory.total))
-        up = bool(task.swung_up(jnp.asarray(trajectory.state)))
-        if not up:
-            break
-    return OracleRun(np.asarray(returns), up)
-
-
-class AcceptedTruth(eqx.Module):
-    """A task that its oracle can solve, and how many draws were thrown away."""
-
-    task: Task
-    oracle: OracleRun
-    redrawn: int = eqx.field(static=True)
-
-
-def accept_truth(
-    preset: Callable[[Any], Task],
-    system: AbstractSystem,
-    planner: AbstractPlanner,
-    *,
-    key: Key,
-    truth: str = "prior",
-    attempts: int = 100,
-) -> AcceptedTruth:
-    """Draw truths (`tasks.draw_truth`) until the oracle swings one up.
-
-    ``preset`` makes a task of a record of constants (`tasks.furuta_swingup`). A truth
-    that the oracle drives to where its integration diverges is one not swung up (far
-    beyond its bounds a machine spins faster than the substeps can follow). Raises
-    `Sim2GPError` E204 when ``attempts`` draws all fail.
-    """
-    diverged = 0
-    for attempt in range(attempts):
-        record = draw_truth(system, key_for(key, attempt, Purpose.TRUTH), truth)
-        task = preset(record)
-        key_a = jax.random.fold_in(key, attempt)
-        try:
-            oracle = fly_oracle(task, planner, key=key_a)
-        except NotFinite:
-            diverged += 1
-            continue
-        if oracle.swings_up:
-            return AcceptedTruth(task, oracle, attempt)
-    raise Sim2GPError(
-        "E204",
-        f"no truth that {type(planner).__name__} can swing up",
-        got=f"{attempts} draws ({truth}), {diverged} of them not finite",
-        expected="at least one",
-        fix="narrow the prior or give the planner more samples",
+        **(Options(world=expected) | options),
     )
 
 

@@ -17,7 +17,13 @@ from sim2gp.runs.store import check_target
 from sim2gp.runs.workers import cores
 
 #: Figure, and the module of `sim2gp.experiments` that makes it.
-FIGURES = {"fig1": "two_link", "fig2": "figure2", "mismatch": "mismatch"}
+FIGURES = {
+    "fig1": "two_link",
+    "fig2": "figure2",
+    "fig3": "figure3",
+    "fig5": "figure3",
+    "mismatch": "mismatch",
+}
 
 
 @dataclass(kw_only=True)
@@ -193,7 +199,8 @@ class Reproduce(Writes):
     """A figure of the paper: its data, the picture, and the claims checked."""
 
     figure: Annotated[
-        Positional[Literal["fig1", "fig2", "mismatch"]], arg(metavar="FIGURE")
+        Positional[Literal["fig1", "fig2", "fig3", "fig5", "mismatch"]],
+        arg(metavar="FIGURE"),
     ]
     """A figure of the paper, or the mismatch map."""
     seed: int = 0
@@ -212,6 +219,8 @@ class Reproduce(Writes):
         if self.figure != "fig1":
             more = {"seeds": self.seeds, "episodes": self.episodes}
             more["workers"] = self.workers or cores()
+        if FIGURES[self.figure] == "figure3":
+            more["figure"] = self.figure
         return _experiment(FIGURES[self.figure])(
             out=_out(self.out, self.figure),
             seed=self.seed,

@@ -17,8 +17,9 @@ import numpy as np
 from sim2gp import diagnose
 from sim2gp.diagnose.residuals import misfit_of_transitions
 from sim2gp.experiments.record import provenance
-from sim2gp.loops import AcceptedTruth, Episode, History, accept_truth, psrl
+from sim2gp.loops import Episode, History, psrl
 from sim2gp.models import AbstractModel, PointEstimate, PriorMean, Sim2GP, Sim2GPBelief
+from sim2gp.oracle import AcceptedTruth, accept_truth
 from sim2gp.planning import MPC
 from sim2gp.runs import Progress, new_run
 from sim2gp.systems.base import AbstractSystem

@@ -6,7 +6,7 @@ returns and every argument that made them; a study is a list of cells.
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -17,8 +17,9 @@ import numpy as np
 from jaxtyping import Float
 
 from sim2gp.errors import NotConverged, NotFinite
+from sim2gp.experiments.stages import AnyCell, described, in_stages
 from sim2gp.flight import Purpose, key_for
-from sim2gp.loops import Episode, accept_truth, psrl
+from sim2gp.loops import Episode, psrl
 from sim2gp.models import (
     NLM,
     AbstractModel,
@@ -29,11 +30,11 @@ from sim2gp.models import (
     ResidualFunctionSpace,
     Sim2GP,
 )
+from sim2gp.oracle import accept_truth
 from sim2gp.planning import ICEM, MPC
 from sim2gp.runs import Progress
 from sim2gp.runs.cells import Cells
 from sim2gp.runs.plain import source
-from sim2gp.runs.workers import spread
 from sim2gp.systems import Candidate
 from sim2gp.systems.base import AbstractMechanism
 from sim2gp.systems.effects import AbstractEffect, RailFriction, Spring
@@ -97,6 +98,11 @@ METHODS: dict[str, Callable[[AbstractMechanism, Effect, Options], AbstractModel]
 }
 
 
+def planner_of(quick: bool) -> MPC:
+    """The planner of a whole study, or of a quick look."""
+    return QUICK_PLANNER if quick else PLANNER
+
+
 def reach_of(task: Task, system: AbstractMechanism) -> dict[str, float]:
     """The box of states that models are trusted in, by channel."""
     bound = np.asarray(task.trusted, float).tolist()
@@ -125,7 +131,7 @@ class Cell:
     @property
     def planner(self) -> MPC:
         """Whoever learns, it is the same one."""
-        return QUICK_PLANNER if self.quick else PLANNER
+        return planner_of(self.quick)
 
     @property
     def name(self) -> str:
@@ -140,19 +146,11 @@ class Cell:
     @property
     def arguments(self) -> dict[str, Any]:
         """All that its returns depend on, but for how many of them there are."""
-        told = asdict(self) | {"planner": _described(self.planner)}
+        told = asdict(self) | {"planner": described(self.planner)}
         del told["episodes"]
         if not told.pop("quick"):
             return told
         return told | {"training": QUICK_TRAINING}
-
-
-def _described(value: Any) -> Any:
-    """Its type and every argument, defaults as well: those may change."""
-    if not is_dataclass(value):
-        return value
-    arguments = {f.name: _described(getattr(value, f.name)) for f in fields(value)}
-    return {"type": type(value).__name__} | arguments
 
 
 def missing(machine: str, condition: str) -> Effect:
@@ -174,14 +172,14 @@ def effects_of(machine: str, condition: str) -> tuple[Effect, ...]:
     return (lacking,)
 
 
-def oracle_cell(cell: Cell) -> dict[str, Any]:
+def oracle_cell(cell: AnyCell) -> dict[str, Any]:
     """Find the seed's truth, the first that its oracle swings up, and its returns."""
     make, preset = MACHINES[cell.machine]
     effects = effects_of(cell.machine, cell.condition)
     found = accept_truth(
         lambda record: preset(record, effects),
         make(),
-        cell.planner,
+        planner_of(cell.quick),
         key=jax.random.key(cell.seed),
     )
     return {
@@ -192,8 +190,10 @@ def oracle_cell(cell: Cell) -> dict[str, Any]:
     }
 
 
-def learner_cell(cell: Cell, redrawn: int) -> dict[str, Any]:
-    """Fly one learner; an episode after a fit that failed was not flown."""
+def meeting(
+    cell: AnyCell, method: str, redrawn: int
+) -> tuple[Task, AbstractModel, int]:
+    """A seed's hidden machine, a learner, and the past actions in its state."""
     make, preset = MACHINES[cell.machine]
     system, key = make(), jax.random.key(cell.seed)
     record = draw_truth(system, key_for(key, redrawn, Purpose.TRUTH))
@@ -201,9 +201,14 @@ def learner_cell(cell: Cell, redrawn: int) -> dict[str, Any]:
     lacking = missing(cell.machine, cell.condition)
     options: dict[str, Any] = {"reach": reach_of(task, system)}
     options |= QUICK_TRAINING if cell.quick else {}
-    model = METHODS[cell.method](system, lacking, options)
-    # The past actions that a model of delayed inputs has in its state.
-    simulator = getattr(model, "system", system)
+    model = METHODS[method](system, lacking, options)
+    # Only a model of delayed inputs has any.
+    return task, model, getattr(model, "system", system).history
+
+
+def learner_cell(cell: Cell, redrawn: int) -> dict[str, Any]:
+    """Fly one learner; an episode after a fit that failed was not flown."""
+    task, model, history = meeting(cell, cell.method, redrawn)
     returns: list[float] = []
     started, failure = time.perf_counter(), None
 
@@ -216,8 +221,8 @@ def learner_cell(cell: Cell, redrawn: int) -> dict[str, Any]:
             model,
             cell.planner,
             episodes=cell.episodes,
-            key=key,
-            history=simulator.history,
+            key=jax.random.key(cell.seed),
+            history=history,
             update_every=cell.update_every,
             final_fit=False,
             on_episode=note,
@@ -261,7 +266,17 @@ def study(
         for group, cell in groups.items()
     }
     every = list(chain.from_iterable(cells.values()))
-    flown = fly_cells(every, out, workers=workers, progress=progress)
+    whole = workers <= len({cell.machine for cell in every})
+
+    def alike(cell: Cell) -> Any:
+        # An oracle plans in the effect itself, at any strength.
+        kind = cell.condition.split()[0] if cell.method == "oracle" else ""
+        learner = cell.method, cell.update_every, kind
+        return cell.machine if whole else (cell.machine, *learner)
+
+    stages = (list(dict.fromkeys(map(reference, every))), every)
+    work = partial(fly_cell, out=out)
+    flown = in_stages(stages, work, alike, workers=workers, progress=progress)
     table = {
         group: scores(
             [flown[cell] for cell in row],
@@ -271,34 +286,6 @@ def study(
         for group, row in cells.items()
     }
     return table, told(flown)
-
-
-def fly_cells(
-    cells: Sequence[Cell], out: Path, *, workers: int, progress: Progress
-) -> dict[Cell, dict[str, Any]]:
-    """All of them and their oracles, on ``workers`` processes; finished ones are read.
-
-    What one process takes shares its compilations: all cells of a machine, or all of a
-    learner on a machine where there are more processes than machines.
-    """
-    values: dict[Cell, dict[str, Any]] = {}
-    stages = (list(dict.fromkeys(map(reference, cells))), list(cells))
-    whole = workers <= len({cell.machine for cell in cells})
-    with progress.task("cells", sum(map(len, stages))) as task:
-        for stage in stages:
-            groups: dict[Any, list[Cell]] = {}
-            for cell in stage:
-                # An oracle plans in the effect itself, at any strength.
-                kind = cell.condition.split()[0] if cell.method == "oracle" else ""
-                learner = cell.method, cell.update_every, kind
-                alike = cell.machine if whole else (cell.machine, *learner)
-                groups.setdefault(alike, []).append(cell)
-            work = partial(fly_cell, out=out)
-            for cell, value in spread(work, list(groups.values()), workers):
-                values[cell] = value
-                told = f"{cell.machine}, {cell.condition}: {cell.method}"
-                task.advance(f"{told}, seed {cell.seed}")
-    return values
 
 
 def reference(cell: Cell) -> Cell:

@@ -103,7 +103,7 @@ class Multisine(AbstractSignal):
         frequency = self.highest * jnp.arange(1, self.tones + 1, dtype=C.dtype)
         angle = 2.0 * jnp.pi * t[:, None] * frequency[None] / self.tones
         raw = jnp.concatenate([jnp.cos(angle), jnp.sin(angle)], axis=1) @ C
-        return raw / jnp.maximum(1.0, jnp.max(jnp.abs(raw), axis=0))
+        return raw / jnp.maximum(1.0, jnp.max(jnp.abs(raw), axis=0, keepdims=True))
 
 
 @eqx.filter_jit

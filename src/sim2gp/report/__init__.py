@@ -8,6 +8,7 @@ from sim2gp.report.animation import animation_gif, animation_png
 from sim2gp.report.document import write_report
 from sim2gp.report.figure1 import arm_drawing, figure1, figure_bytes
 from sim2gp.report.figure2 import figure2
+from sim2gp.report.figure3 import figure3
 from sim2gp.report.redraw import load_run, redraw
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "arm_drawing",
     "figure1",
     "figure2",
+    "figure3",
     "figure_bytes",
     "load_run",
     "redraw",

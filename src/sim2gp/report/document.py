@@ -131,6 +131,7 @@ def _figure(summary: Summary, arrays: Arrays) -> Raw:
     """The paper's figure that this run reproduces."""
     from sim2gp.report.figure1 import figure1, figure_bytes
     from sim2gp.report.figure2 import figure2
+    from sim2gp.report.figure3 import LABELS, figure3
 
     if summary.get("figure1") and "figure1/prior/mean" in arrays:
         name, drawn = "Figure 1", figure1(arrays, summary)
@@ -145,6 +146,15 @@ def _figure(summary: Summary, arrays: Arrays) -> Raw:
         more = (
             "Lines are medians over seeds, shades quartiles; 1 is the oracle's score, "
             "0 that of a pole left hanging, the dotted line 0.95."
+        )
+    elif summary.get("figure3"):
+        shown = summary["figure3"]["shown"]
+        name = "Figure 5" if shown == "nll" else "Figure 3"
+        drawn = figure3(arrays, summary, shown)
+        words = f"{LABELS[shown]} against episode, for every explorer"
+        more = (
+            "On the swing-up of a planner that knows the truth, which no learner is "
+            "shown. Lines are medians over seeds, shades quartiles."
         )
     else:
         return Raw("")
