@@ -52,6 +52,13 @@ class ICEM(AbstractUpdate):
     ) -> tuple[Float[Array, "H m"], Plan]:
         rounds = self.iterations or world.planning_iterations
         colour = world.noise_colour if self.noise_colour is None else self.noise_colour
+        plan = self.search(plan, evaluate, rounds=rounds, colour=colour, key=key)
+        return plan.elites[0], plan
+
+    def search(
+        self, plan: Plan, evaluate: Evaluate, *, rounds: int, colour: float, key: Key
+    ) -> Plan:
+        """So many rounds on anything that has returns; the best one known leads."""
         keys = jax.random.split(key, rounds)
         last = jnp.arange(rounds) == rounds - 1
         sd = jnp.full_like(plan.mean, self.sd)
@@ -67,7 +74,8 @@ class ICEM(AbstractUpdate):
             for i in range(rounds):
                 samples = max(2 * self.elites, int(self.samples / self.decay**i))
                 carry, _ = body(carry, (keys[i], last[i]), samples)
-        return carry[0].elites[0], carry[0]
+        found: Plan = carry[0]
+        return found
 
     def _iterate(
         self,

@@ -1,0 +1,24 @@
+"""The next experiment: commands within limits, chosen by what they should tell."""
+
+from sim2gp.design.experiment import Experiment, after, information, trajectory
+from sim2gp.design.goals import AbstractGoal, Everything, Named, Prediction
+from sim2gp.design.limits import Limits
+from sim2gp.design.search import Designed, design
+from sim2gp.design.signals import AbstractSignal, Free, Multisine
+
+__all__ = [
+    "AbstractGoal",
+    "AbstractSignal",
+    "Designed",
+    "Everything",
+    "Experiment",
+    "Free",
+    "Limits",
+    "Multisine",
+    "Named",
+    "Prediction",
+    "after",
+    "design",
+    "information",
+    "trajectory",
+]

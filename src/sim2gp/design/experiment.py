@@ -1,0 +1,134 @@
+"""What an experiment that was not made yet would tell: the likelihood of logs, ahead.
+
+The commands are held over each period, the outputs are sampled at its ends, and what is
+learned is exactly what `models.windows` would learn from that log: windows that do not
+overlap, each with an unknown start, noise of the sensors on every sample. Only the
+derivatives of that likelihood are needed, and they do not depend on what comes out.
+"""
+
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sim2gp.gaussian import Gaussian
+from sim2gp.least_squares import over
+from sim2gp.linalg import triangular
+from sim2gp.models.cutting import MAX_SUBSTEP, TOLERANCE
+from sim2gp.models.linearized import value_and_jacobian
+from sim2gp.models.windows import DELAY_BLUR, Windows, simulate
+from sim2gp.systems.base import AbstractSystem
+
+#: Commands over each period, in the units of the inputs.
+Commands = Float[Array, "T m"]
+
+
+class Experiment(eqx.Module):
+    """Everything about an experiment but its commands.
+
+    belief: over virtual parameters, before it.
+    noise: sd of each measured output; ``outputs`` are their indices among the states.
+    start: the state that the machine is in when it begins.
+    start_sd: how uncertain the start of every window is, before its samples.
+    period: of commands and samples, s; ``window`` periods make a window.
+    """
+
+    system: AbstractSystem
+    belief: Gaussian
+    noise: Float[Array, " c"]
+    start: Float[Array, " n"]
+    start_sd: Float[Array, " n"]
+    outputs: tuple[int, ...] = eqx.field(static=True)
+    period: float = eqx.field(static=True)
+    steps: int = eqx.field(static=True)
+    window: int = eqx.field(static=True)
+
+    @property
+    def substeps(self) -> int:
+        """Of the integration, in a period."""
+        return max(1, math.ceil(self.period / MAX_SUBSTEP - TOLERANCE))
+
+    def record(self, z: Float[Array, " p"]) -> Any:
+        """Constants, at so many sd of the belief."""
+        tt = self.belief.mean + self.belief.scale @ z
+        return self.system.record(self.system.parameters.values(tt))
+
+
+def trajectory(
+    experiment: Experiment, z: Float[Array, " p"], U: Commands
+) -> Float[Array, "times n"]:
+    """States at the beginning and after each period, for one machine of the belief."""
+    whole = _piece(experiment, U, 0, experiment.steps)
+    params = experiment.record(z)
+    states = simulate(experiment.system, params, whole, experiment.start)
+    return states[:: experiment.substeps]
+
+
+def information(
+    experiment: Experiment, z: Float[Array, " p"], U: Commands
+) -> Float[Array, "p p"]:
+    """Factor of the Fisher information about the belief's ``z``, at one machine.
+
+    In units of the belief: ``I + A^T A`` is the precision after the experiment. Start
+    states are eliminated window by window, by QR.
+    """
+    states = trajectory(experiment, z, U)
+    p, n = z.size, states.shape[1]
+    count = experiment.window
+    first = jnp.arange(0, experiment.steps - count + 2, count)
+    outputs = np.asarray(experiment.outputs)
+
+    def one(i: Array) -> Array:
+        window, x0 = _piece(experiment, U, i, count - 1), states[i]
+
+        def seen(x: Array) -> Array:
+            params = experiment.record(z + x[n:])
+            start = x0 + experiment.start_sd * x[:n]
+            found = simulate(experiment.system, params, window, start)
+            return (
+                found[:: experiment.substeps, outputs] / experiment.noise[None]
+            ).ravel()
+
+        _, J = value_and_jacobian(seen, jnp.zeros(n + p, z.dtype))
+        prior = jnp.eye(n, n + p, dtype=z.dtype)
+        return triangular(jnp.concatenate([J, prior]))[n:, n:]
+
+    return triangular(jax.vmap(one)(first).reshape(-1, p))
+
+
+def after(belief: Gaussian, A: Float[Array, "p p"]) -> Float[Array, "p p"]:
+    """Square root of the covariance once the experiment was made."""
+    eye = jnp.eye(A.shape[1], dtype=A.dtype)
+    return over(belief.scale, triangular(jnp.concatenate([A, eye])))
+
+
+def _piece(experiment: Experiment, U: Commands, first: Any, periods: int) -> Windows:
+    """Some periods as one window: the inputs that reach it, and no data."""
+    period, count = experiment.period, experiment.substeps
+    reach = experiment.system.longest_delay + DELAY_BLUR
+    before, later = math.ceil(reach / period) + 1, math.ceil(DELAY_BLUR / period) + 1
+    held = jnp.concatenate(
+        [jnp.zeros((before, U.shape[1]), U.dtype), U, jnp.repeat(U[-1:], later, axis=0)]
+    )
+    area = jnp.concatenate([jnp.zeros_like(U[:1]), jnp.cumsum(held * period, axis=0)])
+    rows = before + periods + later + 1
+    area = jax.lax.dynamic_slice_in_dim(area, first, rows)
+    knots = period * (jnp.arange(rows, dtype=U.dtype) - before)
+    span = jnp.full(periods * count + 1, period / count, U.dtype).at[0].set(0.0)
+    c = len(experiment.outputs)
+    nothing = jnp.zeros((len(span), c), U.dtype)
+    return Windows(
+        nothing,
+        nothing > 0.0,
+        span,
+        knots,
+        area - area[:1],
+        experiment.start,
+        experiment.start_sd,
+        experiment.noise,
+        experiment.outputs,
+    )

@@ -1,0 +1,57 @@
+"""What an experiment is for: all constants, some of them, or a prediction.
+
+Each goal counts nats: half the log of how much a variance (a volume, a mean square)
+shrinks. Goals can therefore be compared, and an experiment that tells nothing of what
+is asked is worth 0.
+"""
+
+from abc import abstractmethod
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sim2gp.gaussian import log_det_factor
+from sim2gp.linalg import triangular
+from sim2gp.types import Scalar
+
+#: Square root of a covariance of the virtual parameters.
+Scale = Float[Array, "p p"]
+
+
+class AbstractGoal(eqx.Module):
+    """What is to become more certain."""
+
+    @abstractmethod
+    def uncertainty(self, scale: Scale) -> Scalar:
+        """In nats, up to a constant."""
+
+    def nats(self, before: Scale, after: Scale) -> Scalar:
+        """What going from one belief to the other is worth."""
+        return self.uncertainty(before) - self.uncertainty(after)
+
+
+class Everything(AbstractGoal):
+    """All constants alike: the volume of the whole belief (D-optimality)."""
+
+    def uncertainty(self, scale: Scale) -> Scalar:
+        return log_det_factor(triangular(scale.T))
+
+
+class Named(AbstractGoal):
+    """Some constants, whatever becomes of the others: their marginal's volume."""
+
+    index: tuple[int, ...] = eqx.field(static=True)
+
+    def uncertainty(self, scale: Scale) -> Scalar:
+        rows = scale[jnp.asarray(self.index)]
+        return log_det_factor(triangular(rows.T)[: len(self.index)])
+
+
+class Prediction(AbstractGoal):
+    """What a prediction depends on: its mean variance, each row in its own unit."""
+
+    rows: Float[Array, "k p"]
+
+    def uncertainty(self, scale: Scale) -> Scalar:
+        return 0.5 * jnp.log(jnp.mean(jnp.sum((self.rows @ scale) ** 2, axis=1)))

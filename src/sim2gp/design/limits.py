@@ -1,0 +1,135 @@
+"""What a machine may be asked to do: limits of inputs, their rates, and its states.
+
+Commands keep their limits exactly, by construction; states keep them as far as the
+belief can tell.
+"""
+
+import math
+from collections.abc import Mapping
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sim2gp.errors import InputError, nearest
+from sim2gp.systems.base import AbstractSystem
+
+Pairs = Mapping[str, tuple[float, float]]
+
+
+class Limits(eqx.Module):
+    """Boxes of the inputs and the states, and the largest change of a command per s."""
+
+    low: Float[np.ndarray, " m"]
+    high: Float[np.ndarray, " m"]
+    rate: Float[np.ndarray, " m"]
+    state_low: Float[np.ndarray, " n"]
+    state_high: Float[np.ndarray, " n"]
+
+    @classmethod
+    def of(
+        cls,
+        system: AbstractSystem,
+        stated: Pairs,
+        rates: Mapping[str, float],
+        *,
+        start: np.ndarray,
+    ) -> "Limits":
+        """The channels' own limits, narrowed by what is stated by name.
+
+        Raises `InputError` E103 for an unknown name, E150 where nothing may move: an
+        input that is not limited or cannot be zero, a rate that is not positive, a
+        start that is outside.
+        """
+        states, inputs = system.physical_states, system.actions
+        names = [channel.name for channel in (*states, *inputs)]
+        for name in (*stated, *rates):
+            known = names if name in stated else [c.name for c in inputs]
+            if name not in known:
+                raise _unknown(name, known)
+        box = {c.name: (c.low, c.high) for c in (*states, *inputs)}
+        for name, (low, high) in stated.items():
+            box[name] = max(low, box[name][0]), min(high, box[name][1])
+        for channel in inputs:
+            low, high = box[channel.name]
+            if not (math.isfinite(low) and math.isfinite(high)):
+                raise _no_motion(channel.name, low, high, "finite limits", "state them")
+            if not low < high or low > 0.0 or high < 0.0:
+                raise _no_motion(
+                    channel.name, low, high, "a range with 0 in it", "widen it"
+                )
+            if not rates.get(channel.name, math.inf) > 0.0:
+                got = f"{rates[channel.name]:g} {channel.unit}/s"
+                raise InputError(
+                    "E150",
+                    f"rate of {channel.name} admits no motion",
+                    got=got,
+                    expected="more than 0",
+                    fix="raise it",
+                )
+        for channel, x in zip(states, start.tolist(), strict=True):
+            low, high = box[channel.name]
+            if not low < x < high:
+                expected = f"a range with the start, {x:g} {channel.unit}, inside"
+                raise _no_motion(channel.name, low, high, expected, "widen it")
+        pairs = np.asarray([box[name] for name in names])
+        n = len(states)
+        rate = np.asarray([rates.get(c.name, math.inf) for c in inputs])
+        return cls(pairs[n:, 0], pairs[n:, 1], rate, pairs[:n, 0], pairs[:n, 1])
+
+    def stated(self) -> bool:
+        """Whether any state is limited at all."""
+        return bool(
+            np.isfinite(self.state_low).any() | np.isfinite(self.state_high).any()
+        )
+
+
+def excess(limits: Limits, states: Float[Array, "T n"]) -> Float[Array, ""]:
+    """How far a trajectory leaves the box, at worst, as a share of the box's half."""
+    half = 0.5 * (limits.state_high - limits.state_low)
+    half = jnp.where(jnp.isfinite(half), half, 1.0)
+    over = jnp.maximum(
+        states - limits.state_high[None], limits.state_low[None] - states
+    )
+    return jnp.maximum(jnp.max(over / half[None]), 0.0)
+
+
+def kept(limits: Limits, U: Float[Array, "T m"], period: float) -> Float[Array, "T m"]:
+    """The nearest commands that a machine at rest may be given, one after the other."""
+    step = limits.rate * period
+
+    def follow(last: Array, u: Array) -> tuple[Array, Array]:
+        u = jnp.clip(
+            u,
+            jnp.maximum(limits.low, last - step),
+            jnp.minimum(limits.high, last + step),
+        )
+        return u, u
+
+    return jax.lax.scan(follow, jnp.zeros_like(U[0]), U)[1]
+
+
+def _unknown(name: str, known: list[str]) -> InputError:
+    close = nearest(name, known)
+    return InputError(
+        "E103",
+        "unknown channel",
+        where="limits",
+        got=name,
+        expected=f"one of {', '.join(known)}",
+        fix=f"did you mean {close}?" if close else "",
+    )
+
+
+def _no_motion(
+    name: str, low: float, high: float, expected: str, fix: str
+) -> InputError:
+    return InputError(
+        "E150",
+        f"limits of {name} admit no motion",
+        got=f"[{low:g}, {high:g}]",
+        expected=expected,
+        fix=fix,
+    )
