@@ -107,10 +107,3 @@ class Restrained(AbstractObjective):
     def _cost(self, s2: State) -> Scalar:
         beyond = jnp.abs(s2[: self.bound.size]) / self.bound - 1.0
         return self.weight * jnp.sum(jnp.maximum(beyond, 0.0))
-
-
-def single(tree: Any) -> Any:
-    """The same with its numbers in float32."""
-    return jax.tree.map(
-        lambda x: jnp.asarray(x, jnp.float32) if eqx.is_inexact_array(x) else x, tree
-    )

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from sim2gp.exploration import InformationGain, Optimistic, Restrained, single
+from sim2gp.exploration import InformationGain, Optimistic, Restrained
 from sim2gp.flight import (
     Purpose,
     Trajectory,
@@ -28,7 +28,7 @@ from sim2gp.models.base import AbstractBelief, AbstractModel
 from sim2gp.planning import AbstractObjective, AbstractPlanner, MarkovObjective, World
 from sim2gp.tasks import Task
 from sim2gp.transitions import Transitions
-from sim2gp.types import Dynamics, Key, in_float64
+from sim2gp.types import Dynamics, Key, in_float64, single
 
 #: Nats a step, of leaving the trusted box by as much again.
 LIMIT_COST = 100.0

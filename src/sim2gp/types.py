@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
@@ -32,6 +33,7 @@ Reward = Callable[[Array, Array, Array], Array]
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
+_T = TypeVar("_T")
 
 
 class Box(eqx.Module):
@@ -53,3 +55,10 @@ def in_float64(function: Callable[_P, _R]) -> Callable[_P, _R]:
             return function(*args, **kwargs)
 
     return scoped
+
+
+def single(tree: _T) -> _T:
+    """The same with its numbers in float32, for planning."""
+    return jax.tree.map(
+        lambda x: jnp.asarray(x, jnp.float32) if eqx.is_inexact_array(x) else x, tree
+    )

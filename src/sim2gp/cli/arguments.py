@@ -1,7 +1,8 @@
 """Arguments are checked before they are parsed: each fault is one clear line."""
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 from sim2gp.errors import InputError, nearest
@@ -48,6 +49,42 @@ def usage_error(
     """A fault in the arguments."""
     where = "the command line"
     return InputError(code, what, where=where, got=got, expected=expected, fix=fix)
+
+
+def numbers(option: str, words: Iterable[str]) -> dict[str, float]:
+    """``NAME=NUMBER`` words by name (E160 for another form, or a name twice)."""
+    return {name: _number(option, word, v) for name, v, word in _named(option, words)}
+
+
+def pairs(option: str, words: Iterable[str]) -> dict[str, tuple[float, float]]:
+    """``NAME=LOW:HIGH`` words by name (E141 where low is not below high, E160)."""
+    found = {}
+    for name, value, word in _named(option, words):
+        ends = [_number(option, word, end) for end in value.split(":")]
+        if len(ends) != 2:
+            raise usage_error(option, word, f"{name}=LOW:HIGH", "write both ends")
+        if not ends[0] < ends[1]:
+            raise usage_error(option, word, "LOW below HIGH", "swap the two", "E141")
+        found[name] = ends[0], ends[1]
+    return found
+
+
+def _named(option: str, words: Iterable[str]) -> Iterator[tuple[str, str, str]]:
+    seen: set[str] = set()
+    for word in words:
+        name, _, value = word.partition("=")
+        if not (name and value):
+            raise usage_error(option, word, "NAME=VALUE", "write name and value")
+        if name in seen:
+            raise usage_error(option, word, "each name once", "remove one of the two")
+        seen.add(name)
+        yield name, value, word
+
+
+def _number(option: str, word: str, text: str) -> float:
+    if not (_is_number(text) and math.isfinite(float(text))):
+        raise usage_error(option, word, "finite numbers", "correct the number")
+    return float(text)
 
 
 def _fields(command: type) -> dict[str, tuple[Any, str]]:

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from sim2gp.cli.arguments import usage_error
+from sim2gp.cli.arguments import numbers, pairs, usage_error
 from sim2gp.runs import Progress, load_run
 from sim2gp.runs.store import check_target
 from sim2gp.runs.workers import cores
@@ -170,6 +170,55 @@ class Compare(Writes):
 
 
 @dataclass(kw_only=True)
+class Design(Writes):
+    """The next experiment on a machine, and what it should tell."""
+
+    run_or_project: Annotated[Positional[Path], arg(metavar="RUN|PROJECT")]
+    """An identify run; a project file where there is no log yet."""
+    seconds: float = 10.0
+    """Duration in s."""
+    kind: Literal["multisine", "free"] = "multisine"
+    """Family of the commands."""
+    about: Annotated[tuple[str, ...], arg(metavar="NAME...")] = ()
+    """Constants to learn; default all."""
+    predict: Annotated[float | None, arg(metavar="S")] = None
+    """Learn what predictions so far ahead depend on."""
+    within: Annotated[float, arg(metavar="PERCENT")] = 2.0
+    """Known within so much is known well enough."""
+    limit: Annotated[tuple[str, ...], arg(metavar="NAME=LOW:HIGH...")] = ()
+    """Limits of inputs and states, beside the project's."""
+    rate: Annotated[tuple[str, ...], arg(metavar="NAME=RATE...")] = ()
+    """Largest change of an input per s, beside the project's."""
+    start: Annotated[tuple[str, ...], arg(metavar="NAME=VALUE...")] = ()
+    """Where the machine rests before; default zero."""
+    period: float | None = None
+    """Of commands and samples in s; default the logs'."""
+    seed: int = 0
+    """Draws machines and candidates."""
+
+    def run(self, progress: Progress) -> dict[str, Any]:
+        out = _out(self.out, f"design-{self.run_or_project.stem}")
+        if self.run_or_project.suffix == ".toml":
+            _check_project(self.run_or_project)
+        else:
+            load_run(self.run_or_project)  # a folder that is no run fails early
+        asked = import_module("sim2gp.experiments.design").Asked(
+            seconds=self.seconds,
+            kind=self.kind,
+            about=self.about,
+            predict=self.predict,
+            within=self.within,
+            limits=pairs("--limit", self.limit),
+            rates=numbers("--rate", self.rate),
+            start=numbers("--start", self.start),
+            period=self.period,
+        )
+        return _experiment("design")(
+            self.run_or_project, asked, out=out, seed=self.seed, progress=progress
+        )
+
+
+@dataclass(kw_only=True)
 class Report(Common):
     """Draw the report of a run anew."""
 
@@ -236,6 +285,7 @@ COMMANDS: dict[str, type[Common]] = {
     "evaluate": Evaluate,
     "explain": Explain,
     "compare": Compare,
+    "design": Design,
     "report": Report,
     "selftest": Selftest,
     "reproduce": Reproduce,

@@ -3,7 +3,7 @@
 from sim2gp.design.experiment import Experiment, after, information, trajectory
 from sim2gp.design.goals import AbstractGoal, Everything, Named, Prediction
 from sim2gp.design.limits import Limits
-from sim2gp.design.search import Designed, design
+from sim2gp.design.search import Designed, design, prediction_rows
 from sim2gp.design.signals import AbstractSignal, Free, Multisine
 
 __all__ = [
@@ -20,5 +20,6 @@ __all__ = [
     "after",
     "design",
     "information",
+    "prediction_rows",
     "trajectory",
 ]

@@ -69,14 +69,16 @@ def trajectory(
 
 
 def information(
-    experiment: Experiment, z: Float[Array, " p"], U: Commands
+    experiment: Experiment,
+    z: Float[Array, " p"],
+    U: Commands,
+    states: Float[Array, "times n"],
 ) -> Float[Array, "p p"]:
     """Factor of the Fisher information about the belief's ``z``, at one machine.
 
-    In units of the belief: ``I + A^T A`` is the precision after the experiment. Start
-    states are eliminated window by window, by QR.
+    ``states`` are its `trajectory`. In units of the belief: ``I + A^T A`` is the
+    precision after the experiment. Starts are eliminated window by window, by QR.
     """
-    states = trajectory(experiment, z, U)
     p, n = z.size, states.shape[1]
     count = experiment.window
     first = jnp.arange(0, experiment.steps - count + 2, count)
@@ -98,6 +100,32 @@ def information(
         return triangular(jnp.concatenate([J, prior]))[n:, n:]
 
     return triangular(jax.vmap(one)(first).reshape(-1, p))
+
+
+def sensitivity_at(
+    experiment: Experiment, U: Commands, periods: int
+) -> Float[Array, "k p"]:
+    """How predictions of so many periods move with the virtual parameters.
+
+    From states along the way, which are known: a row for each output of each
+    prediction, in noise sd.
+    """
+    system, tt = experiment.system, experiment.belief.mean
+    states = trajectory(experiment, jnp.zeros_like(tt), U)
+    first = jnp.arange(0, experiment.steps - periods + 1, periods)
+    outputs = np.asarray(experiment.outputs)
+
+    def one(i: Array) -> Array:
+        window = _piece(experiment, U, i, periods)
+
+        def ahead(tt: Array) -> Array:
+            params = system.record(system.parameters.values(tt))
+            found = simulate(system, params, window, states[i])
+            return found[-1, outputs] / experiment.noise
+
+        return value_and_jacobian(ahead, tt)[1]
+
+    return jax.vmap(one)(first).reshape(-1, tt.size)
 
 
 def after(belief: Gaussian, A: Float[Array, "p p"]) -> Float[Array, "p p"]:

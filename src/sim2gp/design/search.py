@@ -11,22 +11,29 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sim2gp.design.experiment import Experiment, after, information, trajectory
+from sim2gp.design.experiment import (
+    Experiment,
+    after,
+    information,
+    sensitivity_at,
+    trajectory,
+)
 from sim2gp.design.goals import AbstractGoal
 from sim2gp.design.limits import Limits, excess
-from sim2gp.design.signals import AbstractSignal
+from sim2gp.design.signals import AbstractSignal, Multisine
 from sim2gp.errors import InputError
 from sim2gp.planning import ICEM
-from sim2gp.types import Key, in_float64
+from sim2gp.types import Key, in_float64, single
 
-ROUNDS, SAMPLES, ELITES = 24, 48, 8
-DRAWS = 3  # of the constants, that information is averaged over
-GUARDS = 16  # more of them, that must keep the limits while searching
+ROUNDS, SAMPLES, ELITES = 20, 40, 8
+DRAWS = 2  # of the constants, that information is averaged over
+GUARDS = 8  # more of them, that must keep the limits while searching
 MARGIN = 0.03  # of a box's half, kept free while searching
 COST = 100.0  # nats for leaving the limits by a whole half of the box
 CHECKED = 1000  # draws that the result is held against
 ALLOWED = 0.01  # the share of them that may leave the limits
 SMALLER = 0.93  # times the commands, where more do
+MILD = 0.03  # of an input's range, the sd of each tone of a random motion
 
 
 class Designed(eqx.Module):
@@ -64,7 +71,8 @@ def design(
     draws = jax.random.normal(jax.random.fold_in(search, 1), (DRAWS - 1, p))
     draws = jnp.concatenate([jnp.zeros((1, p)), draws])
     guards = jax.random.normal(guard, (GUARDS, p))
-    C = _search(experiment, goal, limits, signal, draws, guards, search)
+    rough = single((experiment, goal, limits, draws, guards))
+    C = _search(signal, *rough, search).astype(float)
     checks = jax.random.normal(check, (CHECKED, p))
     for _ in range(40):
         U = signal.commands(C, limits)
@@ -82,7 +90,7 @@ def design(
             expected=f"at most {ALLOWED:.0%}",
             fix="widen the limits of the states, or know the machine better first",
         )
-    worth, scale = _worth(experiment, goal, draws, U)
+    worth, scale = _worth(experiment, goal, draws, U, _states(experiment, U, draws))
     middle = _states(experiment, U, jnp.zeros((1, p)))[0]
     low, high = np.quantile(states, [0.05, 0.95], axis=0)
     return Designed(
@@ -97,12 +105,36 @@ def design(
     )
 
 
+@in_float64
+def prediction_rows(
+    experiment: Experiment, limits: Limits, horizon: float, key: Key
+) -> Float[Array, "k p"]:
+    """What predictions ``horizon`` seconds ahead depend on, along small random motions.
+
+    Raises E151 where the experiment is shorter than the horizon.
+    """
+    periods = max(1, round(horizon / experiment.period))
+    if periods > experiment.steps:
+        raise InputError(
+            "E151",
+            "prediction longer than the experiment",
+            got=f"{horizon:g} s",
+            expected=f"at most {experiment.period * experiment.steps:g} s",
+            fix="predict less far, or design more seconds",
+        )
+    experiment, limits = jax.tree.map(jnp.asarray, (experiment, limits))
+    signal = Multisine(experiment.period, experiment.steps)
+    shape = (signal.coefficients, limits.low.size)
+    U = signal.commands(MILD * jax.random.normal(key, shape), limits)
+    return _sensitivity(experiment, U, periods)
+
+
 @eqx.filter_jit
 def _search(
+    signal: AbstractSignal,
     experiment: Experiment,
     goal: AbstractGoal,
     limits: Limits,
-    signal: AbstractSignal,
     draws: Float[Array, "D p"],
     guards: Float[Array, "G p"],
     key: Key,
@@ -112,18 +144,23 @@ def _search(
         lambda l: (l.state_low, l.state_high), limits, _narrowed(limits)
     )
 
-    def one(C: Array) -> Array:
-        U = signal.commands(C, limits)
-        worth, _ = _mean_worth(experiment, goal, draws, U)
-        beyond = jax.vmap(lambda z: excess(inner, trajectory(experiment, z, U)))(guards)
-        return worth - COST * jnp.mean(beyond)
+    def flown(U: Array) -> tuple[Array, Array]:
+        states = _states(experiment, U, jnp.concatenate([draws, guards]))
+        beyond = jax.vmap(lambda S: excess(inner, S))(states[len(draws) :])
+        return states[: len(draws)], jnp.mean(beyond)
 
     def evaluate(C: Float[Array, "N k m"]) -> tuple[Array, Array]:
-        # One after the other: a plan's own simulations fill the machine.
-        returns = jax.lax.map(one, C)
+        # Trajectories are long and narrow, so all candidates' at once; the windows of
+        # one candidate fill the machine by themselves.
+        U = jax.vmap(lambda c: signal.commands(c, limits))(C)
+        states, beyond = jax.vmap(flown)(U)
+        worth = jax.lax.map(
+            lambda x: _mean_worth(experiment, goal, draws, *x)[0], (U, states)
+        )
+        returns = worth - COST * beyond
         return returns, jnp.isfinite(returns)
 
-    plan = rule.init(signal.coefficients, limits.low.size, jnp.zeros(()).dtype)
+    plan = rule.init(signal.coefficients, limits.low.size, draws.dtype)
     plan = rule.search(plan, evaluate, rounds=ROUNDS, colour=1.0, key=key)
     return plan.elites[0]
 
@@ -135,16 +172,17 @@ def _narrowed(limits: Limits) -> tuple[Array, Array]:
 
 
 def _mean_worth(
-    experiment: Experiment, goal: AbstractGoal, draws: Array, U: Array
+    experiment: Experiment, goal: AbstractGoal, draws: Array, U: Array, states: Array
 ) -> tuple[Array, Array]:
     """Nats of the goal over the draws, and the scale after, at the first of them."""
-    A = jax.vmap(lambda z: information(experiment, z, U))(draws)
+    A = jax.vmap(lambda z, S: information(experiment, z, U, S))(draws, states)
     scales = jax.vmap(lambda a: after(experiment.belief, a))(A)
     nats = jax.vmap(lambda s: goal.nats(experiment.belief.scale, s))(scales)
     return jnp.mean(nats), scales[0]
 
 
 _worth = eqx.filter_jit(_mean_worth)
+_sensitivity = eqx.filter_jit(sensitivity_at)
 
 
 @eqx.filter_jit

@@ -51,7 +51,7 @@ class Multisine(AbstractSignal):
         fade = np.minimum(1.0, np.minimum(t, t[-1] - t) / FADE)
         basis = fade[:, None] * np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
         half = jnp.minimum(-limits.low, limits.high)
-        U = (jnp.asarray(basis) @ C) * half[None]
+        U = (jnp.asarray(basis, C.dtype) @ C) * half[None]
         steepest = jnp.max(jnp.abs(jnp.diff(U, axis=0)), axis=0) / self.period
         share = jnp.maximum(jnp.max(jnp.abs(U), axis=0) / half, steepest / limits.rate)
         # The last digits: a product may round up.
@@ -70,7 +70,7 @@ class Free(AbstractSignal):
     def commands(self, C: Float[Array, "k m"], limits: Limits) -> Float[Array, "T m"]:
         at = np.linspace(0.0, len(C) - 1.0, self.steps)
         left = np.minimum(at.astype(int), len(C) - 2)
-        share = (at - left)[:, None]
+        share = jnp.asarray((at - left)[:, None], C.dtype)
         line = (1.0 - share) * C[left] + share * C[left + 1]
         middle, half = (
             0.5 * (limits.high + limits.low),

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim2gp.errors import InputError
-from sim2gp.experiments.identify import PROJECT
+from sim2gp.experiments.identify import PROJECT, restored
 from sim2gp.experiments.prediction import (
     Judged,
     channels,
@@ -39,11 +39,11 @@ from sim2gp.experiments.prediction import (
 from sim2gp.experiments.record import provenance
 from sim2gp.gaussian import Gaussian
 from sim2gp.logs import Log
-from sim2gp.models.forecast import Band, fit_band, forecast
+from sim2gp.models.forecast import fit_band, forecast
 from sim2gp.models.grid import CURVE, Grid, evaluation_windows, steps_of
 from sim2gp.models.windows import Windows, fit_windows
 from sim2gp.project import Project, load_project
-from sim2gp.runs import Progress, load_run, new_run
+from sim2gp.runs import Progress, new_run
 from sim2gp.types import in_float64
 
 
@@ -53,42 +53,23 @@ def run(
     """Predict ``logs`` by an identify run; writes and returns the summary."""
     started = time.perf_counter()
     check_horizon(horizon)
-    stored = load_run(run)
-    if "belief/mean" not in stored.arrays or not (run / PROJECT).exists():
-        raise InputError(
-            "E130",
-            "not an identification",
-            where=str(run),
-            got=str(stored.summary.get("command", "a run without a belief")),
-            expected="the folder of sim2gp identify",
-            fix="run sim2gp identify first",
-        )
-    found = load_project(run / PROJECT)
-    system, x = found.system, stored.arrays
-    posterior = _gaussian(x["belief/mean"], x["belief/scale"])
-    band = Band(
-        x["band/start_sd"],
-        x["band/input_sd"],
-        x["band/resolution"],
-        x["band/rows"],
-        x["band/shape"],
-        float(x["band/inflation"]),
-    )
+    fit = restored(run)
+    found, system = fit.project, fit.project.system
     tested = found.read_logs(logs)
     with new_run(out, "evaluate") as writer, progress.task("evaluate", 2) as task:
         rows, longest = rows_for(horizon), max(horizon, CURVE[-1])
         grid = windows_for(tested, found, longest, horizon)
-        result = forecast(system, posterior, grid.windows, rows)
-        train = _training(found, stored.summary, run)
+        result = forecast(system, fit.posterior, grid.windows, rows)
+        train = _training(found, fit.summary, run)
         linear = None
         if train is not None:
             known = evaluation_windows(train, system, longest=longest)
             linear = regression_errors(known, grid, horizon)
         task.advance("forecasts")
         names = channels(system, grid.windows)
-        whole = judged(rows, grid, result, band, linear)
+        whole = judged(rows, grid, result, fit.band, linear)
         summary, arrays = scores(whole, names, tested, horizon)
-        picture = drawn(system, posterior, band, grid)
+        picture = drawn(system, fit.posterior, fit.band, grid)
         arrays |= trace_arrays(picture, grid, tested, names)
         notes = [str(note) for log in tested for note in log.notes]
         if train is None:

@@ -8,13 +8,15 @@ import os
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from sim2gp import diagnose
 from sim2gp.diagnose.residuals import misfit_of_windows
+from sim2gp.errors import InputError
 from sim2gp.experiments.prediction import (
     channels,
     cut_logs,
@@ -26,6 +28,7 @@ from sim2gp.experiments.prediction import (
     units,
 )
 from sim2gp.experiments.record import provenance
+from sim2gp.gaussian import Gaussian
 from sim2gp.logs import Log
 from sim2gp.models.forecast import Band, compile_forecast, fit_band, forecast
 from sim2gp.models.grid import CURVE, Grid, evaluation_windows
@@ -37,7 +40,8 @@ from sim2gp.models.windows import (
     information_at,
 )
 from sim2gp.project import Project, load_project
-from sim2gp.runs import Progress, new_run
+from sim2gp.runs import Progress, load_run, new_run
+from sim2gp.types import in_float64
 
 PROJECT = "project.toml"  # the file's name in a run
 
@@ -109,6 +113,50 @@ def _stored(belief: WindowsBelief, band: Band, seed: int) -> dict[str, np.ndarra
     }
 
 
+class Identified(NamedTuple):
+    """A finished identification, read back from its run."""
+
+    project: Project
+    summary: dict[str, Any]
+    posterior: Gaussian
+    outputs: list[str]  # the measured channels, in the order of `noise`
+    noise: list[float]
+    period: float  # s, median of the logs
+    band: Band
+
+
+@in_float64
+def restored(run: Path) -> Identified:
+    """What `run` wrote; E130 for a folder that is not an identification."""
+    stored = load_run(run)
+    if "belief/mean" not in stored.arrays or not (run / PROJECT).exists():
+        raise InputError(
+            "E130",
+            "not an identification",
+            where=str(run),
+            got=str(stored.summary.get("command", "a run without a belief")),
+            expected="the folder of sim2gp identify",
+            fix="run sim2gp identify first",
+        )
+    x, noise = stored.arrays, stored.summary["noise"]
+    return Identified(
+        load_project(run / PROJECT),
+        stored.summary,
+        Gaussian(jnp.asarray(x["belief/mean"]), jnp.asarray(x["belief/scale"])),
+        list(noise),
+        [float(sd) for sd in noise.values()],
+        float(stored.summary["period"]),
+        Band(
+            x["band/start_sd"],
+            x["band/input_sd"],
+            x["band/resolution"],
+            x["band/rows"],
+            x["band/shape"],
+            float(x["band/inflation"]),
+        ),
+    )
+
+
 def _summarise(
     project: Project,
     logs: Sequence[Log],
@@ -142,6 +190,7 @@ def _summarise(
         },
         "log_evidence": float(belief.log_evidence),
         "n_rows": rows,
+        "period": float(np.median(np.concatenate([np.diff(x.time) for x in logs]))),
         "n_logs": len(set(recordings(logs))),
         "n_transitions": rows - len(logs),
         "n_windows": len(windows),

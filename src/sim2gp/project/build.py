@@ -248,6 +248,9 @@ def check_names(spec: ProjectSpec, source: Source, system: AbstractSystem) -> No
         if name not in (*states, *inputs):
             raise unknown("channel", name, [*states, *inputs], where)
         _check_pair(f"limits of {name}", low, high, where)
+    for name in spec.rates:
+        if name not in inputs:
+            raise unknown("input", name, inputs, source.where("rates", name))
     for section, key, named in (
         ("likelihood", "start_sd", spec.likelihood.start_sd),
         ("likelihood", "noise_floor", spec.likelihood.noise_floor),

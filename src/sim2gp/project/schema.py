@@ -2,7 +2,7 @@
 
     system = "two_link"
     [options]  [parameters.NAME]  [effects.CHANNEL.EFFECT]  [[logs]]
-    [actuators.INPUT]  [likelihood]  [task]  [limits]  [model]  [planner]
+    [actuators.INPUT]  [likelihood]  [task]  [limits]  [rates]  [model]  [planner]
 
 Types are strict: a number in quotes is text. A fault names the line of its key.
 """
@@ -137,6 +137,7 @@ class ProjectSpec(Section):
     likelihood: LikelihoodSpec = LikelihoodSpec()
     task: TaskSpec = TaskSpec()
     limits: dict[str, Pair] = {}
+    rates: dict[str, Positive] = {}
     model: ModelSpec = ModelSpec()
     planner: PlannerSpec = PlannerSpec()
 

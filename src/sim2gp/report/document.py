@@ -7,6 +7,7 @@ from typing import Any
 
 from sim2gp.report import data, parameters
 from sim2gp.report.animation import player
+from sim2gp.report.experiment import experiment
 from sim2gp.report.markup import (
     Raw,
     asset,
@@ -192,6 +193,7 @@ def write_report(summary: Summary, arrays: Arrays) -> str:
         _figure(summary, arrays),
         _machine(summary, arrays),
         returns(summary, arrays),
+        experiment(summary, arrays),
         parameters.parameter_table(summary),
         parameters.parameter_densities(summary, arrays),
         parameters.directions(summary),
