@@ -20,7 +20,7 @@ from sim2gp.least_squares import over
 from sim2gp.linalg import triangular
 from sim2gp.models.cutting import MAX_SUBSTEP, TOLERANCE
 from sim2gp.models.linearized import value_and_jacobian
-from sim2gp.models.windows import DELAY_BLUR, Windows, simulate
+from sim2gp.models.windows import DELAY_BLUR, Stretch, simulate
 from sim2gp.systems.base import AbstractSystem
 
 #: Commands over each period, in the units of the inputs.
@@ -134,8 +134,8 @@ def after(belief: Gaussian, A: Float[Array, "p p"]) -> Float[Array, "p p"]:
     return over(belief.scale, triangular(jnp.concatenate([A, eye])))
 
 
-def _piece(experiment: Experiment, U: Commands, first: Any, periods: int) -> Windows:
-    """Some periods as one window: the inputs that reach it, and no data."""
+def _piece(experiment: Experiment, U: Commands, first: Any, periods: int) -> Stretch:
+    """Some periods, and the inputs that reach them; at rest before the experiment."""
     period, count = experiment.period, experiment.substeps
     reach = experiment.system.longest_delay + DELAY_BLUR
     before, later = math.ceil(reach / period) + 1, math.ceil(DELAY_BLUR / period) + 1
@@ -147,16 +147,4 @@ def _piece(experiment: Experiment, U: Commands, first: Any, periods: int) -> Win
     area = jax.lax.dynamic_slice_in_dim(area, first, rows)
     knots = period * (jnp.arange(rows, dtype=U.dtype) - before)
     span = jnp.full(periods * count + 1, period / count, U.dtype).at[0].set(0.0)
-    c = len(experiment.outputs)
-    nothing = jnp.zeros((len(span), c), U.dtype)
-    return Windows(
-        nothing,
-        nothing > 0.0,
-        span,
-        knots,
-        area - area[:1],
-        experiment.start,
-        experiment.start_sd,
-        experiment.noise,
-        experiment.outputs,
-    )
+    return Stretch(span, knots, area - area[:1])

@@ -145,7 +145,7 @@ def restored(run: Path) -> Identified:
         Gaussian(jnp.asarray(x["belief/mean"]), jnp.asarray(x["belief/scale"])),
         list(noise),
         [float(sd) for sd in noise.values()],
-        float(stored.summary["period"]),
+        float(f"{stored.summary['period']:.3g}"),  # clocks jitter
         Band(
             x["band/start_sd"],
             x["band/input_sd"],

@@ -66,8 +66,16 @@ class Windows(eqx.Module):
         return jax.vmap(f, in_axes=(axes, *[0] * len(per_window)))(self, *per_window)
 
 
+class Stretch(eqx.Module):
+    """What a simulation needs of a window: its steps, and the inputs that reach it."""
+
+    span: Float[AnyArray, " L"]
+    knots: Float[AnyArray, " H"]
+    area: Float[AnyArray, "H m"]
+
+
 def inputs_of(
-    window: Windows, delays: Float[Array, " m"], blur: float = 0.0
+    window: Windows | Stretch, delays: Float[Array, " m"], blur: float = 0.0
 ) -> Float[Array, "L m"]:
     """Mean delayed input over the step that ends at each row of one window.
 
@@ -110,7 +118,10 @@ def _second_integral(
 
 
 def simulate(
-    system: AbstractSystem, params: Any, window: Windows, x0: Float[Array, " n"]
+    system: AbstractSystem,
+    params: Any,
+    window: Windows | Stretch,
+    x0: Float[Array, " n"],
 ) -> Float[Array, "L n"]:
     """States at the rows of one window, from ``x0`` at its first."""
 
