@@ -337,7 +337,7 @@ def as_csv(experiment: Experiment, found: Designed) -> str:
     """
     system = experiment.system
     inputs = [channel.name for channel in system.actions]
-    states = [f"expected {channel.name}" for channel in system.physical_states]
+    states = [f"expected.{channel.name}" for channel in system.physical_states]
     text = io.StringIO()
     text.write(",".join(["time", *inputs, *states]) + "\n")
     for k in range(experiment.steps):

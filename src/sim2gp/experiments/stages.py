@@ -6,12 +6,13 @@ what some cells need of others is a stage of its own.
 
 from collections.abc import Callable, Sequence
 from dataclasses import fields, is_dataclass
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from sim2gp.runs import Progress
 from sim2gp.runs.workers import spread
 
 
+@runtime_checkable
 class AnyCell(Protocol):
     """Which machine is met, by whom, and whether in a hurry."""
 

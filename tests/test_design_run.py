@@ -1,0 +1,133 @@
+"""sim2gp design from end to end: from priors, from a fit, and bad input."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sim2gp.cli import main
+from sim2gp.design import search
+from sim2gp.experiments.design import Asked, verdict
+from sim2gp.runs import load_run
+from test_identify import folder, project_in, run
+
+assert folder  # fixtures
+assert run
+
+SHORT = ["--seconds", "1", "--period", "0.01"]
+LIMITS = ["--limit", "theta=-1:1", "theta.velocity=-15:15", "--rate", "voltage=200"]
+
+
+@pytest.fixture(autouse=True)
+def brief(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A few rounds."""
+    for name, value in (("ROUNDS", 3), ("SAMPLES", 16), ("CHECKED", 100)):
+        monkeypatch.setattr(search, name, value)
+
+
+def rows(path: Path) -> np.ndarray:
+    return np.genfromtxt(path, delimiter=",", names=True, deletechars="")
+
+
+def test_before_any_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    project, out = project_in(tmp_path), tmp_path / "next"
+    words = ["design", str(project), "--out", str(out), *SHORT, *LIMITS, "--json"]
+    assert main(words) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["worth_running"]
+    assert summary["information_nats"] > 1.0
+    assert "no log was used" in summary["warnings"][0]
+    expected = summary["expected_sd"]
+    assert set(expected) == {"arm_damping", "motor_constant", "pendulum_length"}
+    for entry in expected.values():
+        assert 0.0 < entry["expected_sd"] <= entry["sd"] * (1.0 + 1e-9)
+    assert summary["violations"] <= 0.01
+    table = rows(out / summary["trajectory"])
+    assert table.dtype.names[:3] == ("time", "voltage", "expected.theta")
+    assert len(table) == 100
+    u = table["voltage"]
+    assert np.abs(np.diff(u, prepend=0.0)).max() <= 200.0 * 0.01
+    assert np.abs(table["expected.theta"]).max() <= 1.0
+    stored = load_run(out)
+    np.testing.assert_array_equal(stored.arrays["design/command/voltage"], u)
+    page = (out / "report.html").read_text()
+    assert "The experiment" in page
+    assert "expected.theta" not in page
+
+
+def test_after_a_fit(run: Path, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "next"
+    words = ["design", str(run), "--out", str(out), "--seconds", "1", *LIMITS, "--json"]
+    assert main([*words, "--kind", "free", "--about", "arm_damping"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["period"] == 0.002  # the logs'
+    fit = load_run(run).summary["parameters"]
+    for name, entry in summary["expected_sd"].items():
+        assert entry["sd"] == pytest.approx(fit[name]["sd"], rel=1e-6)
+    assert main([*words, "--predict", "0.2", "--out", str(tmp_path / "other")]) == 0
+
+
+BAD = {
+    "--about arm_dampin": ("E145", "did you mean arm_damping"),
+    "--seconds 0.005": ("E151", "at least two periods of 0.01 s"),
+    "--limit voltage=1:2": ("E150", "limits of voltage admit no motion"),
+    "--limit theta=2:1": ("E141", "LOW below HIGH"),
+    "--limit theta": ("E160", "NAME=VALUE"),
+    "--limit theta=1": ("E160", "LOW:HIGH"),
+    "--limit theta=a:b": ("E160", "finite numbers"),
+    "--limit thata=-1:1": ("E103", "did you mean theta"),
+    "--rate theta=1": ("E103", "expected one of voltage"),
+    "--rate voltage=0": ("E150", "rate of voltage"),
+    "--start alpa=1": ("E103", "expected one of theta"),
+    "--start alpha=4 --limit alpha=-1:1": ("E150", "limits of alpha"),
+    "--predict 3": ("E151", "prediction longer than the experiment"),
+    "--period nan": ("E148", "a positive number"),
+    "--kind chirp": ("E160", "one of multisine, free"),
+}
+
+
+@pytest.mark.parametrize("line", BAD)
+def test_bad_input_is_one_line(line: str, tmp_path: Path, capsys) -> None:
+    project, out = project_in(tmp_path), tmp_path / "next"
+    words = ["design", str(project), "--out", str(out), "--seconds", "1"]
+    assert main([*words, *line.split()]) == 2
+    said = capsys.readouterr()
+    code, text = BAD[line]
+    assert said.err.startswith(code + " ")
+    assert text in said.err
+    assert said.err.count("\n") == 1
+    assert not out.exists()
+
+
+def test_a_run_that_is_none(tmp_path: Path, capsys) -> None:
+    assert main(["design", str(tmp_path / "gone")]) == 2
+    assert capsys.readouterr().err.startswith("E130")
+
+
+def entry(mean: float, sd: float, left: float) -> dict[str, float]:
+    return {"mean": mean, "sd": sd, "of_before": left}
+
+
+ASKED = Asked(10.0, "multisine", (), None, 2.0, {}, {}, {}, None)
+
+
+@pytest.mark.parametrize(
+    ("expected", "nats", "worth", "words"),
+    [
+        ({"m": entry(2.0, 0.2, 0.5)}, 3.0, True, "m, known within 10 % now"),
+        ({"m": entry(2.0, 0.02, 0.5)}, 3.0, False, "m known within 2 % already"),
+        ({"m": entry(2.0, 0.2, 0.999)}, 0.001, False, "nothing narrows m"),
+        # What no such experiment narrows is no reason to run it, but it is said.
+        (
+            {"m": entry(2.0, 0.02, 0.5), "I": entry(1.0, 0.5, 1.0)},
+            1.0,
+            False,
+            "next to nothing of I",
+        ),
+    ],
+)
+def test_when_to_stop(expected, nats, worth, words) -> None:
+    found, text = verdict(ASKED, expected, nats)
+    assert found is worth
+    assert words in text

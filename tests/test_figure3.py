@@ -1,0 +1,184 @@
+"""Figures 3 and 5's bookkeeping: transitions needed, claims, cells, the pictures."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+
+from sim2gp.experiments import exploring, figure3
+from sim2gp.experiments.exploring import METHODS, Cell, HeldOut
+from sim2gp.experiments.swingup import CONDITIONS, meeting
+from sim2gp.gaussian import Gaussian
+from sim2gp.models.base import AbstractBelief
+from sim2gp.report import figure3 as drawn
+from sim2gp.runs import Progress
+from sim2gp.runs.cells import Cells
+from sim2gp.tasks import MACHINES
+
+
+def test_transitions_needed_by_hand():
+    """An error that falls as 1 / n: read off exactly, also between two looks."""
+    counts = np.asarray([25.0, 50.0, 100.0])
+    early = np.stack([counts, 10.0 / counts], axis=1)
+    rmse = 10.0 / (250.0 * np.arange(1, 4))
+    for count in (30.0, 100.0, 180.0, 250.0, 600.0, 750.0):
+        error = 10.0 / count * (1.0 + 1e-12)
+        assert figure3.needed(early, rmse, error) == pytest.approx(count)
+    assert figure3.needed(early, rmse, 1.0) == 25.0
+    assert figure3.needed(early, rmse, 1e-3) == np.inf
+    # A look that failed is passed over.
+    early[1, 1] = np.nan
+    assert figure3.needed(early, rmse, 0.1) == pytest.approx(100.0)
+
+
+def planted(best: str, times: float):
+    """SIM2GP learns ``times`` as fast as under random input; ``best`` predicts best."""
+    rng = np.random.default_rng(0)
+    table, early = {}, {}
+    steps = 250.0 * np.arange(1, 5)
+    looks = np.asarray([25.0, 50.0, 100.0])
+    for machine in MACHINES:
+        for condition in CONDITIONS:
+            for method in METHODS:
+                speed = times if method == "SIM2GP" else 1.0
+                columns = {q: np.zeros((10, 4)) for q in figure3.QUANTITIES}
+                columns["rmse"] = np.tile(10.0 / (speed * steps), (10, 1))
+                columns["nll"] = 0.1 * rng.standard_normal((10, 4)) - 5.0
+                columns["nll"] -= 2.0 * (method == best)
+                columns["swung_up"][:6, 1] = method == "SIM2GP"
+                key = machine, condition, method
+                table[key] = columns
+                rows = np.stack([looks, 10.0 / (speed * looks)], axis=1)
+                early[key] = np.tile(rows, (10, 1, 1))
+    return table, early
+
+
+def test_claims_see_what_was_planted():
+    def claims(best: str, times: float):
+        return figure3.claims(*planted(best, times), np.random.default_rng(1))
+
+    found = claims("RES-FS", 4.0)
+    assert found["furuta_exploring_halves_the_data"]["holds"]
+    assert found["furuta_exploring_halves_the_data"]["figure"].startswith("0.25 of")
+    assert found["cartpole_RES_FS_predicts_best_under_mismatch"]["holds"]
+    assert not found["cartpole_FS_predicts_best_under_mismatch"]["holds"]
+    assert found["furuta_exploring_alone_swings_up"]["holds"]
+    assert "60% of seeds" in found["furuta_exploring_alone_swings_up"]["figure"]
+    slow = claims("FS", 1.5)
+    assert not slow["furuta_exploring_halves_the_data"]["holds"]
+    assert slow["furuta_FS_predicts_best_under_mismatch"]["holds"]
+    # What was flown for random input is no explorer's: it cannot win the claim.
+    other = claims("RES-FS, random", 4.0)
+    assert other["furuta_RES_FS_predicts_best_under_mismatch"]["holds"]
+
+
+class Off(AbstractBelief):
+    """Predicts the truth, a given share of the noise aside."""
+
+    truth: jax.Array
+    off: float
+
+    def predict(self, s, a):
+        i = jnp.argmin(jnp.sum((self.truth[:, 0] - s[None]) ** 2, axis=1))
+        scale = jnp.diag(jnp.asarray([0.1, 0.2, 0.3, 0.4]))
+        return Gaussian(self.truth[i, 1] + self.off * jnp.diag(scale), scale)
+
+    def latent(self, s, a):
+        raise AssertionError("not of interest here")
+
+    sample = point = sensitivity = coordinates = latent
+
+
+def test_scores_of_a_forecast_by_hand():
+    noise = np.asarray([0.1, 0.2, 0.3, 0.4])
+    rng = np.random.default_rng(0)
+    S, truth = rng.standard_normal((2, 30, 4))
+    S2 = truth + noise * rng.standard_normal((30, 4))
+    test = HeldOut(S, np.zeros((30, 1)), S2, truth)
+    with jax.enable_x64(True):
+        belief = Off(jnp.stack([jnp.asarray(S), jnp.asarray(truth)], axis=1), 0.5)
+    found = exploring.tested(belief, test, noise)
+    assert found["rmse"] == pytest.approx(0.5)
+    mean = truth + 0.5 * noise
+    density = scipy.stats.norm.logpdf(S2, mean, noise).sum(axis=1)
+    assert found["nll"] == pytest.approx(-np.mean(density))
+    inside = np.mean(np.abs(S2 - mean) < 1.96 * noise)
+    assert found["coverage95"] == pytest.approx(inside)
+
+
+def test_what_is_tested_is_the_swing_up_of_the_oracle():
+    """Rows in their places, and the truth that made them."""
+    cell = Cell("furuta", "mismatch", "SIM2GP", 0, 1)
+    task, _, _ = meeting(cell, "SIM2GP", 0)
+    rng = np.random.default_rng(1)
+    states, actions = rng.uniform(-1, 1, (2, 6, 4)), rng.uniform(-1, 1, (2, 5, 1))
+    test = HeldOut.of(task, {"states": states, "actions": actions})
+    assert test.state.shape == test.truth.shape == (10, 4)
+    np.testing.assert_allclose(test.next_state[4], states[0, 5], rtol=1e-6)
+    np.testing.assert_allclose(test.state[5], states[1, 0], rtol=1e-6)
+    s, a = (jnp.asarray(x[7], jnp.float32) for x in (test.state, test.action))
+    np.testing.assert_allclose(test.truth[7], task.dynamics(s, a), atol=1e-5)
+
+
+def test_a_finished_cell_is_not_flown_again(tmp_path: Path, monkeypatch):
+    cells = Cells(tmp_path / "exploring")
+    cell = Cell("furuta", "nominal", "SIM2GP", 3, 2)
+    values = {"rmse": [1.0, 0.5], "failure": None, "early": []}
+    saved = cells.save(cell.name, cell.arguments, values)
+    assert exploring.explore_cell(cell, tmp_path / "exploring") == saved
+    more = dataclasses.replace(cell, episodes=3)
+    monkeypatch.setattr(exploring, "oracle_cell", lambda cell: {"redrawn": 0})
+    monkeypatch.setattr(exploring, "learner_cell", lambda cell, oracle: dict(values))
+    assert "source" in exploring.explore_cell(more, tmp_path / "exploring")
+    monkeypatch.setattr(exploring, "EXPLORER", exploring.QUICK_EXPLORER)
+    assert cells.load(cell.name, cell.arguments) is None
+    # Random input is flown by no planner, whichever it is.
+    random = dataclasses.replace(cell, method="SIM2GP, random")
+    assert random.arguments["planner"]["type"] == "RandomInput"
+
+
+@pytest.mark.parametrize("figure", ["fig3", "fig5"])
+def test_the_figure_is_written_whole(figure: str, tmp_path: Path, monkeypatch):
+    flown: list[str] = []
+
+    def learner(cell: Cell, oracle):
+        flown.append(cell.name)
+        columns = {q: [1.0 / e for e in range(1, 4)] for q in figure3.QUANTITIES}
+        looks = [{"transitions": 25.0, "rmse": 3.0}]
+        early = looks if METHODS[cell.method].model == "SIM2GP" else []
+        return columns | {"early": early, "failure": None, "seconds": 1.0}
+
+    monkeypatch.setattr(exploring, "learner_cell", learner)
+    monkeypatch.setattr(exploring, "oracle_cell", lambda cell: {"redrawn": 0})
+
+    def draw(name: str):
+        return figure3.run(
+            out=tmp_path / name,
+            seed=0,
+            seeds=2,
+            episodes=3,
+            quick=False,
+            workers=1,
+            progress=Progress(quiet=True),
+            figure=name,
+        )
+
+    summary = draw(figure)
+    count = len(flown)
+    assert count == 2 * len(MACHINES) * len(CONDITIONS) * len(METHODS)
+    other = {"fig3": "fig5", "fig5": "fig3"}[figure]
+    draw(other)
+    assert len(flown) == count  # one study, two pictures
+    stored = json.loads((tmp_path / figure / "summary.json").read_text())
+    assert stored["claims"].keys() == summary["claims"].keys()
+    assert stored["figure3"]["shown"] == figure3.FIGURES[figure]
+    names = {path.name for path in (tmp_path / figure).iterdir()}
+    assert {"fig3.png", "fig5.png", "report.html", "arrays.npz"} <= names
+    with np.load(tmp_path / figure / "arrays.npz") as arrays:
+        picture = drawn(dict(arrays), stored, "nll")
+    assert len(picture.axes) == 4
