@@ -48,6 +48,8 @@ _CONTENTS = {
     "episode": "flight",
     "posterior_sampling": "loops",
     "psrl": "loops",
+    "psal": "loops",
+    "optimism": "loops",
     "InputError": "errors",
     "Sim2GPError": "errors",
 }
