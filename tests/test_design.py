@@ -24,6 +24,8 @@ from simulated_logs import pendulum
 pytestmark = pytest.mark.usefixtures("float64")
 
 PERIOD, STEPS, WINDOW = 0.01, 200, 20
+TRAJECTORY, INFORMATION = eqx.filter_jit(d.trajectory), eqx.filter_jit(d.information)
+ROWS = eqx.filter_jit(d.experiment.sensitivity_at)
 LIMITS = {"theta": (-1.5, 1.5), "theta.velocity": (-15.0, 15.0)}
 
 
@@ -67,7 +69,7 @@ def test_it_tells_what_the_log_of_it_would(system) -> None:
     """Against `models.windows`, on the log that the experiment would leave."""
     e, U = experiment(system), commands()
     nowhere = jnp.zeros_like(e.belief.mean)
-    states = d.trajectory(e, nowhere, U)
+    states = TRAJECTORY(e, nowhere, U)
     y = np.asarray(states)[:-1]
     log = Log(
         name="log",
@@ -92,7 +94,7 @@ def test_it_tells_what_the_log_of_it_would(system) -> None:
         jnp.zeros(()),
     )
     theirs = np.asarray(information_at(belief, windows)(e.belief.mean))
-    ours = np.asarray(d.information(e, nowhere, U, states))
+    ours = np.asarray(INFORMATION(e, nowhere, U, states))
     np.testing.assert_allclose(ours.T @ ours, theirs.T @ theirs, rtol=1e-6)
     scale = np.asarray(d.after(e.belief, jnp.asarray(ours)))
     precision = np.linalg.inv(np.asarray(e.belief.covariance()))
@@ -127,8 +129,8 @@ def test_a_prediction_depends_on_what_moves_it() -> None:
     """Rows against differences of simulations over the horizon."""
     e, U = experiment(), commands(1)
     periods = 25
-    rows = np.asarray(d.experiment.sensitivity_at(e, U, periods))
-    states = np.asarray(d.trajectory(e, jnp.zeros(3), U))
+    rows = np.asarray(ROWS(e, U, periods))
+    states = np.asarray(TRAJECTORY(e, jnp.zeros(3), U))
     step, at = 1e-5, 3  # the fourth prediction
     ahead = []
     for sign in (1.0, -1.0):
@@ -137,7 +139,7 @@ def test_a_prediction_depends_on_what_moves_it() -> None:
         moved = eqx.tree_at(lambda x: x.belief.mean, moved, tt)
         future = U[at * periods :]
         moved = dataclasses.replace(moved, steps=len(future))
-        ahead.append(np.asarray(d.trajectory(moved, jnp.zeros(3), future))[periods])
+        ahead.append(np.asarray(TRAJECTORY(moved, jnp.zeros(3), future))[periods])
     slope = (ahead[0] - ahead[1])[:2] / (2.0 * step) / np.asarray(e.noise)
     np.testing.assert_allclose(rows[2 * at : 2 * at + 2, 1], slope, rtol=1e-5)
 
@@ -233,8 +235,8 @@ def test_a_designed_experiment_beats_random_ones(found) -> None:
     assert best.nats > max(nats)
     # The scale that is told is that of its own commands.
     U = jnp.asarray(best.commands)
-    states = d.trajectory(e, nowhere, U)
-    A = np.asarray(d.information(e, nowhere, U, states))
+    states = TRAJECTORY(e, nowhere, U)
+    A = np.asarray(INFORMATION(e, nowhere, U, states))
     np.testing.assert_allclose(best.states, states, atol=1e-9)
     np.testing.assert_allclose(best.scale, d.after(e.belief, jnp.asarray(A)), rtol=1e-9)
 

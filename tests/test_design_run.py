@@ -1,14 +1,16 @@
 """sim2gp design from end to end: from priors, from a fit, and bad input."""
 
+import dataclasses
 import json
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
 from sim2gp.cli import main
-from sim2gp.design import search
-from sim2gp.experiments.design import Asked, verdict
+from sim2gp.design import Everything, Limits, Named, search
+from sim2gp.experiments.design import Asked, goal_of, setting, verdict
 from sim2gp.runs import load_run
 from test_identify import folder, project_in, run
 
@@ -16,6 +18,7 @@ assert folder  # fixtures
 assert run
 
 SHORT = ["--seconds", "1", "--period", "0.01"]
+ASKED = Asked(10.0, "multisine", (), None, 2.0, {}, {}, {}, None)
 LIMITS = ["--limit", "theta=-1:1", "theta.velocity=-15:15", "--rate", "voltage=200"]
 
 
@@ -58,14 +61,25 @@ def test_before_any_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
 
 def test_after_a_fit(run: Path, tmp_path: Path, capsys) -> None:
     out = tmp_path / "next"
-    words = ["design", str(run), "--out", str(out), "--seconds", "1", *LIMITS, "--json"]
-    assert main([*words, "--kind", "free", "--about", "arm_damping"]) == 0
+    words = ["design", str(run), "--out", str(out), "--seconds", "0.4", *LIMITS]
+    assert main([*words, "--kind", "free", "--predict", "0.2", "--json"]) == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["period"] == 0.002  # the logs'
     fit = load_run(run).summary["parameters"]
     for name, entry in summary["expected_sd"].items():
         assert entry["sd"] == pytest.approx(fit[name]["sd"], rel=1e-6)
-    assert main([*words, "--predict", "0.2", "--out", str(tmp_path / "other")]) == 0
+
+
+def test_what_is_asked_about(tmp_path: Path) -> None:
+    asked = dataclasses.replace(ASKED, about=("pendulum_length", "arm_damping"))
+    _, experiment, _ = setting(project_in(tmp_path), asked)
+    names = experiment.system.parameters.names
+    box = Limits.of(experiment.system, {}, {}, start=np.zeros(4))
+    goal = goal_of(asked, experiment, box, jax.random.key(0))
+    assert isinstance(goal, Named)
+    assert [names[i] for i in goal.index] == ["pendulum_length", "arm_damping"]
+    plain = goal_of(ASKED, experiment, box, jax.random.key(0))
+    assert isinstance(plain, Everything)
 
 
 BAD = {
@@ -107,9 +121,6 @@ def test_a_run_that_is_none(tmp_path: Path, capsys) -> None:
 
 def entry(mean: float, sd: float, left: float) -> dict[str, float]:
     return {"mean": mean, "sd": sd, "of_before": left}
-
-
-ASKED = Asked(10.0, "multisine", (), None, 2.0, {}, {}, {}, None)
 
 
 @pytest.mark.parametrize(
