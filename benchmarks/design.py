@@ -14,8 +14,6 @@ import argparse
 import dataclasses
 import json
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -138,23 +136,12 @@ def commands(method: str, seed: int, seconds: float) -> np.ndarray:
     if method == "random":
         return random_input(experiment, limits, free, key)
     if method == "multisine":
-        with unaware():
-            found = design(experiment, Everything(), limits, sine, key=key)
+        # Optimised at the prior's middle alone.
+        found = design(experiment, Everything(), limits, sine, key=key, draws=1)
     else:
         family = free if method == "design free" else sine
         found = design(experiment, Everything(), limits, family, key=key)
     return np.asarray(found.commands)
-
-
-@contextmanager
-def unaware() -> Iterator[None]:
-    """Optimise at the prior's middle alone."""
-    before = search.DRAWS
-    search.DRAWS = 1
-    try:
-        yield
-    finally:
-        search.DRAWS = before
 
 
 def random_input(

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import multivariate_normal
 
+from sim2gp.experiments.exploring import forecast
 from sim2gp.experiments.swingup import METHODS, WITH_TERM, reach_of
 from sim2gp.flight import Purpose, key_for
 from sim2gp.models.base import AbstractBelief
@@ -73,7 +74,7 @@ def _episode(task: Task, key: Any, A: Any) -> Any:
 def anywhere(task: Task, seed: int, times: float) -> Rows:
     """States and inputs uniform on the box, velocities and inputs ``times`` as far."""
     rng = np.random.default_rng(seed)
-    half = np.asarray(task.state_bound, float) / 3.0
+    half = np.asarray(task.trusted, float)
     half = np.where(np.isfinite(half), half, np.pi)
     half[half.size // 2 :] *= times
     S = rng.uniform(-half, half, (TESTS, half.size)).astype(np.float32)
@@ -93,22 +94,14 @@ def _steps(task: Task, S: Any, A: Any) -> Any:
 def scores(belief: AbstractBelief, rows: Rows) -> list[float]:
     """RMSE, NLL and 95 % coverage of the velocities."""
     S, A, S2 = rows
-    mean, covariance = (np.asarray(x) for x in _predict(belief, S, A))
+    found = forecast(belief, jnp.asarray(S), jnp.asarray(A))
+    mean, covariance = (np.asarray(x) for x in found)
     v = slice(mean.shape[1] // 2, None)
     e, C = (S2 - mean)[:, v], covariance[:, v, v]
     density = [multivariate_normal(cov=c).logpdf(x) for x, c in zip(e, C, strict=True)]
     z = e / np.sqrt(np.einsum("nii->ni", C))
     rmse = float(np.sqrt(np.mean(e**2)))
     return [rmse, -float(np.mean(density)), float(np.mean(np.abs(z) < 1.96))]
-
-
-@eqx.filter_jit
-def _predict(belief: AbstractBelief, S: Any, A: Any) -> Any:
-    def one(s: Any, a: Any) -> Any:
-        found = belief.predict(s, a)
-        return found.mean, found.covariance()
-
-    return jax.vmap(one)(S, A)
 
 
 def work(job: Job) -> list[list[float]]:

@@ -109,7 +109,7 @@ def test_optimism_adds_the_epistemic_sd() -> None:
     def reward(s: State, a: Action, s2: State) -> Array:
         return s2[0]
 
-    objective = Optimistic(reward, belief, jnp.asarray(0.3))
+    objective = MarkovObjective(Optimistic(reward, belief, jnp.asarray(0.3)))
     sd = [
         np.sqrt(sum(float(jnp.sum(x**2)) for x in belief.sensitivity(s, s))) for s in S
     ]

@@ -46,7 +46,7 @@ def planted(best: str, times: float):
         for condition in CONDITIONS:
             for method in METHODS:
                 speed = times if method == "SIM2GP" else 1.0
-                columns = {q: np.zeros((10, 4)) for q in figure3.QUANTITIES}
+                columns = {q: np.zeros((10, 4)) for q in exploring.QUANTITIES}
                 columns["rmse"] = np.tile(10.0 / (speed * steps), (10, 1))
                 columns["nll"] = 0.1 * rng.standard_normal((10, 4)) - 5.0
                 columns["nll"] -= 2.0 * (method == best)
@@ -137,6 +137,10 @@ def test_a_finished_cell_is_not_flown_again(tmp_path: Path, monkeypatch):
     assert "source" in exploring.explore_cell(more, tmp_path / "exploring")
     monkeypatch.setattr(exploring, "EXPLORER", exploring.QUICK_EXPLORER)
     assert cells.load(cell.name, cell.arguments) is None
+    # A first fit that failed is not tried again either.
+    lost = {"rmse": [], "failure": "E203", "early": []}
+    saved = cells.save(more.name, more.arguments, lost)
+    assert exploring.explore_cell(more, tmp_path / "exploring") == saved
     # Random input is flown by no planner, whichever it is.
     random = dataclasses.replace(cell, method="SIM2GP, random")
     assert random.arguments["planner"]["type"] == "RandomInput"
@@ -148,7 +152,7 @@ def test_the_figure_is_written_whole(figure: str, tmp_path: Path, monkeypatch):
 
     def learner(cell: Cell, oracle):
         flown.append(cell.name)
-        columns = {q: [1.0 / e for e in range(1, 4)] for q in figure3.QUANTITIES}
+        columns = {q: [1.0 / e for e in range(1, 4)] for q in exploring.QUANTITIES}
         looks = [{"transitions": 25.0, "rmse": 3.0}]
         early = looks if METHODS[cell.method].model == "SIM2GP" else []
         return columns | {"early": early, "failure": None, "seconds": 1.0}

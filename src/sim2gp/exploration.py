@@ -51,8 +51,8 @@ class InformationGain(AbstractObjective):
         return jax.vmap(lambda *one: increments(*one)[0])(*each)
 
 
-class Optimistic(AbstractObjective):
-    """A reward, and ``weight`` for each noise sd that the belief is unsure of ``s'``.
+class Optimistic(eqx.Module):
+    """A step's reward, and ``weight`` for each noise sd of doubt about ``s'``.
 
     The bonus is the norm of the epistemic sd over all outputs, each in its noise's.
     """
@@ -61,21 +61,9 @@ class Optimistic(AbstractObjective):
     belief: AbstractBelief
     weight: Scalar
 
-    def init(self) -> tuple[()]:
-        return ()
-
-    def step(self, carry: Any, s: State, a: Action, s2: State) -> tuple[Any, Scalar]:
+    def __call__(self, s: State, a: Action, s2: State) -> Scalar:
         variance = sum(jnp.sum(x**2) for x in self.belief.sensitivity(s, a))
-        return carry, self.reward(s, a, s2) + self.weight * jnp.sqrt(variance)
-
-    def along(
-        self,
-        carry: Any,
-        S: Float[Array, "T n"],
-        A: Float[Array, "T m"],
-        S2: Float[Array, "T n"],
-    ) -> Float[Array, " T"]:
-        return jax.vmap(lambda *x: self.step(carry, *x)[1])(S, A, S2)
+        return self.reward(s, a, s2) + self.weight * jnp.sqrt(variance)
 
 
 class Restrained(AbstractObjective):

@@ -199,9 +199,9 @@ def episode(
     for first in range(0, task.horizon, part):
         if flown is not None and world_at is not None:
             world = world_at(flown)
-            moment = eqx.tree_at(
-                lambda m: m.memory, moment, world.objective.init()
-            )  # what was flown is in the new world's belief
+            # What was flown is in the new world's belief.
+            memory = world.objective.init()
+            moment = eqx.tree_at(lambda m: m.memory, moment, memory)
         steps = jnp.arange(first, min(first + part, task.horizon))
         moment, rows = _fly_steps(task, planner, moment, world, steps, key=key)
         flown = extended(flown, start, rows)

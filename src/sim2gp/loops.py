@@ -28,7 +28,7 @@ from sim2gp.models.base import AbstractBelief, AbstractModel
 from sim2gp.planning import AbstractObjective, AbstractPlanner, MarkovObjective, World
 from sim2gp.tasks import Task
 from sim2gp.transitions import Transitions
-from sim2gp.types import Dynamics, Key, in_float64, single
+from sim2gp.types import Dynamics, Key, double, in_float64, single
 
 #: Nats a step, of leaving the trusted box by as much again.
 LIMIT_COST = 100.0
@@ -175,7 +175,7 @@ def _conditioned(
     A: Float[np.ndarray, "T m"],
     S2: Float[np.ndarray, "T n"],
 ) -> AbstractBelief:
-    return _condition(model, belief, *(jnp.asarray(x, float) for x in (S, A, S2)))
+    return _condition(model, belief, *double(S, A, S2))
 
 
 @eqx.filter_jit
@@ -271,11 +271,16 @@ def optimism(
     ``weight`` is that of one noise sd of doubt about the next state (`Optimistic`).
     """
     each = jnp.asarray(weight, jnp.float32)
+
+    def objective(belief: AbstractBelief) -> AbstractObjective:
+        believed = single(belief.learnable())
+        return MarkovObjective(Optimistic(task.reward, believed, each))
+
     return posterior_sampling(
         task,
         model,
         planner,
-        objective=lambda b: Optimistic(task.reward, single(b.learnable()), each),
+        objective=objective,
         episodes=episodes,
         key=key,
         **(Options(world=expected) | options),

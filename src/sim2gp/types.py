@@ -62,3 +62,8 @@ def single(tree: _T) -> _T:
     return jax.tree.map(
         lambda x: jnp.asarray(x, jnp.float32) if eqx.is_inexact_array(x) else x, tree
     )
+
+
+def double(*arrays: AnyArray) -> tuple[Array, ...]:
+    """Float64 versions, within `in_float64`."""
+    return tuple(jnp.asarray(x, float) for x in arrays)

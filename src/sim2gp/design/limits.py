@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sim2gp.errors import InputError, nearest
-from sim2gp.systems.base import AbstractSystem
+from sim2gp.errors import InputError
+from sim2gp.systems.base import AbstractSystem, index_of
 
 Pairs = Mapping[str, tuple[float, float]]
 
@@ -45,10 +45,10 @@ class Limits(eqx.Module):
         """
         states, inputs = system.physical_states, system.actions
         names = [channel.name for channel in (*states, *inputs)]
-        for name in (*stated, *rates):
-            known = names if name in stated else [c.name for c in inputs]
-            if name not in known:
-                raise _unknown(name, known)
+        for name in stated:
+            index_of(name, (*states, *inputs), where="limits")
+        for name in rates:
+            index_of(name, inputs, where="rates")
         box = {c.name: (c.low, c.high) for c in (*states, *inputs)}
         for name, (low, high) in stated.items():
             box[name] = max(low, box[name][0]), min(high, box[name][1])
@@ -109,18 +109,6 @@ def kept(limits: Limits, U: Float[Array, "T m"], period: float) -> Float[Array, 
         return u, u
 
     return jax.lax.scan(follow, jnp.zeros_like(U[0]), U)[1]
-
-
-def _unknown(name: str, known: list[str]) -> InputError:
-    close = nearest(name, known)
-    return InputError(
-        "E103",
-        "unknown channel",
-        where="limits",
-        got=name,
-        expected=f"one of {', '.join(known)}",
-        fix=f"did you mean {close}?" if close else "",
-    )
 
 
 def _no_motion(

@@ -26,7 +26,7 @@ from sim2gp.planning import ICEM
 from sim2gp.types import Key, in_float64, single
 
 ROUNDS, SAMPLES, ELITES = 20, 40, 8
-DRAWS = 2  # of the constants, that information is averaged over
+DRAWS = 2  # of the constants, that information is averaged over, its mean first
 GUARDS = 8  # more of them, that must keep the limits while searching
 MARGIN = 0.03  # of a box's half, kept free while searching
 COST = 100.0  # nats for leaving the limits by a whole half of the box
@@ -63,22 +63,25 @@ def design(
     signal: AbstractSignal,
     *,
     key: Key,
+    draws: int = DRAWS,
 ) -> Designed:
-    """The best commands found. Raises E150 where none of them keeps the limits."""
+    """The best commands found. Raises E150 where none of them keeps the limits.
+
+    Their worth is averaged over ``draws`` of the constants, the mean being the first.
+    """
     experiment, goal, limits = jax.tree.map(jnp.asarray, (experiment, goal, limits))
     search, guard, check = jax.random.split(key, 3)
     p = experiment.belief.mean.size
-    draws = jax.random.normal(jax.random.fold_in(search, 1), (DRAWS - 1, p))
-    draws = jnp.concatenate([jnp.zeros((1, p)), draws])
+    others = jax.random.normal(jax.random.fold_in(search, 1), (draws - 1, p))
+    informed = jnp.concatenate([jnp.zeros((1, p)), others])
     guards = jax.random.normal(guard, (GUARDS, p))
-    rough = single((experiment, goal, limits, draws, guards))
+    rough = single((experiment, goal, limits, informed, guards))
     C = _search(signal, *rough, search).astype(float)
     checks = jax.random.normal(check, (CHECKED, p))
     for _ in range(40):
         U = signal.commands(C, limits)
-        states = np.asarray(_states(experiment, U, checks))
-        beyond = np.asarray(jax.vmap(lambda S: excess(limits, S))(jnp.asarray(states)))
-        bad = float(np.mean(~(beyond <= 0.0)))
+        states, outside = _checked(experiment, limits, U, checks)
+        bad = float(jnp.mean(outside))
         if bad <= ALLOWED:
             break
         C = SMALLER * C
@@ -90,14 +93,14 @@ def design(
             expected=f"at most {ALLOWED:.0%}",
             fix="widen the limits of the states, or know the machine better first",
         )
-    worth, scale = _worth(experiment, goal, draws, U, _states(experiment, U, draws))
-    middle = _states(experiment, U, jnp.zeros((1, p)))[0]
-    low, high = np.quantile(states, [0.05, 0.95], axis=0)
+    middle = _states(experiment, U, informed)
+    worth, scale = _worth(experiment, goal, informed, U, middle)
+    low, high = np.quantile(np.asarray(states), [0.05, 0.95], axis=0)
     return Designed(
         np.asarray(U),
         float(worth),
         np.asarray(scale),
-        np.asarray(middle),
+        np.asarray(middle[0]),
         low,
         high,
         bad,
@@ -189,3 +192,12 @@ _sensitivity = eqx.filter_jit(sensitivity_at)
 def _states(experiment: Experiment, U: Array, draws: Array) -> Array:
     """Of every drawn machine."""
     return jax.vmap(lambda z: trajectory(experiment, z, U))(draws)
+
+
+@eqx.filter_jit
+def _checked(
+    experiment: Experiment, limits: Limits, U: Array, draws: Array
+) -> tuple[Array, Array]:
+    """Of every drawn machine, and whether it leaves the limits or is lost."""
+    states = _states(experiment, U, draws)
+    return states, ~(jax.vmap(lambda S: excess(limits, S))(states) <= 0.0)

@@ -12,6 +12,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sim2gp.design.limits import Limits, kept
+from sim2gp.planning.mpc import from_unit
+from sim2gp.types import Box
 
 FADE = 0.25  # s, in which a multisine comes and goes
 
@@ -72,8 +74,5 @@ class Free(AbstractSignal):
         left = np.minimum(at.astype(int), len(C) - 2)
         share = jnp.asarray((at - left)[:, None], C.dtype)
         line = (1.0 - share) * C[left] + share * C[left + 1]
-        middle, half = (
-            0.5 * (limits.high + limits.low),
-            0.5 * (limits.high - limits.low),
-        )
-        return kept(limits, middle[None] + half[None] * line, self.period)
+        box = Box(jnp.asarray(limits.low), jnp.asarray(limits.high))
+        return kept(limits, from_unit(line, box), self.period)

@@ -41,7 +41,7 @@ from sim2gp.models.sim2gp import PRIOR_NOISE
 from sim2gp.parameters import unknown_parameter
 from sim2gp.project import Project, load_project
 from sim2gp.runs import Progress, new_run
-from sim2gp.systems.base import AbstractSystem
+from sim2gp.systems.base import AbstractSystem, index_of
 from sim2gp.types import in_float64
 
 FILE = "trajectory.csv"
@@ -209,17 +209,10 @@ def _stated_noise(project: Project, names: list[str]) -> list[float]:
 
 
 def _start(given: Mapping[str, float], system: AbstractSystem) -> Any:
-    states = [channel.name for channel in system.physical_states]
+    states = system.physical_states
     for name in given:
-        if name not in states:
-            raise InputError(
-                "E103",
-                "unknown channel",
-                where="--start",
-                got=name,
-                expected=f"one of {', '.join(states)}",
-            )
-    return jnp.asarray([given.get(name, 0.0) for name in states], float)
+        index_of(name, states, where="--start")
+    return jnp.asarray([given.get(c.name, 0.0) for c in states], float)
 
 
 @in_float64

@@ -44,6 +44,8 @@ from sim2gp.types import Dynamics, Key, in_float64
 #: swing-up needs, and every third step.
 EXPLORER = MPC(update=ICEM(samples=64, elites=8, iterations=3), every=3)
 QUICK_EXPLORER = MPC(update=ICEM(samples=32, elites=4, iterations=2), every=5)
+#: What is kept of each episode.
+QUANTITIES = ("rmse", "nll", "coverage95", "nats", "upright", "swung_up")
 #: Episodes of the oracle that make a test set.
 TESTS = 2
 #: Of the first episode, where a simulator's own fit is looked at as well.
@@ -146,7 +148,8 @@ def tested(
     belief: AbstractBelief, test: HeldOut, noise: np.ndarray
 ) -> dict[str, float]:
     """Error (noise sd), negative log density (nats) and coverage, per transition."""
-    mean, covariance = (np.asarray(x) for x in _forecast(belief, test))
+    found = forecast(belief, jnp.asarray(test.state), jnp.asarray(test.action))
+    mean, covariance = (np.asarray(x) for x in found)
     L = np.linalg.cholesky(covariance)
     z = np.linalg.solve(L, (test.next_state - mean)[..., None])[..., 0]
     logs = np.log(np.einsum("nii->ni", L)).sum(axis=1)
@@ -160,12 +163,16 @@ def tested(
 
 
 @eqx.filter_jit
-def _forecast(belief: AbstractBelief, test: HeldOut) -> tuple[Array, Array]:
+def forecast(
+    belief: AbstractBelief, S: Float[Array, "N n"], A: Float[Array, "N m"]
+) -> tuple[Float[Array, "N n"], Float[Array, "N n n"]]:
+    """Mean and covariance of each transition's next state, noise included."""
+
     def one(s: Array, a: Array) -> tuple[Array, Array]:
         found = belief.predict(s, a)
         return found.mean, found.covariance()
 
-    return jax.vmap(one)(jnp.asarray(test.state), jnp.asarray(test.action))
+    return jax.vmap(one)(S, A)
 
 
 def oracle_cell(cell: Cell) -> dict[str, Any]:
@@ -228,7 +235,7 @@ def learner_cell(cell: Cell, oracle: Mapping[str, Any]) -> dict[str, Any]:
     except (NotConverged, NotFinite) as error:
         failure = str(error)
     seconds = time.perf_counter() - started
-    columns = {name: [row[name] for row in rows] for name in (rows or [{}])[0]}
+    columns = {name: [row[name] for row in rows] for name in QUANTITIES}
     return columns | {"early": early, "failure": failure, "seconds": seconds}
 
 
@@ -256,7 +263,7 @@ def explore_cell(cell: Cell, out: Path) -> dict[str, Any]:
     stored = cells.load(cell.name, cell.arguments)
     oracle = cell.method == "oracle"
     if stored is not None and (
-        oracle or len(stored["rmse"]) >= cell.episodes or stored["failure"]
+        oracle or stored["failure"] or len(stored["rmse"]) >= cell.episodes
     ):
         return stored
     if oracle:

@@ -16,7 +16,13 @@ import numpy as np
 from jaxtyping import Float
 
 from sim2gp.experiments.claims import at_least_as_good, central, claim, resampled
-from sim2gp.experiments.exploring import METHODS, Cell, explore_cell, reference
+from sim2gp.experiments.exploring import (
+    METHODS,
+    QUANTITIES,
+    Cell,
+    explore_cell,
+    reference,
+)
 from sim2gp.experiments.record import provenance
 from sim2gp.experiments.stages import in_stages
 from sim2gp.experiments.swingup import CONDITIONS
@@ -27,7 +33,6 @@ from sim2gp.tasks import MACHINES
 SEEDS, EPISODES = 5, 10
 QUICK_SEEDS, QUICK_EPISODES = 1, 3
 STEPS = 250  # transitions of an episode, on both machines
-QUANTITIES = ("rmse", "nll", "coverage95", "nats", "upright", "swung_up")
 FIGURES = {"fig3": "rmse", "fig5": "nll"}
 #: Exploring is asked to need at most this share of the transitions of random input.
 SHARE = 0.5

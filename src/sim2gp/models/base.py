@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from sim2gp.gaussian import Gaussian
 from sim2gp.models.information import Sensitivity, joint
 from sim2gp.transitions import Transitions
-from sim2gp.types import Action, Dynamics, Key, Scalar, State, in_float64
+from sim2gp.types import Action, Dynamics, Key, Scalar, State, double, in_float64
 
 
 class AbstractBelief(eqx.Module):
@@ -60,7 +60,7 @@ class AbstractBelief(eqx.Module):
     @in_float64
     def information_gain(self, s: State, a: Action) -> Scalar:
         """Nats that one more transition from here is expected to give."""
-        s, a = jnp.asarray(s, float), jnp.asarray(a, float)
+        s, a = double(s, a)
         return self.trajectory_information_gain(s[None], a[None])
 
     @in_float64
@@ -68,8 +68,7 @@ class AbstractBelief(eqx.Module):
         self, S: Float[Array, "T n"], A: Float[Array, "T m"]
     ) -> Scalar:
         """Nats that a whole trajectory is expected to give, redundancy removed."""
-        S, A = jnp.asarray(S, float), jnp.asarray(A, float)
-        return joint(*jax.vmap(self.sensitivity)(S, A))
+        return joint(*jax.vmap(self.sensitivity)(*double(S, A)))
 
 
 class AbstractModel(eqx.Module):

@@ -16,8 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from sim2gp.errors import InputError, nearest
-from sim2gp.systems.base import AbstractSystem
+from sim2gp.systems.base import AbstractSystem, index_of
 from sim2gp.transitions import Transitions
 from sim2gp.types import Action, Key, Scalar, State
 
@@ -48,18 +47,8 @@ class Encoding(eqx.Module):
         E103 for an unknown name.
         """
         channels = (*system.states, *system.actions)
-        names = [channel.name for channel in channels]
         for name in reach:
-            if name not in names:
-                close = nearest(name, names)
-                raise InputError(
-                    "E103",
-                    "unknown channel",
-                    where="reach",
-                    got=name,
-                    expected=f"one of {', '.join(names)}",
-                    fix=f"did you mean {close}?" if close else "",
-                )
+            index_of(name, channels, where="reach")
         low, high = [], []
         for channel in channels:
             half = reach.get(channel.name, REACH.get(channel.unit, 1.0))

@@ -21,14 +21,13 @@ from sim2gp.models.last_layer import LastLayer
 from sim2gp.models.nlm import (
     Head,
     Trained,
-    double,
     lifted,
     with_noise,
 )
 from sim2gp.models.sim2gp import Sim2GP, Sim2GPBelief
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.transitions import Transitions
-from sim2gp.types import Action, Dynamics, Key, Scalar, State, in_float64
+from sim2gp.types import Action, Dynamics, Key, Scalar, State, double, in_float64
 
 
 class HybridDraw(eqx.Module):

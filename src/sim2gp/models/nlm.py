@@ -27,7 +27,7 @@ from sim2gp.models.information import Sensitivity
 from sim2gp.models.last_layer import LastLayer
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.transitions import Transitions
-from sim2gp.types import Action, Dynamics, Key, Scalar, State, in_float64
+from sim2gp.types import Action, Dynamics, Key, Scalar, State, double, in_float64
 
 BLOCK = 100  # steps between two looks at the held-out rows
 BATCH = 256
@@ -361,11 +361,6 @@ def checked(belief: Any, data: Transitions) -> Any:
             fix="look for non-finite or huge values in the data",
         )
     return belief
-
-
-def double(*arrays: Array) -> tuple[Array, ...]:
-    """Float64 versions."""
-    return tuple(jnp.asarray(x, float) for x in arrays)
 
 
 def lifted(s: State, a: Action, change: Gaussian) -> Gaussian:

@@ -25,7 +25,7 @@ from sim2gp.models.features import Encoding
 from sim2gp.models.information import Sensitivity
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.transitions import Transitions
-from sim2gp.types import Action, Dynamics, Key, Scalar, State, in_float64
+from sim2gp.types import Action, Dynamics, Key, Scalar, State, double, in_float64
 
 NOISE_ROUNDS = 5  # EM; the last change of sig is below 1e-3 relative from here on
 STARTS = 4
@@ -48,11 +48,11 @@ class Sim2GPBelief(AbstractBelief):
 
     @in_float64
     def latent(self, s: State, a: Action) -> Gaussian:
-        return _latent(self, *_double(s, a))
+        return _latent(self, *double(s, a))
 
     @in_float64
     def predict(self, s: State, a: Action) -> Gaussian:
-        return _predict(self, *_double(s, a))
+        return _predict(self, *double(s, a))
 
     @in_float64
     def sample(self, key: Key) -> Dynamics:
@@ -167,10 +167,6 @@ class Sim2GP(AbstractModel):
         """
         assert isinstance(belief, Sim2GPBelief)
         return _update(belief, s, a, s2)
-
-
-def _double(*arrays: Array) -> tuple[Array, ...]:
-    return tuple(jnp.asarray(x, float) for x in arrays)
 
 
 def _latent(belief: Sim2GPBelief, s: Array, a: Array) -> Gaussian:

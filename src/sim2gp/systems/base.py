@@ -13,7 +13,7 @@ input; so the delay ``tau`` has a gradient, which a shift by whole samples has n
 import abc
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -283,7 +283,7 @@ def table_for(record: type, parameters: Parameters | None) -> Parameters:
     return parameters
 
 
-def index_of(name: str, channels: tuple[Channel, ...]) -> int:
+def index_of(name: str, channels: Sequence[Channel], *, where: str = "") -> int:
     """Position of a channel by name; `InputError` E103 names the nearest one."""
     names = [channel.name for channel in channels]
     if name not in names:
@@ -291,6 +291,7 @@ def index_of(name: str, channels: tuple[Channel, ...]) -> int:
         raise InputError(
             "E103",
             "unknown channel",
+            where=where,
             got=name,
             expected=f"one of {', '.join(names)}",
             fix=f"did you mean {close}?" if close else "",
