@@ -45,6 +45,20 @@ def test_the_best_is_asked_of_all_others():
     assert found["text"] == "words"
 
 
+def test_a_lost_seed_is_not_a_tie():
+    base = np.zeros(20)
+    lost = np.where(np.arange(20) < 2, -np.inf, base)
+    assert claims.at_least_as_good("RES", {"RES": base, "FS": lost}, rng(), "")["holds"]
+    found = claims.at_least_as_good("RES", {"RES": lost, "FS": base}, rng(), "")
+    assert not found["holds"]
+    assert found["figure"] == "no score on 2 seeds, FS has one"
+    both = {"RES": lost, "FS": lost - 1.0}
+    assert claims.at_least_as_good("RES", both, rng(), "")["holds"]
+    nothing = np.full(20, -np.inf)
+    both = {"RES": nothing, "FS": nothing}
+    assert not claims.at_least_as_good("RES", both, rng(), "")["holds"]
+
+
 def test_who_looks_in_many_places_needs_more():
     """2.4 standard errors are something in one place and nothing in fifteen."""
     base = np.zeros(20)

@@ -58,15 +58,23 @@ def at_least_as_good(
     rng: np.random.Generator,
     text: str,
 ) -> dict[str, Any]:
-    """No other learner is better than ``name`` by more than chance explains."""
+    """No other learner is better than ``name`` by more than chance explains.
+
+    A score that is not finite is a seed that was lost: one lost by ``name`` alone is
+    enough not to hold, one lost by another learner does not count for that one.
+    """
     worst, figure = np.inf, ""
     for other, score in scores.items():
-        if other != name:
-            difference = scores[name] - score
+        kept = np.isfinite(score)
+        lost = int(np.sum(kept & ~np.isfinite(scores[name])))
+        if lost:
+            return claim(False, f"no score on {lost} seeds, {other} has one", text)
+        if other != name and kept.any():
+            difference = scores[name][kept] - score[kept]
             low, high = interval(difference, rng)
             if high < worst:
                 worst, figure = high, f"{told(difference, low, high)} to {other}"
-    return claim(worst >= 0.0, figure, text)
+    return claim(figure != "" and worst >= 0.0, figure, text)
 
 
 def better_somewhere(
