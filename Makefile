@@ -45,7 +45,7 @@ unit: $(VENV)/.test
 nightly: $(VENV)/.test
 	$(BIN)/python -m pytest -m nightly $(ARGS)
 
-# Redraws the committed figures of the paper.
+# Redraws figure 1 of the paper.
 figures: $(VENV)/.core
 	$(BIN)/sim2gp reproduce fig1 --out results/fig1 $(ARGS)
 
