@@ -11,7 +11,6 @@ the constants, those of a held-out motion, the posterior's volume, and the predi
 """
 
 import argparse
-import dataclasses
 import json
 import sys
 from pathlib import Path
@@ -36,6 +35,7 @@ from sim2gp.design import (
     trajectory,
 )
 from sim2gp.design.limits import excess
+from sim2gp.gaussian import Gaussian
 from sim2gp.logs import Log
 from sim2gp.models.cutting import cut
 from sim2gp.models.windows import fit_windows
@@ -176,49 +176,66 @@ def random_input(
     return best
 
 
-@in_float64
-def learned(seed: int, U: np.ndarray) -> dict[str, Any]:
-    """Fly on the seed's arm, fit, and compare with the truth."""
-    experiment, limits = setting(len(U) * PERIOD)
-    system, prior = experiment.system, experiment.belief
-    z = jax.random.normal(jax.random.key(1000 + seed), prior.mean.shape)
-    states = np.asarray(_flown(experiment, z, jnp.asarray(U)))[:-1]
-    rng = np.random.default_rng(seed)
+def truth(seed: int) -> Any:
+    """The seed's arm, in sd of the prior."""
+    p = arm().parameters.prior().mean.size
+    return jax.random.normal(jax.random.key(1000 + seed), (p,))
+
+
+def recorded(seed: int, run: int, U: np.ndarray) -> tuple[Log, np.ndarray]:
+    """The log of the commands on the seed's arm, and the states behind it."""
+    experiment, _ = setting(len(U) * PERIOD)
+    states = np.asarray(_flown(experiment, truth(seed), jnp.asarray(U)))[:-1]
+    rng = np.random.default_rng([seed, run])
     y = states[:, :2] + NOISE * rng.standard_normal((len(U), 2))
     log = Log(
-        name=f"arm{seed}",
-        source=f"arm{seed}.csv",
+        name=f"arm{seed}-{run}",
+        source=f"arm{seed}-{run}.csv",
         time=PERIOD * np.arange(len(U)),
         channels={"q1": y[:, 0], "q2": y[:, 1]},
         inputs={"torque1": U[:, 0], "torque2": U[:, 1]},
         mask={n: np.ones(len(U), bool) for n in ("q1", "q2")},
         notes=(),
     )
-    windows, _ = cut([log], system, window=WINDOW)
-    belief = fit_windows(system, windows, key=jax.random.key(seed))
-    tt = np.asarray(prior.mean + prior.scale @ z)
-    away = np.asarray(belief.posterior.mean) - tt
-    sd = np.asarray(belief.posterior.sd())
-    volume = float(np.linalg.slogdet(np.asarray(belief.posterior.scale))[1])
-    fitted = np.linalg.solve(
-        np.asarray(prior.scale), np.asarray(belief.posterior.mean - prior.mean)
-    )
+    return log, states
+
+
+def fitted(logs: list[Log], seed: int) -> Gaussian:
+    """What `sim2gp identify` believes after the logs."""
+    system = arm()
+    windows, _ = cut(logs, system, window=WINDOW)
+    return fit_windows(system, windows, key=jax.random.key(seed)).posterior
+
+
+def motion_error(belief: Gaussian, seed: int) -> float:
+    """Of angles (rad) in a held-out motion of five seconds, at the belief's mean."""
+    experiment, limits = setting(HELD * PERIOD)
+    prior = experiment.belief
+    z = np.linalg.solve(np.asarray(prior.scale), np.asarray(belief.mean - prior.mean))
     signal = Multisine(PERIOD, HELD)
-    coefficients = 0.06 * jax.random.normal(
-        jax.random.key(77), (signal.coefficients, 2)
+    shape = (signal.coefficients, 2)
+    U = signal.commands(0.06 * jax.random.normal(jax.random.key(77), shape), limits)
+    ours, true = (
+        np.asarray(_flown(experiment, jnp.asarray(x), U))[:, :2]
+        for x in (z, truth(seed))
     )
-    motion = signal.commands(coefficients, limits)
-    longer = eqx.tree_at(lambda e: e.start, experiment, jnp.zeros(4))
-    longer = dataclasses.replace(longer, steps=HELD)
-    true, ours = (
-        np.asarray(_flown(longer, jnp.asarray(x), motion))[:, :2] for x in (z, fitted)
-    )
+    return float(np.sqrt(np.mean((ours - true) ** 2)))
+
+
+@in_float64
+def learned(seed: int, U: np.ndarray) -> dict[str, Any]:
+    """Fly on the seed's arm, fit, and compare with the truth."""
+    experiment, limits = setting(len(U) * PERIOD)
+    prior, z = experiment.belief, truth(seed)
+    log, states = recorded(seed, 0, U)
+    belief = fitted([log], seed)
+    away = np.asarray(belief.mean - prior.mean - prior.scale @ z)
     predicted = np.asarray(_expected(experiment, z, jnp.asarray(U)))
     return {
         "constants": float(np.sqrt(np.mean((away / np.asarray(prior.sd())) ** 2))),
-        "motion": float(np.sqrt(np.mean((ours - true) ** 2))),
-        "log_volume": volume,
-        "z": (away / sd).tolist(),
+        "motion": motion_error(belief, seed),
+        "log_volume": float(np.linalg.slogdet(np.asarray(belief.scale))[1]),
+        "z": (away / np.asarray(belief.sd())).tolist(),
         "z_expected": (away / predicted).tolist(),
         "energy": float(energy(U, limits)),
         "beyond": float(excess(limits, jnp.asarray(states))),

@@ -16,6 +16,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from mutant_descent import DESCENTS
+from mutant_design import DESIGN
 from mutant_exploring import EXPLORING
 from mutant_list import MUTANTS as PHYSICS
 from mutant_list import Hunt, Mutant
@@ -23,7 +24,7 @@ from mutant_misfit import MISFIT
 from mutant_networks import NETWORKS
 from mutant_studies import STUDIES
 
-MUTANTS = (*PHYSICS, *DESCENTS, *NETWORKS, *MISFIT, *STUDIES, *EXPLORING)
+MUTANTS = (*PHYSICS, *DESCENTS, *NETWORKS, *MISFIT, *STUDIES, *EXPLORING, *DESIGN)
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "src" / "sim2gp"

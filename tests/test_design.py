@@ -200,6 +200,15 @@ def test_limits_that_admit_no_motion_are_said(stated, rates, start, words) -> No
         limits(pendulum(), stated, rates, np.asarray(start, float))
 
 
+def test_stated_limits_narrow_those_of_the_channels() -> None:
+    """Whatever a user states, a channel's own limits hold as well."""
+    system = pendulum()
+    (channel,) = system.actions
+    wide = limits(system, {"voltage": (2.0 * channel.low, 0.5 * channel.high)})
+    assert wide.low[0] == channel.low
+    assert wide.high[0] == 0.5 * channel.high
+
+
 # ---------------------------------------------------------------- search
 @pytest.fixture(scope="module")
 def found():

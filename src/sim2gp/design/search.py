@@ -76,15 +76,14 @@ def design(
     informed = jnp.concatenate([jnp.zeros((1, p)), others])
     guards = jax.random.normal(guard, (GUARDS, p))
     rough = single((experiment, goal, limits, informed, guards))
-    C = _search(signal, *rough, search).astype(float)
+    U = signal.commands(_search(signal, *rough, search).astype(float), limits)
     checks = jax.random.normal(check, (CHECKED, p))
     for _ in range(40):
-        U = signal.commands(C, limits)
         states, outside = _checked(experiment, limits, U, checks)
         bad = float(jnp.mean(outside))
         if bad <= ALLOWED:
             break
-        C = SMALLER * C
+        U = SMALLER * U
     else:
         raise InputError(
             "E150",

@@ -216,15 +216,14 @@ def _start(given: Mapping[str, float], system: AbstractSystem) -> Any:
 
 
 @in_float64
-def _summarise(
-    source: Path, asked: Asked, experiment: Experiment, found: Designed, seed: int
-) -> dict[str, Any]:
+def expectation(experiment: Experiment, found: Designed) -> dict[str, dict[str, Any]]:
+    """Of each constant: unit, mean and sd now, sd expected after, and their ratio."""
     table, belief = experiment.system.parameters, experiment.belief
     mean = np.asarray(belief.mean)
     before = physical_moments(table, mean, np.asarray(belief.sd()))
     sd = np.sqrt(np.sum(found.scale**2, axis=1))
     after = physical_moments(table, mean, sd)
-    expected: dict[str, dict[str, Any]] = {
+    return {
         p.name: {
             "unit": p.unit,
             "mean": float(before["mean"][j]),
@@ -234,6 +233,13 @@ def _summarise(
         }
         for j, p in enumerate(table.free)
     }
+
+
+@in_float64
+def _summarise(
+    source: Path, asked: Asked, experiment: Experiment, found: Designed, seed: int
+) -> dict[str, Any]:
+    expected = expectation(experiment, found)
     worth, reason = verdict(asked, expected, found.nats)
     return {
         "command": "design",

@@ -1,0 +1,145 @@
+"""A session that designs its own experiments and stops, beside a tuned multisine.
+
+    python benchmarks/session.py [--truths N] [--rounds N] [--workers N] [--out DIR]
+
+Hidden two-link arms from CAD priors, as in `design.py`. The session designs ten
+seconds, runs them, fits all logs, and designs again, until `sim2gp design` says that
+another run is not worth it. The multisine was optimised once, for the middle of the
+prior, and is run again and again. Both keep the same limits. Compared are the robot's
+seconds that the multisine needs for the held-out error that the session stopped with.
+"""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from design import PERIOD, arm, fitted, motion_error, recorded, setting
+
+from sim2gp.design import Everything, Free, Multisine, design
+from sim2gp.experiments.design import Asked, expectation, verdict
+from sim2gp.gaussian import Gaussian
+from sim2gp.logs import Log
+from sim2gp.runs.workers import cores, spread
+from sim2gp.types import in_float64
+
+SECONDS = 10.0
+#: What `sim2gp design` asks by default.
+ASKED = Asked(SECONDS, "free", (), None, 2.0, {}, {}, {}, PERIOD)
+#: The project's goal: the session's seconds, of those that the multisine needs.
+OF_MULTISINE = 0.5
+
+
+class Job(NamedTuple):
+    seed: int
+    rounds: int
+    out: Path
+
+
+@in_float64
+def session(seed: int, rounds: int) -> dict[str, Any]:
+    """Design, run, learn, until it is not worth it; errors after each run."""
+    experiment, limits = setting(SECONDS)
+    signal = Free(PERIOD, experiment.steps)
+    belief: Gaussian = arm().parameters.prior()
+    logs: list[Log] = []
+    errors: list[float] = []
+    said, stopped = "", False
+    while not stopped and len(logs) < rounds:
+        now = eqx.tree_at(lambda e: e.belief, experiment, belief)
+        key = jax.random.key(100 * seed + len(logs))
+        found = design(now, Everything(), limits, signal, key=key)
+        worth, said = verdict(ASKED, expectation(now, found), found.nats)
+        stopped = not worth
+        if worth:
+            logs.append(recorded(seed, len(logs), found.commands)[0])
+            belief = fitted(logs, seed)
+            errors.append(motion_error(belief, seed))
+    return {"errors": errors, "stopped": stopped, "said": said}
+
+
+@in_float64
+def tuned(path: Path) -> np.ndarray:
+    """The multisine, from the disk where it is."""
+    if not path.exists():
+        experiment, limits = setting(SECONDS)
+        signal, key = Multisine(PERIOD, experiment.steps), jax.random.key(0)
+        found = design(experiment, Everything(), limits, signal, key=key, draws=1)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.save(path, found.commands)
+    return np.load(path)
+
+
+@in_float64
+def repeated(seed: int, rounds: int, U: np.ndarray) -> list[float]:
+    """Errors after one run of the same commands, two, three."""
+    logs, errors = [], []
+    for run in range(rounds):
+        logs.append(recorded(seed, 100 + run, U)[0])
+        errors.append(motion_error(fitted(logs, seed), seed))
+    return errors
+
+
+def work(job: Job) -> dict[str, Any]:
+    """Both on one arm."""
+    U = tuned(job.out.with_suffix(".cells") / "multisine.npy")
+    theirs = repeated(job.seed, 2 * job.rounds, U)
+    return session(job.seed, job.rounds) | {"multisine": theirs}
+
+
+def ratio(row: dict[str, Any]) -> float:
+    """The session's seconds, of those that the multisine needs; 0 for never."""
+    mine, theirs = row["errors"], np.asarray(row["multisine"])
+    if not mine:
+        return float("nan")
+    good = np.flatnonzero(theirs <= mine[-1])
+    return len(mine) / (good[0] + 1.0) if good.size else 0.0
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--truths", type=int, default=20)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--workers", type=int, default=cores())
+    parser.add_argument("--out", type=Path, default=Path("results/session"))
+    options = parser.parse_args()
+    tuned(options.out.with_suffix(".cells") / "multisine.npy")
+    half = (options.truths + 1) // 2
+    jobs = [Job(seed, options.rounds, options.out) for seed in range(options.truths)]
+    rows: list[Any] = [None] * len(jobs)
+    for job, row in spread(work, [jobs[:half], jobs[half:]], options.workers):
+        rows[job.seed] = row
+        print(f"arm {job.seed}: {len(row['errors'])} runs", file=sys.stderr)
+    text = "\n".join(lines(rows))
+    print(text)
+    options.out.mkdir(parents=True, exist_ok=True)
+    (options.out / "table.txt").write_text(text + "\n")
+    (options.out / "arms.json").write_text(json.dumps(rows, indent=1) + "\n")
+
+
+def lines(rows: list[dict[str, Any]]) -> list[str]:
+    """Arm by arm, and the goal."""
+    out = [f"{'arm':4s}{'runs':>6s}{'error, rad':>12s}{'multisine after as many':>26s}"]
+    for i, row in enumerate(rows):
+        n = len(row["errors"])
+        errors = (
+            f"{row['errors'][-1]:12.2e}{row['multisine'][n - 1]:26.2e}" if n else ""
+        )
+        out.append(f"{i:<4d}{n:6d}{errors}")
+    middle = float(np.nanmedian([ratio(row) for row in rows]))
+    verdict = "holds" if middle <= OF_MULTISINE else "does not hold"
+    stopped = sum(row["stopped"] for row in rows)
+    return [
+        *out,
+        f"stopped by itself: {stopped} of {len(rows)}",
+        f"at most {OF_MULTISINE:g} of the seconds that the multisine needs: {verdict} "
+        f"({middle:.2f}, median over arms; 0 where it never got there)",
+    ]
+
+
+if __name__ == "__main__":
+    main()

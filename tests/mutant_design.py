@@ -1,0 +1,133 @@
+"""Mutants of experiment design: what it would tell, its limits, what is asked of it."""
+
+from mutant_list import Mutant
+
+EXPERIMENT, GOALS = "design/experiment.py", "design/goals.py"
+LIMITS, SIGNALS, SEARCH = "design/limits.py", "design/signals.py", "design/search.py"
+RUN = "experiments/design.py"
+TOLD = ("test_design.py", "tells_what_the_log")
+GOAL = ("test_design.py", "dense_covariances")
+KEPT = ("test_design.py", "exactly or followed")
+SEARCHED = ("test_design.py", "beats_random or nothing_can")
+
+DESIGN = (
+    Mutant(
+        "design: starts are known",
+        EXPERIMENT,
+        "triangular(jnp.concatenate([J, prior]))[n:, n:]",
+        "triangular(J[:, n:])",
+        TOLD,
+    ),
+    Mutant(
+        "design: starts without a prior",
+        EXPERIMENT,
+        "prior = jnp.eye(n, n + p, dtype=z.dtype)",
+        "prior = 1e-3 * jnp.eye(n, n + p, dtype=z.dtype)",
+        TOLD,
+    ),
+    Mutant(
+        "design: what was believed before is forgotten",
+        EXPERIMENT,
+        "jnp.concatenate([A, eye])",
+        "jnp.concatenate([A, 1e-3 * eye])",
+        TOLD,
+    ),
+    Mutant(
+        "design: a prediction from the start alone",
+        EXPERIMENT,
+        "whole = _piece(experiment, U, 0, experiment.steps)",
+        "whole = _piece(experiment, U, 1, experiment.steps)",
+        TOLD,
+    ),
+    Mutant(
+        "goal: the rest is taken for known",
+        GOALS,
+        "rows = scale[jnp.asarray(self.index)]",
+        "rows = scale[jnp.asarray(self.index)][:, jnp.asarray(self.index)]",
+        GOAL,
+    ),
+    Mutant(
+        "goal: sd in place of variance",
+        GOALS,
+        "return 0.5 * jnp.log(jnp.mean(",
+        "return 1.0 * jnp.log(jnp.mean(",
+        GOAL,
+    ),
+    Mutant(
+        "limits: rates are twice as fast",
+        LIMITS,
+        "step = limits.rate * period",
+        "step = 2.0 * limits.rate * period",
+        KEPT,
+    ),
+    Mutant(
+        "limits: the machine was not at rest",
+        LIMITS,
+        "jax.lax.scan(follow, jnp.zeros_like(U[0]), U)",
+        "jax.lax.scan(follow, U[0], U)",
+        KEPT,
+    ),
+    Mutant(
+        "limits: the lower side is open",
+        LIMITS,
+        "limits.state_low[None] - states",
+        "0.0 * states",
+        ("test_design.py", "share_of_the_half"),
+    ),
+    Mutant(
+        "limits: what is stated widens a channel",
+        LIMITS,
+        "max(low, box[name][0]), min(high, box[name][1])",
+        "low, high",
+        ("test_design.py", "narrow"),
+    ),
+    Mutant(
+        "limits: a start on the edge",
+        LIMITS,
+        "if not low < x < high:",
+        "if not low - 9.0 < x < high + 9.0:",
+        ("test_design.py", "admit_no_motion"),
+    ),
+    Mutant(
+        "multisine: cut, not scaled",
+        SIGNALS,
+        "U / jnp.maximum(share, 1.0)[None]",
+        "U",
+        ("test_design.py", "scaled_not_cut"),
+    ),
+    Mutant(
+        "search: whatever leaves the limits",
+        SEARCH,
+        "if bad <= ALLOWED:",
+        "if bad <= 1.0:",
+        SEARCHED,
+    ),
+    Mutant(
+        "search: the worst plan",
+        SEARCH,
+        "returns = worth - COST * beyond",
+        "returns = -worth - COST * beyond",
+        SEARCHED,
+    ),
+    Mutant(
+        "verdict: what cannot be narrowed is a reason to run",
+        RUN,
+        'expected[n]["of_before"] <= 1.0 - NARROWER]',
+        'expected[n]["of_before"] <= 1.0]',
+        ("test_design_run.py", None),
+    ),
+    Mutant(
+        "verdict: what is known well enough is a reason to run",
+        RUN,
+        "if share[n] > asked.within",
+        "if share[n] > 0.0",
+        ("test_design_run.py", None),
+    ),
+    Mutant(
+        "csv: rounded",
+        RUN,
+        "repr(float(x))",
+        'f"{float(x):.6g}"',
+        ("test_design_run.py", None),
+    ),
+)
