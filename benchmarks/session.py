@@ -108,10 +108,10 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("results/session"))
     options = parser.parse_args()
     tuned(options.out.with_suffix(".cells") / "multisine.npy")
-    half = (options.truths + 1) // 2
     jobs = [Job(seed, options.rounds, options.out) for seed in range(options.truths)]
+    groups = [jobs[i :: options.workers] for i in range(options.workers)]
     rows: list[Any] = [None] * len(jobs)
-    for job, row in spread(work, [jobs[:half], jobs[half:]], options.workers):
+    for job, row in spread(work, groups, options.workers):
         rows[job.seed] = row
         print(f"arm {job.seed}: {len(row['errors'])} runs", file=sys.stderr)
     text = "\n".join(lines(rows))
@@ -131,12 +131,12 @@ def lines(rows: list[dict[str, Any]]) -> list[str]:
         )
         out.append(f"{i:<4d}{n:6d}{errors}")
     middle = float(np.nanmedian([ratio(row) for row in rows]))
-    verdict = "holds" if middle <= OF_MULTISINE else "does not hold"
+    held = "holds" if middle <= OF_MULTISINE else "does not hold"
     stopped = sum(row["stopped"] for row in rows)
     return [
         *out,
         f"stopped by itself: {stopped} of {len(rows)}",
-        f"at most {OF_MULTISINE:g} of the seconds that the multisine needs: {verdict} "
+        f"at most {OF_MULTISINE:g} of the seconds that the multisine needs: {held} "
         f"({middle:.2f}, median over arms; 0 where it never got there)",
     ]
 
