@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
-from design import PERIOD, arm, fitted, motion_error, recorded, setting
+from design import PERIOD, STARTS, arm, fitted, motion_error, recorded, setting
 
 from sim2gp.design import Everything, Free, Multisine, design
 from sim2gp.experiments.design import Asked, expectation, verdict
@@ -68,7 +68,9 @@ def tuned(path: Path) -> np.ndarray:
     if not path.exists():
         experiment, limits = setting(SECONDS)
         signal, key = Multisine(PERIOD, experiment.steps), jax.random.key(0)
-        found = design(experiment, Everything(), limits, signal, key=key, draws=1)
+        found = design(
+            experiment, Everything(), limits, signal, key=key, draws=1, starts=STARTS
+        )
         path.parent.mkdir(parents=True, exist_ok=True)
         np.save(path, found.commands)
     return np.load(path)

@@ -125,6 +125,16 @@ def test_goals_are_those_of_dense_covariances() -> None:
     assert nats(goal) == pytest.approx(0.5 * np.log(ratio), rel=1e-10)
 
 
+def test_goals_count_their_directions() -> None:
+    """All sd smaller by one factor are worth its log, once for each direction."""
+    scale = jnp.asarray(np.random.default_rng(0).standard_normal((4, 4)))
+    goals = (d.Everything(), d.Named((2, 0)), d.Prediction(scale[:3]))
+    for goal, count in zip(goals, (4, 2, 1), strict=True):
+        assert goal.directions(scale) == count
+        worth = float(goal.nats(scale, scale / 1.7))
+        assert worth == pytest.approx(count * np.log(1.7), rel=1e-10)
+
+
 def test_a_prediction_depends_on_what_moves_it() -> None:
     """Rows against differences of simulations over the horizon."""
     e, U = experiment(), commands(1)
@@ -174,9 +184,29 @@ def test_a_multisine_is_scaled_not_cut() -> None:
 
 def test_excess_is_a_share_of_the_half_width() -> None:
     box = limits(pendulum())
-    S = jnp.asarray([[1.4, 9.0, -14.0, 99.0], [0.0, 0.0, -18.0, 0.0]])
-    assert float(excess(box, S[:1])) == 0.0
+    S = jnp.asarray([[1.4, 9.0, -14.1, 99.0], [0.0, 0.0, -18.0, 0.0]])
+    assert float(excess(box, S[:1])) == pytest.approx(-0.06)
     assert float(excess(box, S)) == pytest.approx(0.2)
+
+
+def test_every_turn_beyond_the_limits_counts() -> None:
+    """Each at its worst; then the mean over machines."""
+    e, box = experiment(), limits(pendulum())
+    beyond = search._beyond_of(e, box)
+    states = np.zeros((2, STEPS + 1, 4))
+    states[0, 10:13, 0] = 1.8, 2.1, 1.8
+    states[0, 100, 2] = -18.0
+    assert float(beyond(jnp.asarray(states))) == pytest.approx(0.5 * (0.4 + 0.2))
+
+
+def test_random_motions_have_sd_one() -> None:
+    for family in (d.Multisine, d.Free):
+        signal = family(PERIOD, STEPS)
+        keys = jax.random.split(jax.random.key(0), 300)
+        C = np.asarray(jax.vmap(lambda k, s=signal: s.random(k, 2))(keys))
+        assert C.shape[1:] == (signal.coefficients, 2)
+        assert np.std(C) == pytest.approx(1.0, abs=0.05)
+        assert abs(np.mean(C[..., 0] * C[..., 1])) < 0.1
 
 
 def test_rates_are_followed_by_the_nearest_command() -> None:
@@ -210,24 +240,99 @@ def test_stated_limits_narrow_those_of_the_channels() -> None:
 
 
 # ---------------------------------------------------------------- search
+QUICK = {"BLOCKS": 3, "TRIALS": 60, "GUARDS": 12, "CHECKED": 200}
+
+
+def test_worth_has_a_gradient_in_the_commands() -> None:
+    """Against differences, also where some windows tell nothing of a constant."""
+    e = experiment(delayed())
+    z = 0.3 * jnp.ones_like(e.belief.mean)
+
+    @jax.jit
+    def worth(U):
+        states = d.trajectory(e, z, U)
+        return search._worth_at(e, d.Everything(), z, U, states)[0]
+
+    U = commands(2).at[: STEPS // 2].set(0.0)
+    V = commands(3)
+    slope = float(jnp.sum(jax.jit(jax.grad(worth))(U) * V))
+    h = 1e-5
+    difference = float(worth(U + h * V) - worth(U - h * V)) / (2.0 * h)
+    assert slope == pytest.approx(difference, rel=1e-5)
+
+
+def test_a_search_on_longer_periods_sees_the_same() -> None:
+    """Fewer samples of as much less noise; an experiment of few periods stays whole."""
+    fine = dataclasses.replace(experiment(), period=0.002, steps=500, window=50)
+    coarse, signal = search._coarser(fine, d.Multisine(0.002, 500))
+    assert (coarse.period, coarse.steps, coarse.window) == (0.01, 100, 10)
+    box, nowhere = limits(fine.system), jnp.zeros((1, 3))
+    C = 0.1 * jax.random.normal(jax.random.key(1), (signal.coefficients, 1))
+    told = [
+        float(search._worth(e, d.Everything(), nowhere, s.commands(C, box))[0])
+        for e, s in ((fine, d.Multisine(0.002, 500)), (coarse, signal))
+    ]
+    assert told[1] == pytest.approx(told[0], abs=0.1)
+    short = dataclasses.replace(fine, steps=3, window=3)
+    assert search._coarser(short, d.Multisine(0.002, 3))[0] is short
+
+
+def test_commands_are_made_no_smaller_than_they_must_be() -> None:
+    e = experiment()
+    box, draws = limits(e.system), jax.random.normal(jax.random.key(1), (100, 3))
+    U, states, bad = search._kept(e, box, commands(4, 5.0), draws)
+    share = float(jnp.max(jnp.abs(U)) / jnp.max(jnp.abs(commands(4, 5.0))))
+    assert 0.0 < share < 1.0
+    assert bad <= 0.01
+    assert np.mean([float(excess(box, S)) > 0.0 for S in states]) == pytest.approx(bad)
+    _, larger = search._checked(e, box, U / search.SMALLER, draws)
+    assert float(jnp.mean(larger > 0.0)) > 0.01
+
+
+class Away:
+    """A climb that always ends far outside."""
+
+    def compile_for(self, *args) -> None:
+        pass
+
+    def __call__(self, *args):
+        C, state = args[7:9]
+        return 0.0 * C + 1.0, state
+
+
+def test_a_climb_that_ends_far_outside_is_given_up(monkeypatch) -> None:
+    e = experiment()
+    box, signal = limits(e.system), d.Multisine(PERIOD, STEPS)
+    draws = jax.random.normal(jax.random.key(1), (50, 3))
+    monkeypatch.setattr(search, "_climb", Away())
+    improve = search._climber(e, signal, d.Everything(), box, draws[:2], draws)
+    start = improve(jax.random.key(3))
+    assert float(jnp.max(jnp.abs(start))) < 1.0
+    # It begins nearly within its limits.
+    U = signal.commands(start.astype(float), box)
+    _, beyond = search._checked(e, search._narrowed(box), U, draws)
+    assert float(jnp.mean(beyond > 0.0)) <= search.LEAVING + 0.05
+
+
 @pytest.fixture(scope="module")
 def found():
-    """A search of a few rounds."""
+    """A short search."""
     with jax.enable_x64(True), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(search, "ROUNDS", 6)
-        patch.setattr(search, "SAMPLES", 20)
-        patch.setattr(search, "CHECKED", 200)
+        for name, value in QUICK.items():
+            patch.setattr(search, name, value)
         e = experiment()
         box = limits(e.system, LIMITS, {"voltage": 100.0})
         signal = d.Multisine(PERIOD, STEPS)
-        key = jax.random.key(0)
-        return e, box, signal, d.design(e, d.Everything(), box, signal, key=key)
+        key, goal = jax.random.key(0), d.Everything()
+        best = d.design(e, goal, box, signal, key=key)
+        assert d.design(e, goal, box, signal, key=key, starts=3).nats > best.nats
+        return e, box, signal, best
 
 
 def test_a_designed_experiment_beats_random_ones(found) -> None:
     e, box, signal, best = found
     assert best.violations <= 0.01
-    assert float(excess(box, jnp.asarray(best.states))) == 0.0
+    assert float(excess(box, jnp.asarray(best.states))) <= 0.0
     draws = jax.random.normal(jax.random.key(5), (12, signal.coefficients, 1))
     nowhere = jnp.zeros(3)
 
@@ -239,9 +344,9 @@ def test_a_designed_experiment_beats_random_ones(found) -> None:
         return d.Everything().nats(e.belief.scale, scale), excess(box, states)
 
     told = [random(c) for c in draws]
-    nats = [float(n) for n, beyond in told if float(beyond) == 0.0]
+    nats = [float(n) for n, beyond in told if float(beyond) <= 0.0]
     assert nats
-    assert best.nats > max(nats)
+    assert best.nats > max(nats) + 0.3
     # The scale that is told is that of its own commands.
     U = jnp.asarray(best.commands)
     states = TRAJECTORY(e, nowhere, U)
@@ -255,7 +360,7 @@ def test_no_commands_keep_limits_that_nothing_can(found) -> None:
     e, _, signal, _ = found
     box = limits(e.system, {"alpha": (-0.2, 0.401)})
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in (("ROUNDS", 2), ("SAMPLES", 16), ("CHECKED", 50)):
+        for name, value in QUICK.items():
             patch.setattr(search, name, value)
         with pytest.raises(InputError, match="E150 no commands keep the limits"):
             d.design(e, d.Everything(), box, signal, key=jax.random.key(0))

@@ -22,10 +22,13 @@ ASKED = Asked(10.0, "multisine", (), None, 2.0, {}, {}, {}, None)
 LIMITS = ["--limit", "theta=-1:1", "theta.velocity=-15:15", "--rate", "voltage=200"]
 
 
+QUICK = {"BLOCK": 5, "BLOCKS": 2, "TRIALS": 40, "GUARDS": 8, "CHECKED": 100}
+
+
 @pytest.fixture(autouse=True)
 def brief(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A few rounds."""
-    for name, value in (("ROUNDS", 3), ("SAMPLES", 16), ("CHECKED", 100)):
+    """A few steps."""
+    for name, value in QUICK.items():
         monkeypatch.setattr(search, name, value)
 
 
@@ -97,7 +100,7 @@ BAD = {
     "--start alpha=4 --limit alpha=-1:1": ("E150", "limits of alpha"),
     "--predict 3": ("E151", "prediction longer than the experiment"),
     "--period nan": ("E148", "a positive number"),
-    "--kind chirp": ("E160", "one of multisine, free"),
+    "--kind chirp": ("E160", "one of free, multisine"),
 }
 
 

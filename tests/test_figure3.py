@@ -77,6 +77,18 @@ def test_claims_see_what_was_planted():
     assert other["furuta_RES_FS_predicts_best_under_mismatch"]["holds"]
 
 
+def test_a_seed_that_random_input_lost_tells_nothing():
+    """All of its fits failed: the claim rests on the others, or on none."""
+    table, early = planted("FS", 4.0)
+    for machine, lost in (("furuta", slice(0, 1)), ("cartpole", slice(None))):
+        table[machine, "nominal", "SIM2GP, random"]["rmse"][lost] = np.nan
+    found = figure3.claims(table, early, np.random.default_rng(1))
+    assert found["furuta_exploring_halves_the_data"]["figure"].startswith("0.25 of")
+    none = found["cartpole_exploring_halves_the_data"]
+    assert not none["holds"]
+    assert "no seed" in none["figure"]
+
+
 class Off(AbstractBelief):
     """Predicts the truth, a given share of the noise aside."""
 
@@ -160,13 +172,13 @@ def test_the_figure_is_written_whole(figure: str, tmp_path: Path, monkeypatch):
     monkeypatch.setattr(exploring, "learner_cell", learner)
     monkeypatch.setattr(exploring, "oracle_cell", lambda cell: {"redrawn": 0})
 
-    def draw(name: str):
+    def draw(name: str, seeds: int | None = 2, quick: bool = False):
         return figure3.run(
             out=tmp_path / name,
             seed=0,
-            seeds=2,
+            seeds=seeds,
             episodes=3,
-            quick=False,
+            quick=quick,
             workers=1,
             progress=Progress(quiet=True),
             figure=name,
@@ -186,3 +198,9 @@ def test_the_figure_is_written_whole(figure: str, tmp_path: Path, monkeypatch):
     with np.load(tmp_path / figure / "arrays.npz") as arrays:
         picture = drawn(dict(arrays), stored, "nll")
     assert len(picture.axes) == 4
+    # A quick look has fewer learners, and says which.
+    quick = draw(figure, None, quick=True)
+    shown = quick["figure3"]["methods"]
+    assert set(METHODS) - set(shown) == set(figure3.NOT_QUICK)
+    assert len(flown) - count == len(MACHINES) * len(CONDITIONS) * len(shown)
+    assert [row[0] for row in quick["tables"][0]["rows"]] == shown

@@ -177,7 +177,7 @@ class Design(Writes):
     """An identify run; a project file where there is no log yet."""
     seconds: float = 10.0
     """Duration in s."""
-    kind: Literal["multisine", "free"] = "multisine"
+    kind: Literal["free", "multisine"] = "free"
     """Family of the commands."""
     about: Annotated[tuple[str, ...], arg(metavar="NAME...")] = ()
     """Constants to learn; default all."""
@@ -193,8 +193,10 @@ class Design(Writes):
     """Where the machine rests before; default zero."""
     period: float | None = None
     """Of commands and samples in s; default the logs'."""
+    starts: int = 1
+    """Random motions that are improved; the best one counts."""
     seed: int = 0
-    """Draws machines and candidates."""
+    """Draws machines and motions."""
 
     def run(self, progress: Progress) -> dict[str, Any]:
         out = _out(self.out, f"design-{self.run_or_project.stem}")
@@ -212,6 +214,7 @@ class Design(Writes):
             rates=numbers("--rate", self.rate),
             start=numbers("--start", self.start),
             period=self.period,
+            starts=self.starts,
         )
         return _experiment("design")(
             self.run_or_project, asked, out=out, seed=self.seed, progress=progress

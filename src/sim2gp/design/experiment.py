@@ -73,11 +73,12 @@ def information(
     z: Float[Array, " p"],
     U: Commands,
     states: Float[Array, "times n"],
-) -> Float[Array, "p p"]:
-    """Factor of the Fisher information about the belief's ``z``, at one machine.
+) -> Float[Array, "rows p"]:
+    """Rows that square to the Fisher information about the belief's ``z``.
 
-    ``states`` are its `trajectory`. In units of the belief: ``I + A^T A`` is the
-    precision after the experiment. Starts are eliminated window by window, by QR.
+    At one machine, whose `trajectory` is ``states``. In units of the belief:
+    ``I + A^T A`` is the precision after the experiment. Starts are eliminated window by
+    window, by orthogonal projection.
     """
     p, n = z.size, states.shape[1]
     count = experiment.window
@@ -91,15 +92,28 @@ def information(
             params = experiment.record(z + x[n:])
             start = x0 + experiment.start_sd * x[:n]
             found = simulate(experiment.system, params, window, start)
-            return (
-                found[:: experiment.substeps, outputs] / experiment.noise[None]
-            ).ravel()
+            rows = found[:: experiment.substeps, outputs] / experiment.noise[None]
+            return rows.ravel()
 
         _, J = value_and_jacobian(seen, jnp.zeros(n + p, z.dtype))
-        prior = jnp.eye(n, n + p, dtype=z.dtype)
-        return triangular(jnp.concatenate([J, prior]))[n:, n:]
+        return _about_constants(J, n)
 
-    return triangular(jax.vmap(one)(first).reshape(-1, p))
+    return jax.vmap(one)(first).reshape(-1, p)
+
+
+def _about_constants(J: Float[Array, "N q"], n: int) -> Float[Array, "rows p"]:
+    """Rows in all of a window's unknowns as rows in its constants alone.
+
+    What an unknown start, of unit prior, explains as well is projected out: twice, as
+    the second time takes what rounding left. Every factor here has full rank, so that
+    plans can be improved along its gradient.
+    """
+    S = jnp.concatenate([J[:, :n], jnp.eye(n, dtype=J.dtype)])
+    P = jnp.concatenate([J[:, n:], jnp.zeros((n, J.shape[1] - n), J.dtype)])
+    Q = over(S, triangular(S))
+    for _ in range(2):
+        P = P - Q @ (Q.T @ P)
+    return P
 
 
 def sensitivity_at(
@@ -128,7 +142,7 @@ def sensitivity_at(
     return jax.vmap(one)(first).reshape(-1, tt.size)
 
 
-def after(belief: Gaussian, A: Float[Array, "p p"]) -> Float[Array, "p p"]:
+def after(belief: Gaussian, A: Float[Array, "rows p"]) -> Float[Array, "p p"]:
     """Square root of the covariance once the experiment was made."""
     eye = jnp.eye(A.shape[1], dtype=A.dtype)
     return over(belief.scale, triangular(jnp.concatenate([A, eye])))

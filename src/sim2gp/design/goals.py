@@ -26,6 +26,10 @@ class AbstractGoal(eqx.Module):
     def uncertainty(self, scale: Scale) -> Scalar:
         """In nats, up to a constant."""
 
+    @abstractmethod
+    def directions(self, scale: Scale) -> int:
+        """How many variances its nats count: a volume counts all of its axes."""
+
     def nats(self, before: Scale, after: Scale) -> Scalar:
         """What going from one belief to the other is worth."""
         return self.uncertainty(before) - self.uncertainty(after)
@@ -37,6 +41,9 @@ class Everything(AbstractGoal):
     def uncertainty(self, scale: Scale) -> Scalar:
         return log_det_factor(triangular(scale.T))
 
+    def directions(self, scale: Scale) -> int:
+        return len(scale)
+
 
 class Named(AbstractGoal):
     """Some constants, whatever becomes of the others: their marginal's volume."""
@@ -47,6 +54,9 @@ class Named(AbstractGoal):
         rows = scale[jnp.asarray(self.index)]
         return log_det_factor(triangular(rows.T)[: len(self.index)])
 
+    def directions(self, scale: Scale) -> int:
+        return len(self.index)
+
 
 class Prediction(AbstractGoal):
     """What a prediction depends on: its mean variance, each row in its own unit."""
@@ -55,3 +65,6 @@ class Prediction(AbstractGoal):
 
     def uncertainty(self, scale: Scale) -> Scalar:
         return 0.5 * jnp.log(jnp.mean(jnp.sum((self.rows @ scale) ** 2, axis=1)))
+
+    def directions(self, scale: Scale) -> int:
+        return 1

@@ -87,13 +87,13 @@ class Limits(eqx.Module):
 
 
 def excess(limits: Limits, states: Float[Array, "T n"]) -> Float[Array, ""]:
-    """How far a trajectory leaves the box, at worst, as a share of the box's half."""
+    """How far a trajectory leaves the box at worst, in halves of it; below 0 inside."""
     half = 0.5 * (limits.state_high - limits.state_low)
     half = jnp.where(jnp.isfinite(half), half, 1.0)
     over = jnp.maximum(
         states - limits.state_high[None], limits.state_low[None] - states
     )
-    return jnp.maximum(jnp.max(over / half[None]), 0.0)
+    return jnp.max(over / half[None])
 
 
 def kept(limits: Limits, U: Float[Array, "T m"], period: float) -> Float[Array, "T m"]:

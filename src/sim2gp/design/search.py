@@ -1,9 +1,16 @@
 """The search: the commands whose worth, over draws of the belief, is largest.
 
-Worth is averaged over draws of the constants, because information depends on them; a
-plan that takes some drawn machine beyond its limits pays for it. What is returned was
-then held against many more draws, and made smaller until it passed.
+Worth is averaged over draws of the constants, because information depends on them. A
+random motion is improved along gradients through simulator and information. Those draws
+that it takes nearest to the limits guard them: to leave costs little at first and much
+in the end, for the way to a better motion may lead outside. What is returned has passed
+on draws that had no part in the search, made smaller where it did not.
 """
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sim2gp.ahead import ahead
 from sim2gp.design.experiment import (
     Experiment,
     after,
@@ -22,17 +30,24 @@ from sim2gp.design.goals import AbstractGoal
 from sim2gp.design.limits import Limits, excess
 from sim2gp.design.signals import AbstractSignal, Multisine
 from sim2gp.errors import InputError
-from sim2gp.planning import ICEM
+from sim2gp.models.features import Moments, adam, descend
 from sim2gp.types import Key, in_float64, single
 
-ROUNDS, SAMPLES, ELITES = 20, 40, 8
-DRAWS = 2  # of the constants, that information is averaged over, its mean first
-GUARDS = 8  # more of them, that must keep the limits while searching
-MARGIN = 0.03  # of a box's half, kept free while searching
-COST = 100.0  # nats for leaving the limits by a whole half of the box
+GRID = 0.01  # s, the shortest period that a search looks at
+BLOCK, BLOCKS, RATE = 15, 5, 0.015  # of Adam's steps along the gradient
+STARTS = 1  # random motions
+BEGIN, LEAVING = 0.1, 0.2  # their coefficients' sd, less where more trials leave limits
+DRAWS = 4  # of the constants, that information is averaged over, its mean first
+TRIALS = 300  # of them, that must keep the limits while searching
+GUARDS = 32  # of those, the nearest to the limits, that a block of steps looks at
+MARGIN = 0.05  # of a box's half, kept free while searching
+TURN = 0.25  # s, in which a motion leaves its limits about once
+LOST = 0.3  # halves of the box: so far outside, a plan is given up
+CHEAP, COST = 2.0, 15.0  # at first and at last, for a half of the box, in nats of
+#: each direction that is asked about
 CHECKED = 1000  # draws that the result is held against
 ALLOWED = 0.01  # the share of them that may leave the limits
-SMALLER = 0.93  # times the commands, where more do
+SMALLER = 0.97  # times the commands, where too many still do
 MILD = 0.03  # of an input's range, the sd of each tone of a random motion
 
 
@@ -64,46 +79,63 @@ def design(
     *,
     key: Key,
     draws: int = DRAWS,
+    starts: int = STARTS,
 ) -> Designed:
     """The best commands found. Raises E150 where none of them keeps the limits.
 
     Their worth is averaged over ``draws`` of the constants, the mean being the first.
+    The best of what is found from so many random motions.
     """
     experiment, goal, limits = jax.tree.map(jnp.asarray, (experiment, goal, limits))
-    search, guard, check = jax.random.split(key, 3)
     p = experiment.belief.mean.size
-    others = jax.random.normal(jax.random.fold_in(search, 1), (draws - 1, p))
-    informed = jnp.concatenate([jnp.zeros((1, p)), others])
-    guards = jax.random.normal(guard, (GUARDS, p))
-    rough = single((experiment, goal, limits, informed, guards))
-    U = signal.commands(_search(signal, *rough, search).astype(float), limits)
-    checks = jax.random.normal(check, (CHECKED, p))
-    for _ in range(40):
-        states, outside = _checked(experiment, limits, U, checks)
-        bad = float(jnp.mean(outside))
-        if bad <= ALLOWED:
-            break
-        U = SMALLER * U
-    else:
-        raise InputError(
-            "E150",
-            "no commands keep the limits",
-            got=f"{bad:.0%} of {CHECKED} draws leave them however small the commands",
-            expected=f"at most {ALLOWED:.0%}",
-            fix="widen the limits of the states, or know the machine better first",
+    search, *others = jax.random.split(key, 4)
+    informed, trials, checks = (
+        jax.random.normal(k, (count, p))
+        for k, count in zip(others, (draws, TRIALS, CHECKED), strict=True)
+    )
+    informed = informed.at[0].set(0.0)
+    nothing = jnp.zeros((experiment.steps, limits.low.size))
+    rough, coarse = _coarser(experiment, signal)
+    improve = _climber(rough, coarse, goal, limits, informed, trials)
+    _checked.compile_for(experiment, limits, nothing, checks)
+    _worth.compile_for(experiment, goal, informed, nothing)
+
+    def one(key: Key) -> Designed:
+        U = signal.commands(improve(key).astype(float), limits)
+        U, states, bad = _kept(experiment, limits, U, checks)
+        worth, scale, middle = _worth(experiment, goal, informed, U)
+        low, high = np.quantile(np.asarray(states), [0.05, 0.95], axis=0)
+        return Designed(
+            np.asarray(U),
+            float(worth),
+            np.asarray(scale),
+            np.asarray(middle),
+            low,
+            high,
+            bad,
+            CHECKED,
         )
-    middle = _states(experiment, U, informed)
-    worth, scale = _worth(experiment, goal, informed, U, middle)
-    low, high = np.quantile(np.asarray(states), [0.05, 0.95], axis=0)
-    return Designed(
-        np.asarray(U),
-        float(worth),
-        np.asarray(scale),
-        np.asarray(middle[0]),
-        low,
-        high,
-        bad,
-        CHECKED,
+
+    found = [one(jax.random.fold_in(search, i)) for i in range(starts)]
+    return max(found, key=lambda f: f.nats if math.isfinite(f.nats) else -math.inf)
+
+
+def _kept(
+    experiment: Experiment, limits: Limits, U: Array, draws: Array
+) -> tuple[Array, Array, float]:
+    """Commands that keep the limits; the draws' states, and the share that leaves."""
+    for _ in range(100):
+        states, beyond = _checked(experiment, limits, U, draws)
+        bad = float(jnp.mean(beyond > 0.0))
+        if bad <= ALLOWED:
+            return U, states, bad
+        U = SMALLER * U
+    raise InputError(
+        "E150",
+        "no commands keep the limits",
+        got=f"{bad:.0%} of {len(draws)} draws leave them however small the commands",
+        expected=f"at most {ALLOWED:.0%}",
+        fix="widen the limits of the states, or know the machine better first",
     )
 
 
@@ -126,77 +158,171 @@ def prediction_rows(
         )
     experiment, limits = jax.tree.map(jnp.asarray, (experiment, limits))
     signal = Multisine(experiment.period, experiment.steps)
-    shape = (signal.coefficients, limits.low.size)
-    U = signal.commands(MILD * jax.random.normal(key, shape), limits)
+    U = signal.commands(MILD * signal.random(key, limits.low.size), limits)
     return _sensitivity(experiment, U, periods)
 
 
-@eqx.filter_jit
-def _search(
+def _coarser(
+    experiment: Experiment, signal: AbstractSignal
+) -> tuple[Experiment, AbstractSignal]:
+    """As long and as telling, with periods of `GRID`: for a search, long enough."""
+    k = math.floor(GRID / experiment.period + 1e-9)
+    k = max(1, min(k, experiment.steps // 2))
+    if k == 1:
+        return experiment, signal
+    period, steps = k * experiment.period, experiment.steps // k
+    coarse = dataclasses.replace(
+        experiment,
+        noise=experiment.noise / math.sqrt(k),
+        period=period,
+        steps=steps,
+        window=min(max(2, round(experiment.window / k)), steps),
+    )
+    return coarse, dataclasses.replace(signal, period=period, steps=steps)
+
+
+def _climber(
+    experiment: Experiment,
+    signal: AbstractSignal,
+    goal: AbstractGoal,
+    limits: Limits,
+    draws: Float[Array, "D p"],
+    trials: Float[Array, "N p"],
+) -> Callable[[Key], Float[Array, "k m"]]:
+    """From a random motion to a better one, in blocks of steps with guards each."""
+    experiment, goal, limits, draws, trials = single(
+        (experiment, goal, limits, draws, trials)
+    )
+    inner, inputs = _narrowed(limits), limits.low.size
+    costs = goal.directions(experiment.belief.scale) * np.geomspace(CHEAP, COST, BLOCKS)
+    total = jnp.asarray(BLOCK * BLOCKS)
+
+    def beyond(C: Array) -> Array:
+        return _checked(experiment, inner, signal.commands(C, limits), trials)[1]
+
+    def block(C: Array, state: Moments, guards: Array, i: int) -> Any:
+        cost, at = jnp.asarray(costs[i], jnp.float32), jnp.asarray(BLOCK * i)
+        about = signal, experiment, goal, limits, draws, guards
+        return *about, cost, C, state, at, total
+
+    nothing = jnp.zeros((signal.coefficients, inputs), jnp.float32)
+    _climb.compile_for(*block(nothing, adam(nothing), trials[:GUARDS], 0))
+
+    def improved(key: Key) -> Array:
+        C = BEGIN * signal.random(key, inputs).astype(jnp.float32)
+        far = beyond(C)
+        for _ in range(30):
+            if jnp.mean(far > 0.0) <= LEAVING:
+                break
+            C = 0.8 * C
+            far = beyond(C)
+        state = adam(C)
+        for i in range(BLOCKS):
+            # Of a machine that is lost no gradient can be had.
+            near = jnp.where(jnp.isfinite(far), far, -jnp.inf)
+            guards = trials[jnp.argsort(-near)[:GUARDS]]
+            moved, after = _climb(*block(C, state, guards, i))
+            then = beyond(moved)
+            # Over the top there is no way back: the next block, at a higher cost,
+            # begins where this one did.
+            if jnp.mean(then < LOST) > 1.0 - LEAVING:
+                C, state, far = moved, after, then
+            else:
+                state = adam(C)
+        return C
+
+    return improved
+
+
+@ahead
+def _climb(
     signal: AbstractSignal,
     experiment: Experiment,
     goal: AbstractGoal,
     limits: Limits,
     draws: Float[Array, "D p"],
     guards: Float[Array, "G p"],
-    key: Key,
-) -> Float[Array, "k m"]:
-    rule = ICEM(samples=SAMPLES, elites=ELITES, finest=0.05)
-    inner = eqx.tree_at(
-        lambda l: (l.state_low, l.state_high), limits, _narrowed(limits)
+    cost: Array,
+    C: Float[Array, "k m"],
+    state: Moments,
+    first: Array,
+    total: Array,
+) -> tuple[Float[Array, "k m"], Moments]:
+    """Steps of Adam on the worth at one draw after the other, less what guards pay."""
+    beyond = _beyond_of(experiment, _narrowed(limits))
+
+    def loss(C: Float[Array, "k m"], z: Float[Array, " p"]) -> Array:
+        U = signal.commands(C, limits)
+        states = _states(experiment, U, jnp.concatenate([z[None], guards]))
+        worth, _ = _worth_at(experiment, goal, z, U, states[0])
+        return cost * beyond(states[1:]) - worth
+
+    def slope(C: Float[Array, "k m"], i: Array, key: Key) -> Array:
+        # Only its direction: a plan that is far out for once is not to set the pace.
+        g = jax.grad(loss)(C, draws[i % len(draws)])
+        return g / (jnp.linalg.norm(g) + 1e-12)
+
+    key = jax.random.key(0)
+    return descend(
+        slope, C, state, RATE, steps=BLOCK, start=first, total=total, key=key
     )
 
-    def flown(U: Array) -> tuple[Array, Array]:
-        states = _states(experiment, U, jnp.concatenate([draws, guards]))
-        beyond = jax.vmap(lambda S: excess(inner, S))(states[len(draws) :])
-        return states[: len(draws)], jnp.mean(beyond)
 
-    def evaluate(C: Float[Array, "N k m"]) -> tuple[Array, Array]:
-        # Trajectories are long and narrow, so all candidates' at once; the windows of
-        # one candidate fill the machine by themselves.
-        U = jax.vmap(lambda c: signal.commands(c, limits))(C)
-        states, beyond = jax.vmap(flown)(U)
-        worth = jax.lax.map(
-            lambda x: _mean_worth(experiment, goal, draws, *x)[0], (U, states)
-        )
-        returns = worth - COST * beyond
-        return returns, jnp.isfinite(returns)
+def _beyond_of(experiment: Experiment, limits: Limits) -> Callable[[Array], Array]:
+    """How far machines leave the limits in all of their turns, on average."""
+    turn = min(max(1, round(TURN / experiment.period)), experiment.steps)
+    turns = experiment.steps // turn
 
-    plan = rule.init(signal.coefficients, limits.low.size, draws.dtype)
-    plan = rule.search(plan, evaluate, rounds=ROUNDS, colour=1.0, key=key)
-    return plan.elites[0]
+    def one(states: Float[Array, "times n"]) -> Array:
+        S = states[: turns * turn].reshape(turns, turn, -1)
+        worst = jax.vmap(lambda S: excess(limits, S))(S)
+        return jnp.sum(jnp.maximum(worst, 0.0))
+
+    return lambda states: jnp.mean(jax.vmap(one)(states))
 
 
-def _narrowed(limits: Limits) -> tuple[Array, Array]:
-    low, high = jnp.asarray(limits.state_low), jnp.asarray(limits.state_high)
+def _narrowed(limits: Limits) -> Limits:
+    low, high = limits.state_low, limits.state_high
     off = 0.5 * MARGIN * jnp.where(jnp.isfinite(high - low), high - low, 0.0)
-    return low + off, high - off
+    box = low + off, high - off
+    return eqx.tree_at(lambda l: (l.state_low, l.state_high), limits, box)
 
 
-def _mean_worth(
-    experiment: Experiment, goal: AbstractGoal, draws: Array, U: Array, states: Array
+def _worth_at(
+    experiment: Experiment, goal: AbstractGoal, z: Array, U: Array, states: Array
 ) -> tuple[Array, Array]:
-    """Nats of the goal over the draws, and the scale after, at the first of them."""
-    A = jax.vmap(lambda z, S: information(experiment, z, U, S))(draws, states)
-    scales = jax.vmap(lambda a: after(experiment.belief, a))(A)
-    nats = jax.vmap(lambda s: goal.nats(experiment.belief.scale, s))(scales)
-    return jnp.mean(nats), scales[0]
+    """Nats of the goal at one machine, and the scale of the belief after it."""
+    scale = after(experiment.belief, information(experiment, z, U, states))
+    return goal.nats(experiment.belief.scale, scale), scale
 
 
-_worth = eqx.filter_jit(_mean_worth)
-_sensitivity = eqx.filter_jit(sensitivity_at)
+@ahead
+def _worth(
+    experiment: Experiment, goal: AbstractGoal, draws: Array, U: Array
+) -> tuple[Array, Array, Array]:
+    """The mean over draws; scale and states at the first of them."""
+
+    def one(z: Array) -> tuple[Array, Array, Array]:
+        states = trajectory(experiment, z, U)
+        return *_worth_at(experiment, goal, z, U, states), states
+
+    nats, scales, states = jax.lax.map(one, draws)
+    return jnp.mean(nats), scales[0], states[0]
 
 
-@eqx.filter_jit
 def _states(experiment: Experiment, U: Array, draws: Array) -> Array:
     """Of every drawn machine."""
     return jax.vmap(lambda z: trajectory(experiment, z, U))(draws)
 
 
-@eqx.filter_jit
+_sensitivity = eqx.filter_jit(sensitivity_at)
+
+
+@ahead
 def _checked(
     experiment: Experiment, limits: Limits, U: Array, draws: Array
 ) -> tuple[Array, Array]:
-    """Of every drawn machine, and whether it leaves the limits or is lost."""
+    """Of every drawn machine, and how far it leaves the limits; infinite when lost."""
     states = _states(experiment, U, draws)
-    return states, ~(jax.vmap(lambda S: excess(limits, S))(states) <= 0.0)
+    beyond = jax.vmap(lambda S: excess(limits, S))(states)
+    return states, jnp.where(jnp.isfinite(beyond), beyond, jnp.inf)

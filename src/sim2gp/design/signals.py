@@ -7,15 +7,18 @@ free signal has a knot every tenth of a second and is a straight line between th
 from abc import abstractmethod
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from sim2gp.design.limits import Limits, kept
 from sim2gp.planning.mpc import from_unit
-from sim2gp.types import Box
+from sim2gp.planning.noise import coloured_noise
+from sim2gp.types import Box, Key
 
 FADE = 0.25  # s, in which a multisine comes and goes
+COLOUR = 1.0  # of free random motions: power falls as one over frequency
 
 
 class AbstractSignal(eqx.Module):
@@ -32,6 +35,10 @@ class AbstractSignal(eqx.Module):
     @abstractmethod
     def commands(self, C: Float[Array, "k m"], limits: Limits) -> Float[Array, "T m"]:
         """Within the limits of value and rate, exactly."""
+
+    @abstractmethod
+    def random(self, key: Key, inputs: int) -> Float[Array, "k m"]:
+        """Coefficients of a motion like any other, of sd 1: a search begins there."""
 
 
 class Multisine(AbstractSignal):
@@ -59,6 +66,9 @@ class Multisine(AbstractSignal):
         # The last digits: a product may round up.
         return kept(limits, U / jnp.maximum(share, 1.0)[None], self.period)
 
+    def random(self, key: Key, inputs: int) -> Float[Array, "k m"]:
+        return jax.random.normal(key, (self.coefficients, inputs))
+
 
 class Free(AbstractSignal):
     """Straight lines between knots ``spacing`` seconds apart."""
@@ -76,3 +86,7 @@ class Free(AbstractSignal):
         line = (1.0 - share) * C[left] + share * C[left + 1]
         box = Box(jnp.asarray(limits.low), jnp.asarray(limits.high))
         return kept(limits, from_unit(line, box), self.period)
+
+    def random(self, key: Key, inputs: int) -> Float[Array, "k m"]:
+        none = jnp.zeros((self.coefficients, inputs))
+        return coloured_noise(key, 1, none, COLOUR)[0]

@@ -64,6 +64,7 @@ class Asked:
     rates: Mapping[str, float]
     start: Mapping[str, float]
     period: float | None
+    starts: int = 1
 
     def words(self) -> str:
         """As they were typed."""
@@ -79,6 +80,7 @@ class Asked:
         ):
             parts += [f"{option} {' '.join(pairs)}"] if pairs else []
         parts += [f"--period {self.period:g}"] if self.period else []
+        parts += [f"--starts {self.starts}"]
         return " ".join(parts)
 
 
@@ -108,7 +110,7 @@ def run(
         signal = signal_of(asked.kind, experiment)
         goal = goal_of(asked, experiment, limits, jax.random.fold_in(key, 1))
         task.advance("limits and goal")
-        found = design(experiment, goal, limits, signal, key=key)
+        found = design(experiment, goal, limits, signal, key=key, starts=asked.starts)
         task.advance(f"{found.nats:.1f} nats")
         summary = _summarise(source, asked, experiment, found, seed)
         summary["warnings"] = notes
