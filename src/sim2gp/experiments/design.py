@@ -116,7 +116,7 @@ def run(
         summary["warnings"] = notes
         line = f"sim2gp design {source} {asked.words()} --seed {seed}"
         summary |= provenance(line, started)
-        arrays = _arrays(experiment, found)
+        arrays = _arrays(experiment, limits, found)
         from sim2gp.report import write_report
 
         writer.write_summary(summary)
@@ -312,7 +312,9 @@ def _table(expected: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _arrays(experiment: Experiment, found: Designed) -> dict[str, np.ndarray]:
+def _arrays(
+    experiment: Experiment, limits: Limits, found: Designed
+) -> dict[str, np.ndarray]:
     system = experiment.system
     arrays = {
         "design/time": experiment.period * np.arange(experiment.steps + 1),
@@ -321,6 +323,7 @@ def _arrays(experiment: Experiment, found: Designed) -> dict[str, np.ndarray]:
     }
     for i, channel in enumerate(system.actions):
         arrays[f"design/command/{channel.name}"] = found.commands[:, i]
+        arrays[f"design/limit/{channel.name}"] = _pair(limits.low, limits.high, i)
     for i, channel in enumerate(system.physical_states):
         for name, values in (
             ("state", found.states),
@@ -328,7 +331,13 @@ def _arrays(experiment: Experiment, found: Designed) -> dict[str, np.ndarray]:
             ("high", found.high),
         ):
             arrays[f"design/{name}/{channel.name}"] = values[:, i]
+        box = _pair(limits.state_low, limits.state_high, i)
+        arrays[f"design/limit/{channel.name}"] = box
     return arrays
+
+
+def _pair(low: np.ndarray, high: np.ndarray, i: int) -> np.ndarray:
+    return np.asarray([low[i], high[i]], float)
 
 
 def as_csv(experiment: Experiment, found: Designed) -> str:

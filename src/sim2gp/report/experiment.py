@@ -10,6 +10,7 @@ from sim2gp.report.markup import Raw, cards, paragraph, section
 from sim2gp.report.parameters import Arrays, Summary
 
 _SIZE = 420.0, 190.0
+NEAR = 0.5  # of a chart's height: limits no farther from the motion are drawn
 
 
 def experiment(summary: Summary, arrays: Arrays) -> Raw:
@@ -18,19 +19,17 @@ def experiment(summary: Summary, arrays: Arrays) -> Raw:
         return Raw("")
     t = np.asarray(arrays["design/time"], float)
     units: Mapping[str, Any] = summary.get("units") or {}
+
+    def drawn(name: str, t: np.ndarray, *kinds: str) -> str:
+        values = [np.asarray(arrays[f"design/{kind}/{name}"]) for kind in kinds]
+        box = np.asarray(arrays.get(f"design/limit/{name}", ()))
+        return _chart(name, str(units.get(name, "")), t, values, box)
+
     commands = [
-        _chart(name, units, t[:-1], np.asarray(arrays[f"design/command/{name}"]))
-        for name in _names(arrays, "design/command/")
+        drawn(name, t[:-1], "command") for name in _names(arrays, "design/command/")
     ]
     states = [
-        _chart(
-            name,
-            units,
-            t,
-            np.asarray(arrays[f"design/state/{name}"]),
-            np.asarray(arrays[f"design/low/{name}"]),
-            np.asarray(arrays[f"design/high/{name}"]),
-        )
+        drawn(name, t, "state", "low", "high")
         for name in _names(arrays, "design/state/")
     ]
     share = summary.get("violations")
@@ -49,7 +48,10 @@ def experiment(summary: Summary, arrays: Arrays) -> Raw:
         cards(commands, "wide"),
         Raw("<h3>Expected motion</h3>\n"),
         cards(states, "wide"),
-        paragraph("Shades hold nine in ten of the machines drawn.", "soft"),
+        paragraph(
+            "Shades hold nine in ten of the machines drawn; level lines are limits.",
+            "soft",
+        ),
     )
 
 
@@ -58,19 +60,17 @@ def _names(arrays: Arrays, prefix: str) -> list[str]:
 
 
 def _chart(
-    name: str,
-    units: Mapping[str, Any],
-    t: np.ndarray,
-    middle: np.ndarray,
-    low: np.ndarray | None = None,
-    high: np.ndarray | None = None,
+    name: str, unit: str, t: np.ndarray, values: list[np.ndarray], box: np.ndarray
 ) -> str:
-    edges = [x for x in (low, high) if x is not None]
+    """A line, or one with its band; limits that it comes near to are drawn."""
+    low, high = svg.span(*values)
+    reach = NEAR * (high - low)
+    near = box[(box > low - reach) & (box < high + reach)]
     axes = svg.Axes(
-        (float(t[0]), float(t[-1])), svg.span(middle, *edges), *_SIZE, x_label="s"
+        (float(t[0]), float(t[-1])), svg.span(*values, near), *_SIZE, x_label="s"
     )
-    marks = []
-    if low is not None and high is not None:
-        marks.append(svg.band(axes, t, low, high, "c1"))
-    marks.append(svg.line(axes, t, middle, "c1"))
-    return svg.chart(axes, marks, title=name, unit=str(units.get(name, "")))
+    marks = [svg.level(axes, float(x), "quiet", "limit") for x in near]
+    if len(values) == 3:
+        marks.append(svg.band(axes, t, values[1], values[2], "c1"))
+    marks.append(svg.line(axes, t, values[0], "c1"))
+    return svg.chart(axes, marks, title=name, unit=unit)
