@@ -60,6 +60,7 @@ def test_before_any_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     page = (out / "report.html").read_text()
     assert "The experiment" in page
     assert "expected.theta" not in page
+    assert ">limit<" in page
 
 
 def test_after_a_fit(run: Path, tmp_path: Path, capsys) -> None:

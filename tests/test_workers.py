@@ -1,6 +1,11 @@
 """Studies on several processes: every job once, groups stay together, faults speak."""
 
 import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -69,3 +74,52 @@ def test_a_process_that_dies_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
         Sim2GPError, match="E208 a worker process died: got exit code 3"
     ):
         list(spread(square, [[14], [1]], 2))
+
+
+def lingering(path: str) -> None:
+    """Says which process it is, and does not end by itself."""
+    Path(path).write_text(str(os.getpid()))
+    time.sleep(120.0)
+
+
+STUDY = """
+import sys
+from test_workers import lingering
+from sim2gp.runs.workers import spread
+
+if __name__ == "__main__":
+    list(spread(lingering, [[name] for name in sys.argv[1:]], 2))
+"""
+
+
+def test_workers_end_with_a_process_that_is_killed(tmp_path: Path) -> None:
+    (tmp_path / "study.py").write_text(STUDY)
+    files = [tmp_path / "one", tmp_path / "two"]
+    path = os.pathsep.join(
+        [str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]
+    )
+    study = subprocess.Popen(
+        [sys.executable, str(tmp_path / "study.py"), *map(str, files)],
+        env=os.environ | {"PYTHONPATH": path},
+    )
+
+    def within(seconds: float, done: Callable[[], bool]) -> bool:
+        end = time.monotonic() + seconds
+        while not done() and time.monotonic() < end:
+            time.sleep(0.1)
+        return done()
+
+    assert within(100.0, lambda: all(f.exists() and f.read_text() for f in files))
+    workers = [int(f.read_text()) for f in files]
+    study.kill()
+    study.wait()
+    assert within(20.0, lambda: not any(map(alive, workers)))
+
+
+def alive(number: int) -> bool:
+    try:
+        os.kill(number, 0)
+    except ProcessLookupError:
+        return False
+    status = Path(f"/proc/{number}/status")
+    return not status.exists() or "State:\tZ" not in status.read_text()

@@ -8,6 +8,7 @@ can: two that share two cores by threads are slower than two that own one each.
 import multiprocessing
 import os
 import queue
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from itertools import chain, cycle
 from typing import Any, TypeVar
@@ -116,7 +117,8 @@ def _next(results: Any, processes: Sequence[Any]) -> Any:
 
 
 def _serve(work: Callable[[Any], Any], jobs: Any, results: Any) -> None:
-    """One process: take groups until there are none."""
+    """One process: take groups until there are none, or nobody is left to take them."""
+    threading.Thread(target=_follow, daemon=True).start()
     for first, group in iter(jobs.get, None):
         for number, job in enumerate(group, first):
             try:
@@ -125,3 +127,14 @@ def _serve(work: Callable[[Any], Any], jobs: Any, results: Any) -> None:
                 fields = {name: str(value) for name, value in vars(error).items()}
                 results.put((number, None, (type(error).__name__, fields)))
                 return
+
+
+def _follow() -> None:
+    """End with the process that started this one, whatever ended that.
+
+    Killed outright it stops no worker, and they would fly the whole study for nobody.
+    """
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
