@@ -35,6 +35,7 @@ class Experiment(eqx.Module):
     start: the state that the machine is in when it begins.
     start_sd: how uncertain the start of every window is, before its samples.
     period: of commands and samples, s; ``window`` periods make a window.
+    substep: of the integration at most, s.
     """
 
     system: AbstractSystem
@@ -46,11 +47,12 @@ class Experiment(eqx.Module):
     period: float = eqx.field(static=True)
     steps: int = eqx.field(static=True)
     window: int = eqx.field(static=True)
+    substep: float = eqx.field(static=True, default=MAX_SUBSTEP)
 
     @property
     def substeps(self) -> int:
         """Of the integration, in a period."""
-        return max(1, math.ceil(self.period / MAX_SUBSTEP - TOLERANCE))
+        return max(1, math.ceil(self.period / self.substep - TOLERANCE))
 
     def record(self, z: Float[Array, " p"]) -> Any:
         """Constants, at so many sd of the belief."""

@@ -29,17 +29,17 @@ from sim2gp.design.experiment import (
 from sim2gp.design.goals import AbstractGoal
 from sim2gp.design.limits import Limits, excess
 from sim2gp.design.signals import AbstractSignal, Multisine
-from sim2gp.errors import InputError
+from sim2gp.errors import InputError, NotFinite
 from sim2gp.models.features import Moments, adam, descend
 from sim2gp.types import Key, in_float64, single
 
-GRID = 0.01  # s, the shortest period that a search looks at
+GRID, SUBSTEP = 0.01, 0.0025  # s, the shortest period and substep that a search sees
 BLOCK, BLOCKS, RATE = 15, 5, 0.015  # of Adam's steps along the gradient
 STARTS = 1  # random motions
 BEGIN, LEAVING = 0.1, 0.2  # their coefficients' sd, less where more trials leave limits
 DRAWS = 4  # of the constants, that information is averaged over, its mean first
 TRIALS = 300  # of them, that must keep the limits while searching
-GUARDS = 32  # of those, the nearest to the limits, that a block of steps looks at
+GUARDS = 24  # of those, the nearest to the limits, that a block of steps looks at
 MARGIN = 0.05  # of a box's half, kept free while searching
 TURN = 0.25  # s, in which a motion leaves its limits about once
 LOST = 0.3  # halves of the box: so far outside, a plan is given up
@@ -117,7 +117,15 @@ def design(
         )
 
     found = [one(jax.random.fold_in(search, i)) for i in range(starts)]
-    return max(found, key=lambda f: f.nats if math.isfinite(f.nats) else -math.inf)
+    best = max(found, key=lambda f: f.nats if math.isfinite(f.nats) else -math.inf)
+    if not math.isfinite(best.nats):
+        raise NotFinite(
+            "E203",
+            "information of the experiment",
+            got=best.nats,
+            fix="narrow the limits of the states: the simulation is lost within them",
+        )
+    return best
 
 
 def _kept(
@@ -168,8 +176,6 @@ def _coarser(
     """As long and as telling, with periods of `GRID`: for a search, long enough."""
     k = math.floor(GRID / experiment.period + 1e-9)
     k = max(1, min(k, experiment.steps // 2))
-    if k == 1:
-        return experiment, signal
     period, steps = k * experiment.period, experiment.steps // k
     coarse = dataclasses.replace(
         experiment,
@@ -177,6 +183,7 @@ def _coarser(
         period=period,
         steps=steps,
         window=min(max(2, round(experiment.window / k)), steps),
+        substep=SUBSTEP,
     )
     return coarse, dataclasses.replace(signal, period=period, steps=steps)
 
