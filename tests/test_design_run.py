@@ -10,7 +10,7 @@ import pytest
 
 from sim2gp.cli import main
 from sim2gp.design import Everything, Limits, Named, search
-from sim2gp.experiments.design import Asked, goal_of, setting, verdict
+from sim2gp.experiments.design import Asked, foretold, goal_of, setting, verdict
 from sim2gp.runs import load_run
 from test_identify import folder, project_in, run
 
@@ -69,6 +69,10 @@ def test_after_a_fit(run: Path, tmp_path: Path, capsys) -> None:
     assert main([*words, "--kind", "free", "--predict", "0.2", "--json"]) == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["period"] == 0.002  # the logs'
+    ahead = summary["prediction_sd"]
+    gain = np.log(ahead["before"] / ahead["after"])
+    assert gain == pytest.approx(summary["information_nats"], rel=0.2)
+    assert "0.2 s ahead" in summary["headline"]
     fit = load_run(run).summary["parameters"]
     for name, entry in summary["expected_sd"].items():
         assert entry["sd"] == pytest.approx(fit[name]["sd"], rel=1e-6)
@@ -133,6 +137,8 @@ def entry(mean: float, sd: float, left: float) -> dict[str, float]:
         ({"m": entry(2.0, 0.2, 0.5)}, 3.0, True, "m, known within 10 % now"),
         ({"m": entry(2.0, 0.02, 0.5)}, 3.0, False, "m known within 2 % already"),
         ({"m": entry(2.0, 0.2, 0.999)}, 0.001, False, "nothing narrows m"),
+        # Little of many constants adds up to nats, and to no reason.
+        ({n: entry(2.0, 0.2, 0.97) for n in "abc"}, 0.1, False, "narrows a, b and c"),
         # What no such experiment narrows is no reason to run it, but it is said.
         (
             {"m": entry(2.0, 0.02, 0.5), "I": entry(1.0, 0.5, 1.0)},
@@ -144,5 +150,20 @@ def entry(mean: float, sd: float, left: float) -> dict[str, float]:
 )
 def test_when_to_stop(expected, nats, worth, words) -> None:
     found, text = verdict(ASKED, expected, nats)
+    assert found is worth
+    assert words in text
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "worth", "words"),
+    [
+        (8.0, 2.0, True, "0.5 s ahead, known within 8 sd of the sensors' noise now"),
+        (0.9, 0.1, False, "known within 0.9 sd of the sensors' noise already"),
+        (8.0, 7.9, False, "nothing narrows what is predicted 0.5 s ahead"),
+    ],
+)
+def test_when_a_prediction_is_good_enough(before, after, worth, words) -> None:
+    asked = dataclasses.replace(ASKED, predict=0.5)
+    found, text = foretold(asked, before, after, 1.4)
     assert found is worth
     assert words in text

@@ -64,7 +64,11 @@ class Prediction(AbstractGoal):
     rows: Float[Array, "k p"]
 
     def uncertainty(self, scale: Scale) -> Scalar:
-        return 0.5 * jnp.log(jnp.mean(jnp.sum((self.rows @ scale) ** 2, axis=1)))
+        return jnp.log(self.deviation(scale))
+
+    def deviation(self, scale: Scale) -> Scalar:
+        """Root mean square of the predictions' sd."""
+        return jnp.sqrt(jnp.mean(jnp.sum((self.rows @ scale) ** 2, axis=1)))
 
     def directions(self, scale: Scale) -> int:
         return 1

@@ -112,7 +112,7 @@ def run(
         task.advance("limits and goal")
         found = design(experiment, goal, limits, signal, key=key, starts=asked.starts)
         task.advance(f"{found.nats:.1f} nats")
-        summary = _summarise(source, asked, experiment, found, seed)
+        summary = _summarise(source, asked, experiment, goal, found, seed)
         summary["warnings"] = notes
         line = f"sim2gp design {source} {asked.words()} --seed {seed}"
         summary |= provenance(line, started)
@@ -239,10 +239,24 @@ def expectation(experiment: Experiment, found: Designed) -> dict[str, dict[str, 
 
 @in_float64
 def _summarise(
-    source: Path, asked: Asked, experiment: Experiment, found: Designed, seed: int
+    source: Path,
+    asked: Asked,
+    experiment: Experiment,
+    goal: AbstractGoal,
+    found: Designed,
+    seed: int,
 ) -> dict[str, Any]:
     expected = expectation(experiment, found)
-    worth, reason = verdict(asked, expected, found.nats)
+    ahead: dict[str, float] = {}
+    if not isinstance(goal, Prediction):
+        worth, reason = verdict(asked, expected, found.nats)
+    else:
+        before, after = experiment.belief.scale, jnp.asarray(found.scale)
+        ahead = {
+            "before": float(goal.deviation(before)),
+            "after": float(goal.deviation(after)),
+        }
+        worth, reason = foretold(asked, ahead["before"], ahead["after"], found.nats)
     return {
         "command": "design",
         "title": f"{source.stem}: the next experiment",
@@ -254,6 +268,7 @@ def _summarise(
         "information_nats": found.nats,
         "worth_running": worth,
         "expected_sd": expected,
+        "prediction_sd": ahead,
         "violations": found.violations,
         "draws_checked": found.checked,
         "units": units(experiment.system),
@@ -270,7 +285,7 @@ def verdict(
     """
     names = asked.about or tuple(expected)
     told = [n for n in names if expected[n]["of_before"] <= 1.0 - NARROWER]
-    if not told and nats < NARROWER:
+    if not told:
         return False, (
             "Not worth running: within these limits nothing narrows "
             f"{listed(names)} by more than {100.0 * NARROWER:.0f} %."
@@ -279,18 +294,38 @@ def verdict(
     poor = [n for n in told if share[n] > asked.within]
     untold = [n for n in names if n not in told]
     rest = f" It tells next to nothing of {listed(untold)}." if untold else ""
-    if not poor and not asked.predict:
+    if not poor:
         return False, (
             f"Not worth running: {listed(told)} known within {asked.within:g} % "
             f"already.{rest}"
         )
-    text = f"Worth running: {nats:.1f} nats."
-    if poor:
-        worst = max(poor, key=lambda n: share[n])
-        after = share[worst] * expected[worst]["of_before"]
-        text += f" {worst}, known within {digits(share[worst], 2)} % now, should be"
-        text += f" within {digits(after, 2)} % after."
-    return True, text + rest
+    worst = max(poor, key=lambda n: share[n])
+    after = share[worst] * expected[worst]["of_before"]
+    text = f"Worth running: {nats:.1f} nats. {worst}, known within"
+    text += f" {digits(share[worst], 2)} % now, should be within {digits(after, 2)} %"
+    return True, f"{text} after.{rest}"
+
+
+def foretold(
+    asked: Asked, before: float, after: float, nats: float
+) -> tuple[bool, str]:
+    """The same of a prediction, its sd in those of the sensors' noise.
+
+    Nobody can see that it is better than the sensors.
+    """
+    what = f"what is predicted {asked.predict:g} s ahead"
+    now = f"{digits(before, 2)} sd of the sensors' noise"
+    if before <= 1.0:
+        return False, f"Not worth running: {what} is known within {now} already."
+    if after > (1.0 - NARROWER) * before:
+        return False, (
+            f"Not worth running: within these limits nothing narrows {what} by more "
+            f"than {100.0 * NARROWER:.0f} %; it is known within {now}."
+        )
+    return True, (
+        f"Worth running: {nats:.1f} nats; {what}, known within {now} now, should be "
+        f"within {digits(after, 2)} after."
+    )
 
 
 def _table(expected: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
