@@ -65,7 +65,8 @@ OF_RANDOM, OF_MULTISINE, CALIBRATED = 0.5, 0.9, (0.8, 1.25)
 #: Mean square of the commands, each in its own limit, of every experiment.
 ENERGY = 0.007
 TRIES = 30  # random inputs, for one that keeps the limits
-STARTS = 3  # random motions that a search improves, the multisine's too
+STARTS = 4  # random motions that a search improves, the multisine's too
+DESIGNS = 4  # of each kind, by searches of their own; arms take them in turn
 HELD, AHEAD = 500, 100  # periods of the held-out motion, and of a prediction in it
 
 
@@ -132,7 +133,7 @@ def energy(U: Any, limits: Limits) -> Any:
 
 @in_float64
 def commands(method: str, seed: int, seconds: float) -> np.ndarray:
-    """What is flown on every arm, or a random input of its own for each."""
+    """A design of that seed; of random input, what an arm of that seed is given."""
     experiment, limits = setting(seconds)
     steps, key = experiment.steps, jax.random.key(seed)
     sine = Powered(PERIOD, steps, Multisine(PERIOD, steps), ENERGY)
@@ -265,13 +266,15 @@ def _expected(experiment: Experiment, z: Any, U: Any) -> Any:
 
 def work(job: Job) -> dict[str, Any]:
     """One method on its arms."""
-    path = job.out / f"{job.method.replace(' ', '_')}_{job.seconds:g}.npy"
+    which = job.seed % DESIGNS
+    name = f"{job.method.replace(' ', '_')}_{job.seconds:g}_{which}.npy"
+    path = job.out / name
     if job.method == "random":
         U = commands(job.method, job.seed, job.seconds)
     else:
         if not path.exists():
             path.parent.mkdir(parents=True, exist_ok=True)
-            np.save(path, commands(job.method, 0, job.seconds))
+            np.save(path, commands(job.method, which, job.seconds))
         U = np.load(path)
     return learned(job.seed, U)
 
