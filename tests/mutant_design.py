@@ -49,8 +49,8 @@ DESIGN = (
     Mutant(
         "goal: sd in place of variance",
         GOALS,
-        "return 0.5 * jnp.log(jnp.mean(",
-        "return 1.0 * jnp.log(jnp.mean(",
+        "return jnp.sqrt(jnp.mean(jnp.sum(",
+        "return (jnp.mean(jnp.sum(",
         GOAL,
     ),
     Mutant(

@@ -8,6 +8,7 @@ can: two that share two cores by threads are slower than two that own one each.
 import multiprocessing
 import os
 import queue
+import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from itertools import chain, cycle
@@ -137,4 +138,4 @@ def _follow() -> None:
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
-        os._exit(1)
+        os.kill(os.getpid(), signal.SIGTERM)  # as `spread` ends them itself
