@@ -13,6 +13,7 @@ the constants, those of a held-out motion, the posterior's volume, and the predi
 import argparse
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -266,17 +267,21 @@ def _expected(experiment: Experiment, z: Any, U: Any) -> Any:
 
 def work(job: Job) -> dict[str, Any]:
     """One method on its arms."""
+    if job.method == "random":
+        return learned(job.seed, commands(job.method, job.seed, job.seconds))
     which = job.seed % DESIGNS
     name = f"{job.method.replace(' ', '_')}_{job.seconds:g}_{which}.npy"
-    path = job.out / name
-    if job.method == "random":
-        U = commands(job.method, job.seed, job.seconds)
-    else:
-        if not path.exists():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            np.save(path, commands(job.method, which, job.seconds))
-        U = np.load(path)
+    U = stored(job.out / name, lambda: commands(job.method, which, job.seconds))
     return learned(job.seed, U)
+
+
+def stored(path: Path, make: Callable[[], np.ndarray]) -> np.ndarray:
+    """Commands from the disk, made where they are not there yet."""
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.save(path, make())
+    found: np.ndarray = np.load(path)
+    return found
 
 
 def main() -> None:

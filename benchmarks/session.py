@@ -29,6 +29,7 @@ from design import (
     motion_error,
     recorded,
     setting,
+    stored,
 )
 
 from sim2gp.design import Everything, Free, Multisine, design
@@ -76,17 +77,14 @@ def session(seed: int, rounds: int) -> dict[str, Any]:
 
 
 @in_float64
-def tuned(path: Path) -> np.ndarray:
-    """The multisine, from the disk where it is."""
-    if not path.exists():
-        experiment, limits = setting(SECONDS)
-        signal, key = Multisine(PERIOD, experiment.steps), jax.random.key(0)
-        found = design(
-            experiment, Everything(), limits, signal, key=key, draws=1, starts=STARTS
-        )
-        path.parent.mkdir(parents=True, exist_ok=True)
-        np.save(path, found.commands)
-    return np.load(path)
+def tuned() -> np.ndarray:
+    """The multisine, optimised for the middle of the prior."""
+    experiment, limits = setting(SECONDS)
+    signal, key = Multisine(PERIOD, experiment.steps), jax.random.key(0)
+    found = design(
+        experiment, Everything(), limits, signal, key=key, draws=1, starts=STARTS
+    )
+    return found.commands
 
 
 @in_float64
@@ -101,7 +99,7 @@ def repeated(seed: int, rounds: int, U: np.ndarray) -> list[float]:
 
 def work(job: Job) -> dict[str, Any]:
     """Both on one arm; from the disk if they were flown."""
-    U = tuned(job.out.with_suffix(".cells") / "multisine.npy")
+    U = stored(job.out.with_suffix(".cells") / "multisine.npy", tuned)
     cells, name = Cells(job.out), f"arm{job.seed}"
     told = {"rounds": job.rounds, "noise": NOISE, "limits": LIMITS, "rates": RATES}
     found = cells.load(name, told)
@@ -128,7 +126,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=cores())
     parser.add_argument("--out", type=Path, default=Path("results/session"))
     options = parser.parse_args()
-    tuned(options.out.with_suffix(".cells") / "multisine.npy")
+    stored(options.out.with_suffix(".cells") / "multisine.npy", tuned)
     jobs = [Job(seed, options.rounds, options.out) for seed in range(options.truths)]
     groups = [jobs[i :: options.workers] for i in range(options.workers)]
     rows: list[Any] = [None] * len(jobs)
