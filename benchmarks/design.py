@@ -1,6 +1,7 @@
 """Designed experiments beside what one would run otherwise, on arms with friction.
 
-    python benchmarks/design.py [--truths N] [--seconds S] [--workers N] [--out DIR]
+    python benchmarks/design.py [--truths N] [--recordings N] [--seconds S]
+        [--workers N] [--out DIR]
 
 Hidden two-link arms are drawn from CAD priors. Each is excited for S seconds within the
 same limits of torque, torque rate, position and velocity and with the same energy: by
@@ -36,6 +37,7 @@ from sim2gp.design import (
     trajectory,
 )
 from sim2gp.design.limits import excess
+from sim2gp.experiments.claims import of_median
 from sim2gp.gaussian import Gaussian
 from sim2gp.logs import Log
 from sim2gp.models.cutting import cut
@@ -75,6 +77,7 @@ class Job(NamedTuple):
     method: str
     seed: int
     seconds: float
+    recordings: int
     out: Path
 
 
@@ -237,20 +240,33 @@ def motion_error(belief: Gaussian, seed: int) -> float:
 
 
 @in_float64
-def learned(seed: int, U: np.ndarray) -> dict[str, Any]:
-    """Fly on the seed's arm, fit, and compare with the truth."""
+def learned(seed: int, U: np.ndarray, recordings: int) -> dict[str, Any]:
+    """Fly on the seed's arm, fit each recording of it, and compare with the truth.
+
+    An arm's error is the root mean square over its recordings: that of a single one is
+    mostly the luck of whichever constant is known least.
+    """
     experiment, limits = setting(len(U) * PERIOD)
     prior, z = experiment.belief, truth(seed)
-    log, states = recorded(seed, 0, U)
-    belief = fitted([log], seed)
-    away = np.asarray(belief.mean - prior.mean - prior.scale @ z)
     predicted = np.asarray(_expected(experiment, z, jnp.asarray(U)))
+    away, sd, motion, volume = [], [], [], []
+    for run in range(recordings):
+        log, states = recorded(seed, run, U)
+        belief = fitted([log], seed)
+        away.append(np.asarray(belief.mean - prior.mean - prior.scale @ z))
+        sd.append(np.asarray(belief.sd()))
+        motion.append(motion_error(belief, seed))
+        volume.append(np.linalg.slogdet(np.asarray(belief.scale))[1])
+    errors = np.asarray(away)
+    each = np.sqrt(np.mean((errors / np.asarray(prior.sd())) ** 2, axis=1))
     return {
-        "constants": float(np.sqrt(np.mean((away / np.asarray(prior.sd())) ** 2))),
-        "motion": motion_error(belief, seed),
-        "log_volume": float(np.linalg.slogdet(np.asarray(belief.scale))[1]),
-        "z": (away / np.asarray(belief.sd())).tolist(),
-        "z_expected": (away / predicted).tolist(),
+        "constants": float(np.sqrt(np.mean(each**2))),
+        "motion": float(np.sqrt(np.mean(np.square(motion)))),
+        "constants_of_each": each.tolist(),
+        "motion_of_each": motion,
+        "log_volume": float(np.mean(volume)),
+        "z": (errors / np.asarray(sd)).tolist(),
+        "z_expected": (errors / predicted).tolist(),
         "energy": float(energy(U, limits)),
         "beyond": float(excess(limits, jnp.asarray(states))),
     }
@@ -268,11 +284,12 @@ def _expected(experiment: Experiment, z: Any, U: Any) -> Any:
 def work(job: Job) -> dict[str, Any]:
     """One method on its arms."""
     if job.method == "random":
-        return learned(job.seed, commands(job.method, job.seed, job.seconds))
+        U = commands(job.method, job.seed, job.seconds)
+        return learned(job.seed, U, job.recordings)
     which = job.seed % DESIGNS
     name = f"{job.method.replace(' ', '_')}_{job.seconds:g}_{which}.npy"
     U = stored(job.out / name, lambda: commands(job.method, which, job.seconds))
-    return learned(job.seed, U)
+    return learned(job.seed, U, job.recordings)
 
 
 def stored(path: Path, make: Callable[[], np.ndarray]) -> np.ndarray:
@@ -287,15 +304,14 @@ def stored(path: Path, make: Callable[[], np.ndarray]) -> np.ndarray:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--truths", type=int, default=20)
+    parser.add_argument("--recordings", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--workers", type=int, default=cores())
     parser.add_argument("--out", type=Path, default=Path("results/design"))
     options = parser.parse_args()
     seeds = range(options.truths)
-    groups = [
-        [Job(m, s, options.seconds, options.out.with_suffix(".cells")) for s in seeds]
-        for m in METHODS
-    ]
+    rest = options.seconds, options.recordings, options.out.with_suffix(".cells")
+    groups = [[Job(m, s, *rest) for s in seeds] for m in METHODS]
     found: dict[str, list[Any]] = {m: [None] * len(seeds) for m in METHODS}
     for job, result in spread(work, groups, options.workers):
         found[job.method][job.seed] = result
@@ -308,7 +324,7 @@ def main() -> None:
 
 
 def lines(found: dict[str, list[Any]]) -> list[str]:
-    """Medians, ratios per arm, and the goals."""
+    """Medians, ratios per arm with bootstrap intervals, and the goals."""
 
     def each(method: str, what: str) -> np.ndarray:
         return np.asarray([row[what] for row in found[method]])
@@ -328,11 +344,12 @@ def lines(found: dict[str, list[Any]]) -> list[str]:
     for ours in METHODS[2:]:
         for other, goal in (("random", OF_RANDOM), ("multisine", OF_MULTISINE)):
             for what in ("constants", "motion"):
-                ratio = float(np.median(each(ours, what) / each(other, what)))
+                rng = np.random.default_rng(0)
+                ratio, low, high = of_median(each(ours, what) / each(other, what), rng)
                 verdict = "holds" if ratio <= goal else "does not hold"
                 out.append(
                     f"{ours}: error of the {what} at most {goal:g} of {other}'s: "
-                    f"{verdict} ({ratio:.2f}, median over arms)"
+                    f"{verdict} ({ratio:.2f} [{low:.2f}, {high:.2f}], median over arms)"
                 )
         lower = int(np.sum(each(ours, "log_volume") < each("random", "log_volume")))
         out.append(f"{ours}: volume below random's in {lower} of {len(found[ours])}")

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import scipy.stats
 
 from sim2gp.experiments import claims
 
@@ -25,6 +26,21 @@ def test_a_bootstrap_interval_covers_the_mean(level: float, z: float):
     half = z * sample.std() / np.sqrt(200)
     assert low == pytest.approx(sample.mean() - half, abs=0.02)
     assert high == pytest.approx(sample.mean() + half, abs=0.02)
+
+
+@pytest.mark.parametrize("lost", [0, 10])
+def test_a_medians_interval_is_its_exact_bootstrap(lost: int):
+    """A resample's median is at most the k-th where half of it or more is among k."""
+    count = 21
+    values = np.arange(1.0, count + 1)
+    shares = scipy.stats.binom(count, np.arange(1, count + 1) / count).sf(count // 2)
+    shares = np.diff(shares, prepend=0.0)  # of each value, to be the median
+    cumulative = np.cumsum(shares)
+    low, high = (values[np.searchsorted(cumulative, t)] for t in (0.025, 0.975))
+    values[count - lost :] = np.inf  # seeds that never got there
+    middle, below, above = claims.of_median(values[::-1], rng())
+    assert (middle, below) == (11.0, low)
+    assert above == (np.inf if lost else high)
 
 
 def test_every_resample_has_as_many_seeds():

@@ -47,6 +47,20 @@ def central(
     return float(low), float(high)
 
 
+def of_median(
+    each: Float[np.ndarray, " seeds"], rng: np.random.Generator
+) -> tuple[float, float, float]:
+    """The median over seeds, and the central share `LEVEL` of its bootstrap.
+
+    A seed may be infinite, for never: the ends are medians that were drawn.
+    """
+    weights = resampled(len(each), rng).astype(int)
+    medians = np.asarray([np.median(np.repeat(each, w)) for w in weights])
+    tail = 0.5 * (1.0 - LEVEL)
+    low, high = np.quantile(medians, [tail, 1.0 - tail], method="nearest")
+    return float(np.median(each)), float(low), float(high)
+
+
 def told(difference: Float[np.ndarray, " seeds"], low: float, high: float) -> str:
     """A mean difference with its interval, in words."""
     return f"{difference.mean():+.3f} [{low:+.3f}, {high:+.3f}]"

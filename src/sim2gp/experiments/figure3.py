@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from sim2gp.experiments.claims import at_least_as_good, central, claim, resampled
+from sim2gp.experiments.claims import at_least_as_good, claim, of_median
 from sim2gp.experiments.exploring import (
     METHODS,
     QUANTITIES,
@@ -233,11 +233,7 @@ def _halved(
             ratios.append(mine / needed(early[other][i], rmse, float(found[-1])))
     if not ratios:
         return claim(False, "no seed on which random input has an error", text)
-    each = np.asarray(ratios)
-    median = float(np.median(each))
-    weights = resampled(len(each), rng).astype(int)
-    medians = np.asarray([np.median(np.repeat(each, w)) for w in weights])
-    low, high = central(medians)
+    median, low, high = of_median(np.asarray(ratios), rng)
     return claim(
         median <= SHARE,
         f"{median:.2f} of its transitions [{low:.2f}, {high:.2f}]",
