@@ -41,8 +41,8 @@ from sim2gp.transitions import Transitions
 from sim2gp.types import Dynamics, Key, in_float64
 
 #: Information hardly depends on the last digits of a plan: fewer sequences than a
-#: swing-up needs, and every third step.
-EXPLORER = MPC(update=ICEM(samples=64, elites=8, iterations=3), every=3)
+#: swing-up needs, and every fourth step.
+EXPLORER = MPC(update=ICEM(samples=48, elites=8, iterations=3), every=4)
 QUICK_EXPLORER = MPC(update=ICEM(samples=32, elites=4, iterations=2), every=5)
 #: What is kept of each episode.
 QUANTITIES = ("rmse", "nll", "coverage95", "nats", "upright", "swung_up")

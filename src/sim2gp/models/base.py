@@ -68,7 +68,14 @@ class AbstractBelief(eqx.Module):
         self, S: Float[Array, "T n"], A: Float[Array, "T m"]
     ) -> Scalar:
         """Nats that a whole trajectory is expected to give, redundancy removed."""
-        return joint(*jax.vmap(self.sensitivity)(*double(S, A)))
+        return _joint_along(self, *double(S, A))
+
+
+@eqx.filter_jit
+def _joint_along(
+    belief: AbstractBelief, S: Float[Array, "T n"], A: Float[Array, "T m"]
+) -> Scalar:
+    return joint(*jax.vmap(belief.sensitivity)(S, A))
 
 
 class AbstractModel(eqx.Module):
