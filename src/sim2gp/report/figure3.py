@@ -23,8 +23,21 @@ def figure3(
     """Median and quartiles over seeds, on data that nobody learned from."""
 
     def finish(ax: "Axes") -> None:
+        from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
         if shown == "rmse":
             ax.set_yscale("log")
+            plain = FuncFormatter(lambda x, _: f"{x:g}")
+            low, high = ax.get_ylim()
+            ax.yaxis.set_major_formatter(plain)
+            ax.yaxis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
+            few = high < 300.0 * low  # too few decades to be read without more numbers
+            ax.yaxis.set_minor_formatter(plain if few else NullFormatter())
+        else:
+            # One learner's upper quartile, of hundreds, would flatten all others.
+            medians = np.concatenate([line.get_ydata() for line in ax.lines])
+            low, high = np.nanmin(medians), np.nanmax(medians)
+            ax.set_ylim(low - 0.1 * (high - low), high + 0.1 * (high - low))
 
     return panels(
         summary["figure3"],
