@@ -11,7 +11,7 @@ from collections.abc import Iterator
 LAYERS: tuple[frozenset[str], ...] = (
     frozenset(
         "types errors linalg gaussian least_squares arrowhead laplace parameters "
-        "transitions ahead".split()
+        "transitions ahead descent".split()
     ),
     frozenset({"systems", "logs"}),
     frozenset({"models", "tasks", "planning"}),
@@ -28,6 +28,7 @@ SIBLINGS: frozenset[tuple[str, str]] = frozenset(
         ("cli", "report"),
         ("experiments", "report"),
         ("ahead", "types"),
+        ("descent", "types"),
         ("gaussian", "linalg"),
         ("gaussian", "types"),
         ("gaussian", "errors"),

@@ -182,6 +182,7 @@ ARGUMENTS = {
     "report there": ("E130", "not a run"),
     "reproduce": ("E160", "missing FIGURE"),
     "reproduce fig11": ("E160", "did you mean fig1"),
+    "reproduce fig1 --workers 2": ("E160", "leave it out"),
     "demo --json=maybe": ("E160", "maybe"),
 }
 

@@ -356,6 +356,26 @@ def test_a_designed_experiment_beats_random_ones(found) -> None:
     np.testing.assert_allclose(best.scale, d.after(e.belief, jnp.asarray(A)), rtol=1e-9)
 
 
+def test_a_refused_start_does_not_end_the_search(found, monkeypatch) -> None:
+    """The second of two is returned; the first one's refusal is not."""
+    e, box, signal, _ = found
+    for name, value in QUICK.items():
+        monkeypatch.setattr(search, name, value)
+    kept, calls = search._kept, []
+
+    def refused_once(*args: object) -> object:
+        calls.append(args)
+        if len(calls) == 1:
+            raise InputError("E150", "no commands keep the limits")
+        return kept(*args)
+
+    monkeypatch.setattr(search, "_kept", refused_once)
+    key = jax.random.key(0)
+    second = d.design(e, d.Everything(), box, signal, key=key, starts=2)
+    assert len(calls) == 2
+    assert second.violations <= search.ALLOWED
+
+
 def test_no_commands_keep_limits_that_nothing_can(found) -> None:
     """A pole that starts beside its limit swings beyond it whatever is done."""
     e, _, signal, _ = found

@@ -267,9 +267,18 @@ class Reproduce(Writes):
     """Processes (not figure 1); default one per core."""
 
     def run(self, progress: Progress) -> dict[str, Any]:
-        more: dict[str, Any] = {}
-        if self.figure != "fig1":
-            more = {"seeds": self.seeds, "episodes": self.episodes}
+        more: dict[str, Any] = {
+            "seeds": self.seeds,
+            "episodes": self.episodes,
+            "workers": self.workers,
+        }
+        if self.figure == "fig1":
+            for name, value in more.items():
+                if value is not None:
+                    where, one = f"--{name} with fig1", "one run in one process"
+                    raise usage_error(where, str(value), one, "leave it out")
+            more = {}
+        else:
             more["workers"] = self.workers or cores()
         if FIGURES[self.figure] == "figure3":
             more["figure"] = self.figure

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sim2gp.ahead import ahead
+from sim2gp.descent import Moments, adam, descend
 from sim2gp.design.experiment import (
     Experiment,
     after,
@@ -30,7 +31,6 @@ from sim2gp.design.goals import AbstractGoal
 from sim2gp.design.limits import Limits, excess
 from sim2gp.design.signals import AbstractSignal, Multisine
 from sim2gp.errors import InputError, NotFinite
-from sim2gp.models.features import Moments, adam, descend
 from sim2gp.types import Key, in_float64, single
 
 GRID, SUBSTEP = 0.01, 0.0025  # s, the shortest period and substep that a search sees
@@ -116,7 +116,7 @@ def design(
             CHECKED,
         )
 
-    found = [one(jax.random.fold_in(search, i)) for i in range(starts)]
+    found = _of_starts(one, search, starts)
     best = max(found, key=lambda f: f.nats if math.isfinite(f.nats) else -math.inf)
     if not math.isfinite(best.nats):
         raise NotFinite(
@@ -126,6 +126,20 @@ def design(
             fix="narrow the limits of the states: the simulation is lost within them",
         )
     return best
+
+
+def _of_starts(one: Callable[[Key], Designed], key: Key, starts: int) -> list[Designed]:
+    """What each start ends with; E150 of the last one where none keeps the limits."""
+    found: list[Designed] = []
+    refused: InputError | None = None
+    for i in range(starts):
+        try:
+            found.append(one(jax.random.fold_in(key, i)))
+        except InputError as error:  # another start may end within the limits
+            refused = error
+    if refused and not found:
+        raise refused
+    return found
 
 
 def _kept(

@@ -1,4 +1,4 @@
-"""Features for neural linear models: encoded inputs, a small network, its optimiser.
+"""Features for neural linear models: encoded inputs and a small network.
 
     phi(x) = [tanh(... tanh(enc(x) A + a) ...) ; 1] / sqrt(m)
 
@@ -8,8 +8,7 @@ data a feature goes flat, it does not extrapolate along a line.
 """
 
 import math
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Mapping
 
 import equinox as eqx
 import jax
@@ -18,14 +17,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp.systems.base import AbstractSystem, index_of
 from sim2gp.transitions import Transitions
-from sim2gp.types import Action, Key, Scalar, State
+from sim2gp.types import Action, Key, State
 
 #: Half-width of a channel without limits, by its unit: how far a small machine moves.
 REACH = {"rad": math.pi, "rad/s": 20.0, "m": 1.0, "m/s": 2.0}
 HELD_OUT = 5  # one chunk of rows in so many
 CHUNK = 5  # rows; neighbours in time are too alike to judge each other
 SPLIT = 0  # names the split; another number is another split
-WEIGHT_DECAY = 1e-4
 
 
 class Encoding(eqx.Module):
@@ -166,64 +164,3 @@ class Minibatches(eqx.Module):
         start = jnp.where(self.count > size, t * size, 0)
         wrapped = (start + places) % jnp.maximum(self.count, 1)
         return self.order[wrapped], places < self.count
-
-
-#: ``(parameters, t, key) -> gradient`` of what is minimised.
-Gradient = Callable[[Any, Array, Key], Any]
-#: First and second moment of the gradients so far.
-Moments = tuple[Any, Any]
-
-
-def adam(parameters: Any) -> Moments:
-    """The optimiser before its first step."""
-    zeros = jax.tree.map(jnp.zeros_like, parameters)
-    return zeros, zeros
-
-
-def descend(
-    gradient: Gradient,
-    parameters: Any,
-    state: Moments,
-    rates: Any,
-    *,
-    steps: int,
-    start: Int[Array, ""],
-    total: Int[Array, ""],
-    key: Key,
-) -> tuple[Any, Moments]:
-    """``steps`` of Adam (Kingma & Ba 2015) from step ``start`` of ``total``; one scan.
-
-    The rate falls along a half cosine to a tenth, weights decay apart from the
-    moments. A gradient that is not finite changes nothing: one bad batch does not end
-    a training.
-    """
-
-    def step(carry: tuple[Any, Moments], i: Array) -> tuple[tuple, None]:
-        parameters, (first, second) = carry
-        t = start + i
-        grads = gradient(parameters, t, jax.random.fold_in(key, t))
-        finite = [jnp.all(jnp.isfinite(g)) for g in jax.tree.leaves(grads)]
-        new = (
-            jax.tree.map(lambda m, g: 0.9 * m + 0.1 * g, first, grads),
-            jax.tree.map(lambda v, g: 0.999 * v + 0.001 * g**2, second, grads),
-        )
-        done = (t + 1).astype(jnp.float32)
-        unbiased = jnp.sqrt(1.0 - 0.999**done) / (1.0 - 0.9**done)
-        share = jnp.minimum(t / jnp.maximum(total, 1), 1.0).astype(jnp.float32)
-        fall = 0.55 + 0.45 * jnp.cos(jnp.pi * share)
-
-        def move(p: Array, m: Array, v: Array, rate: float) -> Array:
-            towards = unbiased.astype(p.dtype) * m / (jnp.sqrt(v) + 1e-8)
-            return p - rate * fall.astype(p.dtype) * (towards + WEIGHT_DECAY * p)
-
-        moved = jax.tree.map(move, parameters, *new, rates)
-        good = jnp.all(jnp.stack(finite))
-        return chosen(good, (moved, new), carry), None
-
-    (parameters, state), _ = jax.lax.scan(step, (parameters, state), jnp.arange(steps))
-    return parameters, state
-
-
-def chosen(condition: Scalar | Array, new: Any, old: Any) -> Any:
-    """``new`` where the condition holds, leaf by leaf."""
-    return jax.tree.map(lambda n, o: jnp.where(condition, n, o), new, old)

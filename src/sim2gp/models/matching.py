@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from sim2gp.descent import adam, chosen, descend
 from sim2gp.gaussian import LOG_2PI, log_det_factor, lower_factor
 from sim2gp.linalg import solve_triangular
 from sim2gp.models import features, last_layer
@@ -204,7 +205,7 @@ def train(
         batches = features.Minibatches.shuffled(jax.random.fold_in(key, i), rows)
         begin = jnp.where(i < first, 0, jnp.where(i < second, first, second))
         end = jnp.where(i < first, first, jnp.where(i < second, second, last))
-        moments = features.chosen(i == begin, features.adam(q), moments)
+        moments = chosen(i == begin, adam(q), moments)
         gradient = _gradient(X32, Y, batches, target, objective, N, i < first)
 
         def masked(q: Variational, t: Array, key: Key) -> Variational:
@@ -213,7 +214,7 @@ def train(
             slope = jnp.where(learns, grads.log_noise, 0.0)
             return eqx.tree_at(lambda g: g.log_noise, grads, slope)
 
-        q, moments = features.descend(
+        q, moments = descend(
             masked,
             q,
             moments,
@@ -230,7 +231,7 @@ def train(
         log_noise = jnp.where(i + 1 >= second, settled, q.log_noise)
         return eqx.tree_at(lambda q: q.log_noise, q, log_noise), moments, noise
 
-    start = (q, features.adam(q), q.noise)
+    start = (q, adam(q), q.noise)
     q, _, noise = jax.lax.fori_loop(0, last, block, start)
     return q, noise
 

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from sim2gp.descent import adam, chosen, descend
 from sim2gp.errors import NotFinite
 from sim2gp.gaussian import Gaussian
 from sim2gp.linalg import cholesky, solve_triangular
@@ -275,7 +276,7 @@ def type_two(
             index, valid = rows.batch(t, BATCH)
             return jax.grad(evidence_loss)(trained, X32[index], Y[index], valid)
 
-        trained, state = features.descend(
+        trained, state = descend(
             gradient,
             trained,
             state,
@@ -287,10 +288,10 @@ def type_two(
         )
         new = look(trained)
         better = jnp.sum(new.losses) < jnp.sum(best.losses)
-        return trained, state, features.chosen(better, new, best)
+        return trained, state, chosen(better, new, best)
 
     rates = trained.rates()
-    start = (trained, features.adam(trained), look(trained))
+    start = (trained, adam(trained), look(trained))
     return jax.lax.fori_loop(0, steps // BLOCK, block, start)[2]
 
 

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from sim2gp.descent import chosen
 from sim2gp.gaussian import LOG_2PI
 from sim2gp.models import features, hybrid, last_layer, nlm
 from sim2gp.models.base import AbstractBelief, AbstractModel
@@ -159,7 +160,7 @@ def _posterior(
         )
         physics = eqx.tree_at(lambda g: g.mean, delta, delta.mean + tt)
         # Nothing left to add: the MAP of the curved problem is the better answer.
-        physics = features.chosen(jnp.all(absent), sim.posterior, physics)
+        physics = chosen(jnp.all(absent), sim.posterior, physics)
     else:
         scale = jnp.where(absent, 1.0, c)
         R = last_layer.data_factor(Phi, r / scale[None], mask)
@@ -170,5 +171,5 @@ def _posterior(
     # A layer that is not used keeps its prior: updates must find nothing in it.
     keep = [~absent.reshape(-1, *[1] * (x.ndim - 1)) for x in jax.tree.leaves(layer)]
     pairs = zip(keep, jax.tree.leaves(layer), jax.tree.leaves(prior), strict=True)
-    chosen = [jnp.where(k, new, old) for k, new, old in pairs]
-    return physics, jax.tree.unflatten(jax.tree.structure(layer), chosen)
+    leaves = [jnp.where(k, new, old) for k, new, old in pairs]
+    return physics, jax.tree.unflatten(jax.tree.structure(layer), leaves)

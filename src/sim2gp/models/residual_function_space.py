@@ -15,6 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from sim2gp.descent import chosen
 from sim2gp.models import features, hybrid, matching, nlm
 from sim2gp.models.base import AbstractBelief, AbstractModel
 from sim2gp.models.features import Encoding
@@ -103,7 +104,7 @@ class ResidualFunctionSpace(AbstractModel):
         scale = jnp.where(fitted, 0.0, before.scale)
         still = eqx.tree_at(lambda b: b.physics.scale, belief, scale)
         later = hybrid.conditioned(self.sim, still, s, a, s2)
-        physics = features.chosen(fitted, before, later.physics)
+        physics = chosen(fitted, before, later.physics)
         return eqx.tree_at(lambda b: b.physics, later, physics)
 
 
