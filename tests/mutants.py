@@ -22,9 +22,19 @@ from mutant_list import MUTANTS as PHYSICS
 from mutant_list import Hunt, Mutant
 from mutant_misfit import MISFIT
 from mutant_networks import NETWORKS
+from mutant_sac import OFF_POLICY
 from mutant_studies import STUDIES
 
-MUTANTS = (*PHYSICS, *DESCENTS, *NETWORKS, *MISFIT, *STUDIES, *EXPLORING, *DESIGN)
+MUTANTS = (
+    *PHYSICS,
+    *DESCENTS,
+    *NETWORKS,
+    *MISFIT,
+    *STUDIES,
+    *EXPLORING,
+    *DESIGN,
+    *OFF_POLICY,
+)
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "src" / "sim2gp"
