@@ -19,6 +19,7 @@ from sim2gp.planning import (
     AbstractObjective,
     AbstractPlanner,
     MarkovObjective,
+    Observation,
     Resumed,
     World,
 )
@@ -74,6 +75,17 @@ class Trajectory(eqx.Module):
         return with_history(S, A, history)
 
 
+class Reset(eqx.Module):
+    """A task's start, with as many past actions as the state of a world carries."""
+
+    task: Task
+    past: int = eqx.field(static=True)
+
+    def __call__(self, key: Key) -> State:
+        start = self.task.reset(key)[: self.task.size]
+        return jnp.concatenate([start, jnp.zeros(self.past, start.dtype)])
+
+
 def world_of(
     task: Task, dynamics: Dynamics, objective: AbstractObjective, *, history: int = 0
 ) -> World:
@@ -81,11 +93,13 @@ def world_of(
 
     ``history`` is the number of past actions in the state of ``dynamics``.
     """
-    free = jnp.full(history * task.actions.low.size, jnp.inf, task.state_bound.dtype)
+    m = task.actions.low.size
+    free = jnp.full(history * m, jnp.inf, task.state_bound.dtype)
+    past = jnp.tile(0.5 * (task.actions.high - task.actions.low), history)
     return World(
         dynamics,
         objective,
-        task.reset,
+        Reset(task, history * m),
         task.actions,
         task.horizon,
         state_bound=jnp.concatenate([task.state_bound, free]),
@@ -93,6 +107,7 @@ def world_of(
         planning_horizon=task.planning_horizon,
         planning_iterations=task.planning_iterations,
         noise_colour=task.noise_colour,
+        seen=Observation(jnp.concatenate([task.trusted, past]), task.pole),
     )
 
 

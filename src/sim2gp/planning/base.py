@@ -87,6 +87,30 @@ class Resumed(AbstractObjective):
         return self.objective.along(carry, S, A, S2)
 
 
+class Observation(eqx.Module):
+    """A state as a network sees it: turns of an angle are one, the rest of order one.
+
+    angle: the state whose turns do not count, as (sin, cos), or None.
+    scale: of every state.
+    """
+
+    scale: Float[Array, " n"]
+    angle: int | None = eqx.field(static=True, default=None)
+
+    def __call__(self, s: State) -> Float[Array, " o"]:
+        scaled = s / self.scale
+        if self.angle is None:
+            return scaled
+        turn = jnp.stack([jnp.sin(s[self.angle]), jnp.cos(s[self.angle])])
+        rest = jnp.concatenate([scaled[: self.angle], scaled[self.angle + 1 :]])
+        return jnp.concatenate([rest, turn])
+
+    @property
+    def size(self) -> int:
+        """Number of observed numbers."""
+        return self.scale.size + (self.angle is not None)
+
+
 class World(eqx.Module):
     """One draw of everything a planner needs; a pytree, so a new draw is new data.
 
@@ -94,6 +118,7 @@ class World(eqx.Module):
     (newest first) at the end of the state, for delayed inputs. The planning defaults
     travel with the machine: a fast pendulum wants a short plan and restless noise, a
     slow one the opposite, and a planner built without arguments is right on both.
+    So does what a policy sees of a state; None is the state as it is.
     """
 
     dynamics: Dynamics
@@ -106,6 +131,15 @@ class World(eqx.Module):
     planning_horizon: int = eqx.field(static=True, default=30)
     planning_iterations: int = eqx.field(static=True, default=4)
     noise_colour: float = eqx.field(static=True, default=1.0)
+    seen: Observation | None = None
+
+    @property
+    def observe(self) -> Observation:
+        """What a policy sees of a state."""
+        if self.seen is not None:
+            return self.seen
+        start = jax.eval_shape(self.reset, jax.random.key(0))
+        return Observation(jnp.ones(start.shape, start.dtype))
 
     def step(self, s: State, a: Action) -> tuple[State, Bool[Array, ""]]:
         """The guarded next state, and whether the dynamics gave a usable one."""
