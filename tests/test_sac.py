@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import scipy.stats
 from jaxtyping import Array
+from scipy.linalg import solve_discrete_are
 
 from double_integrator import A, B, Q, R
 from double_integrator import world as double_integrator
@@ -120,7 +121,7 @@ def test_a_policy_plans_ahead() -> None:
     data = Transitions.empty(1, 2, 1)
     learner = trained(planner, here, data, times=3)
     policy = planner.policy(learner, here)
-    P = _riccati()
+    P = solve_discrete_are(A, B, Q, R)
     K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
     ratios = []
     for s in ([0.8, 0.0], [-0.5, 0.5], [0.3, -0.8]):
@@ -132,16 +133,6 @@ def test_a_policy_plans_ahead() -> None:
 
 def _anywhere_in_the_plane(key: Array) -> Array:
     return jax.random.uniform(key, (2,), minval=-1.0)
-
-
-def _riccati() -> np.ndarray:
-    """Of the cost that counts the state after each step."""
-    P = np.zeros((2, 2))
-    for _ in range(500):
-        P = P + Q
-        K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
-        P = A.T @ P @ (A - B @ K)
-    return P + Q
 
 
 def _cost(policy, s) -> float:

@@ -5,7 +5,7 @@ differences are taken per seed and their means are bootstrapped over seeds.
 """
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -39,11 +39,13 @@ def interval(
 
 
 def central(
-    values: Float[np.ndarray, " resamples"], level: float = LEVEL
+    values: Float[np.ndarray, " resamples"],
+    level: float = LEVEL,
+    method: Literal["linear", "nearest"] = "linear",
 ) -> tuple[float, float]:
     """The two quantiles that ``level`` of the values lie between."""
     tail = 0.5 * (1.0 - level)
-    low, high = np.quantile(values, [tail, 1.0 - tail])
+    low, high = np.quantile(values, [tail, 1.0 - tail], method=method)
     return float(low), float(high)
 
 
@@ -56,9 +58,7 @@ def of_median(
     """
     weights = resampled(len(each), rng).astype(int)
     medians = np.asarray([np.median(np.repeat(each, w)) for w in weights])
-    tail = 0.5 * (1.0 - LEVEL)
-    low, high = np.quantile(medians, [tail, 1.0 - tail], method="nearest")
-    return float(np.median(each)), float(low), float(high)
+    return float(np.median(each)), *central(medians, method="nearest")
 
 
 def told(difference: Float[np.ndarray, " seeds"], low: float, high: float) -> str:

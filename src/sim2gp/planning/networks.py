@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from sim2gp.gaussian import LOG_2PI
 from sim2gp.planning.base import Observation
+from sim2gp.planning.mpc import from_unit
 from sim2gp.types import Action, Box, Key, Scalar, State
 
 #: Bounds of a policy's log sd, which its network moves between.
@@ -88,6 +89,4 @@ class Policy(eqx.Module):
 
     def __call__(self, s: State) -> Action:
         mean, _ = jnp.split(self.actor(self.observe(s)), 2)
-        middle = 0.5 * (self.box.high + self.box.low)
-        a = middle + 0.5 * (self.box.high - self.box.low) * jnp.tanh(mean)
-        return jnp.clip(a, self.box.low, self.box.high)
+        return from_unit(jnp.tanh(mean)[None], self.box)[0]

@@ -69,6 +69,7 @@ class Replay(eqx.Module):
         """The same actions in the same states of another world."""
         step = jax.vmap(lambda s, u: made(world, s, u))
         S2, r, valid = step(self.state, self.action)
+        valid = valid & (jnp.arange(len(valid)) < self.count)
         return Replay(self.state, self.action, S2, r, valid, self.count)
 
 
