@@ -1,4 +1,4 @@
-"""Figure 2's bookkeeping: scores, claims on planted returns, cells that resume."""
+"""Figures 2 and 4: scores, claims on planted returns, cells that resume."""
 
 import dataclasses
 import json
@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from sim2gp.experiments import figure2, swingup
-from sim2gp.experiments.swingup import CONDITIONS, METHODS, Cell
-from sim2gp.planning import MPC
+from sim2gp.experiments.swingup import CONDITIONS, METHODS, TRAINED, Cell
+from sim2gp.planning import MPC, SAC
 from sim2gp.report import figure2 as drawn
 from sim2gp.runs import Progress
 from sim2gp.runs.cells import Cells
@@ -36,7 +36,7 @@ def planted(fast: str = "", slow: str = "") -> figure2.Table:
     table = {}
     for machine in MACHINES:
         for condition in CONDITIONS:
-            for method in METHODS:
+            for method in (*METHODS, *TRAINED):
                 score = np.full((10, 6), 1.0) + 1e-3 * rng.standard_normal((10, 6))
                 score[:, 0] = 0.1
                 if method == "NLM":
@@ -71,6 +71,51 @@ def test_claims_see_what_was_planted():
         json.dumps(claim, allow_nan=False)
 
 
+def test_off_policy_claims_see_what_was_planted():
+    def holds(table: figure2.Table, name: str) -> bool:
+        found = figure2.off_policy_claims(table, np.random.default_rng(1))
+        json.dumps(found, allow_nan=False)
+        return found[name]["holds"]
+
+    close = "furuta_off_policy_oracle_is_close_to_MPC"
+    beaten = "cartpole_the_posterior_beats_domain_randomisation"
+    table = planted(fast="FS", slow="domain randomisation")
+    assert holds(table, close)
+    assert holds(table, beaten)
+    assert holds(table, "furuta_FS_is_best_under_mismatch")
+    assert not holds(table, "furuta_literal_function_space_is_best_under_mismatch")
+    assert not holds(table, "sampling_beats_the_point_estimate_somewhere")
+    table = planted(fast="SIM2GP", slow="off-policy oracle")
+    assert not holds(table, close)
+    assert holds(table, beaten)
+    assert not holds(planted(), beaten)
+    assert holds(table, "sampling_beats_the_point_estimate_somewhere")
+
+
+def test_a_policy_that_is_trained_has_cells_of_its_own():
+    """Scores are relative to MPC's oracle, whoever learns."""
+    cell = Cell("furuta", "nominal", "SIM2GP", 3, 2)
+    policy = dataclasses.replace(cell, planning="sac")
+    assert isinstance(policy.planner, SAC)
+    assert policy.name != cell.name
+    assert policy.arguments["planner"]["type"] == "SAC"
+    assert set(policy.arguments) == set(cell.arguments)
+    assert swingup.reference(policy) == swingup.reference(cell)
+    quick = dataclasses.replace(policy, quick=True).planner
+    assert quick.steps * quick.updates <= 4000
+
+
+@pytest.mark.parametrize("method", TRAINED)
+def test_policies_are_trained_where_no_episode_changes_anything(method, monkeypatch):
+    small = SAC(hidden=(8,), worlds=4, steps=5, updates=1)
+    monkeypatch.setitem(swingup.PLANNERS, "sac", small)
+    cell = Cell("cartpole", "mismatch", method, 0, 2, planning="sac")
+    flown = swingup.learner_cell(cell, 0)
+    assert flown["failure"] is None
+    assert len(flown["returns"]) == 2
+    assert np.isfinite(flown["returns"]).all()
+
+
 def test_a_finished_cell_is_not_flown_again(tmp_path: Path, monkeypatch):
     cells = Cells(tmp_path / "fig2")
     cell = Cell("furuta", "nominal", "SIM2GP", 3, 2)
@@ -88,7 +133,7 @@ def test_a_finished_cell_is_not_flown_again(tmp_path: Path, monkeypatch):
     flown = swingup.fly_cell(more, tmp_path / "fig2")
     assert flown == {"returns": [], "source": source()}
     for other in (MPC(horizon=7), MPC(lengths=(0.5, 1.0))):
-        monkeypatch.setattr(swingup, "PLANNER", other)
+        monkeypatch.setitem(swingup.PLANNERS, "mpc", other)
         assert cells.load(cell.name, cell.arguments) is None
     # Damaged, it counts as missing.
     (cells.folder / f"{cell.name}.json").write_text('{"arguments": ')
@@ -101,7 +146,7 @@ def test_a_changed_default_of_the_planner_is_another_planner(monkeypatch):
     before = cell.arguments
     assert before["planner"]["update"]["type"] == "ICEM"
     assert before["planner"]["lengths"] == MPC().lengths
-    monkeypatch.setattr(swingup, "PLANNER", MPC(lengths=(1.0,)))
+    monkeypatch.setitem(swingup.PLANNERS, "mpc", MPC(lengths=(1.0,)))
     assert cell.arguments != before
 
 
@@ -142,10 +187,11 @@ def test_a_quick_look_has_a_planner_and_cells_of_its_own(monkeypatch):
     for cell in (quick, full):
         with pytest.raises(KeyboardInterrupt):
             swingup.oracle_cell(swingup.reference(cell))
-    assert used == 2 * [swingup.QUICK_PLANNER, swingup.PLANNER]
+    assert used == 2 * [swingup.QUICK_PLANNERS["mpc"], swingup.PLANNERS["mpc"]]
 
 
-def test_the_figure_goes_on_where_it_was(tmp_path: Path, monkeypatch):
+@pytest.mark.parametrize("number", ["2", "4"])
+def test_the_figure_goes_on_where_it_was(number, tmp_path: Path, monkeypatch):
     """Interrupted after seven cells, the second run flies only what is missing."""
     flown: list[str] = []
 
@@ -161,31 +207,32 @@ def test_the_figure_goes_on_where_it_was(tmp_path: Path, monkeypatch):
     monkeypatch.setattr(swingup, "oracle_cell", lambda cell: ORACLE)
 
     def draw():
-        out, progress = tmp_path / "fig2", Progress()
         return figure2.run(
-            out=out,
+            out=tmp_path / "run",
+            figure=f"fig{number}",
             seed=0,
             seeds=None,
             episodes=None,
             quick=True,
             workers=1,
-            progress=progress,
+            progress=Progress(),
         )
 
     with pytest.raises(KeyboardInterrupt):
         draw()
-    assert not (tmp_path / "fig2").exists()
+    assert not (tmp_path / "run").exists()
     first = list(flown)
     flown.append("go on")
     summary = draw()
     again = flown[len(first) + 1 :]
     assert not set(first) & set(again)
-    assert len(first) + len(again) == 2 * len(CONDITIONS) * len(METHODS) * len(MACHINES)
+    methods = figure2.FIGURES[f"fig{number}"][-1]
+    assert len(first) + len(again) == 2 * len(CONDITIONS) * len(methods) * len(MACHINES)
     assert summary["seeds"] == 2
-    assert (tmp_path / "fig2" / "figure2.png").stat().st_size > 20_000
-    assert "Figure 2" in (tmp_path / "fig2" / "report.html").read_text()
+    assert (tmp_path / "run" / f"figure{number}.png").stat().st_size > 20_000
+    assert f"Figure {number}" in (tmp_path / "run" / "report.html").read_text()
     # Redrawn from the stored arrays alone.
-    with np.load(tmp_path / "fig2" / "arrays.npz") as arrays:
+    with np.load(tmp_path / "run" / "arrays.npz") as arrays:
         figure = drawn(dict(arrays), summary)
     assert len(figure.axes) == 4
-    assert len(figure.axes[0].lines) == len(METHODS) + 1
+    assert len(figure.axes[0].lines) == len(methods) + 1

@@ -1,6 +1,6 @@
 """The upper reference: a planner that knows the truth, and truths that it can solve."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import equinox as eqx
@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from sim2gp.errors import NotFinite, Sim2GPError
-from sim2gp.flight import Purpose, episode, key_for, oracle_world
-from sim2gp.planning import AbstractPlanner
+from sim2gp.flight import Purpose, Trajectory, episode, key_for, oracle_world
+from sim2gp.planning import AbstractPlanner, World
 from sim2gp.systems import AbstractSystem
 from sim2gp.tasks import Task, draw_truth
 from sim2gp.transitions import Transitions
@@ -38,21 +38,32 @@ def fly_oracle(
     It plans without noise and flies the noisy task. It swings up when the pole stands
     over the last second of every episode; the first one that does not ends the run.
     """
-    world = oracle_world(task)
-    planner_state = planner.init(world, key=key_for(key, 0, Purpose.PREPARE))
-    data = Transitions.empty(1, task.size, task.actions.low.size)
-    ready = planner.prepare(
-        planner_state, world, data, key=key_for(key, 1, Purpose.PREPARE)
-    )
     returns, up = [], True
-    for e in range(1, episodes + 1):
-        key_e = key_for(key, e, Purpose.ORACLE)
-        trajectory, _ = episode(task, planner, ready, world, key=key_e)
+    world = oracle_world(task)
+    for trajectory in flights(task, world, planner, key=key, episodes=episodes):
         returns.append(float(trajectory.total))
         up = bool(task.swung_up(jnp.asarray(trajectory.state)))
         if not up:
             break
     return OracleRun(np.asarray(returns), up)
+
+
+def flights(
+    task: Task, world: World, planner: AbstractPlanner, *, key: Key, episodes: int
+) -> Iterator[Trajectory]:
+    """Episodes of a planner that learns nothing of the machine but what its world is.
+
+    It gets ready for the world before each of them: MPC forgets, SAC trains on.
+    """
+    state = planner.init(world, key=key_for(key, 0, Purpose.PREPARE))
+    size = jax.eval_shape(world.reset, key).size
+    nothing = Transitions.empty(1, size, task.actions.low.size)
+    for e in range(1, episodes + 1):
+        preparing = key_for(key, e, Purpose.PREPARE)
+        state = planner.prepare(state, world, nothing, key=preparing)
+        flying = key_for(key, e, Purpose.ORACLE)
+        trajectory, state = episode(task, planner, state, world, key=flying)
+        yield trajectory
 
 
 class AcceptedTruth(eqx.Module):

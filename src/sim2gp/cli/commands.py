@@ -21,6 +21,7 @@ FIGURES = {
     "fig1": "two_link",
     "fig2": "figure2",
     "fig3": "figure3",
+    "fig4": "figure2",
     "fig5": "figure3",
     "mismatch": "mismatch",
 }
@@ -251,7 +252,7 @@ class Reproduce(Writes):
     """A figure of the paper: its data, the picture, and the claims checked."""
 
     figure: Annotated[
-        Positional[Literal["fig1", "fig2", "fig3", "fig5", "mismatch"]],
+        Positional[Literal["fig1", "fig2", "fig3", "fig4", "fig5", "mismatch"]],
         arg(metavar="FIGURE"),
     ]
     """A figure of the paper, or the mismatch map."""
@@ -280,7 +281,7 @@ class Reproduce(Writes):
             more = {}
         else:
             more["workers"] = self.workers or cores()
-        if FIGURES[self.figure] == "figure3":
+        if FIGURES[self.figure] in ("figure2", "figure3"):  # of two figures each
             more["figure"] = self.figure
         return _experiment(FIGURES[self.figure])(
             out=_out(self.out, self.figure),

@@ -1,6 +1,7 @@
-"""Figure 2: posterior sampling with sampling MPC, with and without model mismatch.
+"""Figures 2 and 4: posterior sampling, with and without model mismatch.
 
-Best-seen score against episode, for every learner on both machines. The cells are on
+Best-seen score against episode, for every learner on both machines: with sampling MPC,
+and with policies that are trained off-policy in the sampled world. The cells are on
 the disk as soon as they are flown: an interrupted figure goes on where it was, and a
 finished one is redrawn from them.
 """
@@ -17,11 +18,14 @@ from sim2gp.experiments.claims import (
     at_least_as_good,
     better_somewhere,
     claim,
+    interval,
+    told,
 )
 from sim2gp.experiments.record import provenance
 from sim2gp.experiments.swingup import (
     CONDITIONS,
     METHODS,
+    TRAINED,
     WITH_TERM,
     Cell,
     best_seen,
@@ -35,6 +39,20 @@ from sim2gp.tasks import MACHINES, SOLVED
 SEEDS, EPISODES = 5, 10
 QUICK_SEEDS, QUICK_EPISODES = 2, 4
 CLAIM_EPISODES = 5  # claims compare means of the best-seen score over these
+#: Each figure's number, its title, how it plans, and the lines it draws.
+FIGURES = {
+    "fig2": ("2", "posterior sampling with MPC", "mpc", tuple(METHODS)),
+    "fig4": (
+        "4",
+        "posterior sampling with off-policy learning",
+        "sac",
+        (*METHODS, *TRAINED),
+    ),
+}
+#: Of the median off-policy oracle, against MPC's.
+CLOSE = 0.9
+#: Learned models that are compared with each other.
+RIVALS = tuple(m for m in METHODS if m not in ("point estimate", "Auto", WITH_TERM))
 
 Table = dict[tuple[str, str, str], Float[np.ndarray, "seeds E"]]
 
@@ -42,6 +60,7 @@ Table = dict[tuple[str, str, str], Float[np.ndarray, "seeds E"]]
 def run(
     *,
     out: Path,
+    figure: str,
     seed: int,
     seeds: int | None,
     episodes: int | None,
@@ -51,37 +70,41 @@ def run(
 ) -> dict[str, Any]:
     """Fly the missing cells, check the claims, write the run; returns its summary.
 
-    ``seeds`` and ``episodes`` None are the figure's own numbers. The cells of an
-    earlier run with the same ``out`` are used again, also for fewer episodes. A
-    ``quick`` look is planned with fewer sequences and has cells of its own.
+    ``figure`` is ``fig2`` or ``fig4``. ``seeds`` and ``episodes`` None are the figure's
+    own numbers. The cells of an earlier run with the same ``out`` are used again, also
+    for fewer episodes. A ``quick`` look is planned with fewer sequences, or trained for
+    less, and has cells of its own.
     """
     started = time.perf_counter()
     seeds = seeds or (QUICK_SEEDS if quick else SEEDS)
     episodes = episodes or (QUICK_EPISODES if quick else EPISODES)
+    number, title, planning, methods = FIGURES[figure]
     groups = {
-        (m, c, w): Cell(m, c, w, seed, episodes, quick=quick)
+        (m, c, w): Cell(m, c, w, seed, episodes, quick=quick, planning=planning)
         for m in MACHINES
         for c in CONDITIONS
-        for w in METHODS
+        for w in methods
     }
     numbers = range(seed, seed + seeds)
-    with new_run(out, "reproduce fig2") as writer:
+    with new_run(out, f"reproduce {figure}") as writer:
         table, details = study(groups, numbers, out, workers=workers, progress=progress)
-        words = f"sim2gp reproduce fig2 --seed {seed} --seeds {seeds} "
+        words = f"sim2gp reproduce {figure} --seed {seed} --seeds {seeds} "
+        check = claims if figure == "fig2" else off_policy_claims
         summary: dict[str, Any] = {
-            "command": "reproduce fig2",
-            "title": "Figure 2: posterior sampling with MPC",
+            "command": f"reproduce {figure}",
+            "title": f"Figure {number}: {title}",
             "figure2": {
+                "number": number,
                 "machines": list(MACHINES),
                 "conditions": list(CONDITIONS),
-                "methods": list(METHODS),
+                "methods": list(methods),
                 "episodes": episodes,
             },
             "seed": seed,
             "seeds": seeds,
-            "claims": claims(table, np.random.default_rng(seed)),
+            "claims": check(table, np.random.default_rng(seed)),
             **details,
-            "tables": [_table(table)],
+            "tables": [_table(table, methods)],
             **provenance(words + f"--episodes {episodes}{' --quick' * quick}", started),
         }
         arrays = {f"figure2/{'/'.join(k)}": v for k, v in table.items()}
@@ -89,7 +112,8 @@ def run(
 
         writer.write_summary(summary)
         writer.write_arrays("arrays.npz", arrays)
-        writer.write_bytes("figure2.png", figure_bytes(figure2(arrays, summary), "png"))
+        drawn = figure_bytes(figure2(arrays, summary), "png")
+        writer.write_bytes(f"figure{number}.png", drawn)
         writer.write_text("report.html", write_report(summary, arrays))
     return summary
 
@@ -101,11 +125,7 @@ def claims(table: Table, rng: np.random.Generator) -> dict[str, dict[str, Any]]:
     interval is the central 95 % of bootstrap means over seeds.
     """
     reached = {key: first_at(score, SOLVED) for key, score in table.items()}
-    early = {
-        key: best_seen(score)[:, :CLAIM_EPISODES].mean(axis=1)
-        for key, score in table.items()
-    }
-    rivals = [m for m in METHODS if m not in ("point estimate", "Auto", WITH_TERM)]
+    early = _early(table)
     out: dict[str, dict[str, Any]] = {}
     for machine in MACHINES:
         nominal, wrong = (machine, "nominal"), (machine, "mismatch")
@@ -120,7 +140,7 @@ def claims(table: Table, rng: np.random.Generator) -> dict[str, dict[str, Any]]:
             "least twice as many (median episodes)",
         )
         out[f"{machine}_residual_costs_nothing"] = _best(
-            "RES", {m: early[*nominal, m] for m in rivals}, rng, "without mismatch"
+            "RES", {m: early[*nominal, m] for m in RIVALS}, rng, "without mismatch"
         )
         share = float(np.mean(np.isfinite(reached[*wrong, "SIM2GP"])))
         out[f"{machine}_physics_alone_fails_under_mismatch"] = claim(
@@ -129,7 +149,7 @@ def claims(table: Table, rng: np.random.Generator) -> dict[str, dict[str, Any]]:
             "under mismatch pure SIM2GP never reaches 95 %",
         )
         out[f"{machine}_literal_function_space_is_best_under_mismatch"] = _best(
-            "FS literal", {m: early[*wrong, m] for m in rivals}, rng, "under mismatch"
+            "FS literal", {m: early[*wrong, m] for m in RIVALS}, rng, "under mismatch"
         )
         needed = median_episode(reached[*wrong, "RES-FS"])
         out[f"{machine}_RES_FS_solves_mismatch_in_three"] = claim(
@@ -137,15 +157,60 @@ def claims(table: Table, rng: np.random.Generator) -> dict[str, dict[str, Any]]:
             f"median episode {needed:g}",
             "under mismatch RES-FS reaches 95 % in at most 3 episodes",
         )
+    return out | _sampling_pays(early, rng)
+
+
+def off_policy_claims(
+    table: Table, rng: np.random.Generator
+) -> dict[str, dict[str, Any]]:
+    """As `claims`, of policies that were trained in the sampled world."""
+    early = _early(table)
+    out: dict[str, dict[str, Any]] = {}
+    for machine in MACHINES:
+        nominal, wrong = (machine, "nominal"), (machine, "mismatch")
+        last = [
+            float(np.median(best_seen(table[*group, "off-policy oracle"])[:, -1]))
+            for group in (nominal, wrong)
+        ]
+        out[f"{machine}_off_policy_oracle_is_close_to_MPC"] = claim(
+            min(last) >= CLOSE,
+            f"median best score {last[0]:.2f}, with mismatch {last[1]:.2f}",
+            f"trained in the true world, the best score is at least {CLOSE} of MPC's",
+        )
+        for name, word in (("FS literal", "literal_function_space"), ("FS", "FS")):
+            out[f"{machine}_{word}_is_best_under_mismatch"] = _best(
+                name, {m: early[*wrong, m] for m in RIVALS}, rng, "under mismatch"
+            )
+        gain = early[*nominal, "SIM2GP"] - early[*nominal, "domain randomisation"]
+        low, high = interval(gain, rng)
+        out[f"{machine}_the_posterior_beats_domain_randomisation"] = claim(
+            low > 0.0,
+            told(gain, low, high),
+            "without mismatch policies trained in posterior draws are better than one "
+            "trained in draws of the prior (mean best-seen score, episodes 1-5)",
+        )
+    return out | _sampling_pays(early, rng)
+
+
+def _early(table: Table) -> dict[tuple[str, str, str], Float[np.ndarray, " seeds"]]:
+    """What learners are compared by."""
+    return {
+        key: best_seen(score)[:, :CLAIM_EPISODES].mean(axis=1)
+        for key, score in table.items()
+    }
+
+
+def _sampling_pays(
+    early: dict[tuple[str, str, str], Float[np.ndarray, " seeds"]],
+    rng: np.random.Generator,
+) -> dict[str, dict[str, Any]]:
     pairs = {
         f"{m}, {c}": (early[m, c, "SIM2GP"], early[m, c, "point estimate"])
         for m in MACHINES
         for c in CONDITIONS
     }
-    out["sampling_beats_the_point_estimate_somewhere"] = better_somewhere(
-        pairs, rng, SAMPLING_PAYS
-    )
-    return out
+    found = better_somewhere(pairs, rng, SAMPLING_PAYS)
+    return {"sampling_beats_the_point_estimate_somewhere": found}
 
 
 def _best(
@@ -159,11 +224,11 @@ def _best(
     return at_least_as_good(name, early, rng, f"{text} {score}")
 
 
-def _table(table: Table) -> dict[str, Any]:
+def _table(table: Table, methods: tuple[str, ...]) -> dict[str, Any]:
     """Median episodes to 95 %, and the median best score of the last episode."""
     groups = [(m, c) for m in MACHINES for c in CONDITIONS]
     rows = []
-    for method in METHODS:
+    for method in methods:
         row = [method]
         for machine, condition in groups:
             score = table[machine, condition, method]

@@ -18,8 +18,8 @@ from jaxtyping import Float
 
 from sim2gp.errors import NotConverged, NotFinite
 from sim2gp.experiments.stages import AnyCell, described, in_stages
-from sim2gp.flight import Purpose, key_for
-from sim2gp.loops import Episode, psrl
+from sim2gp.flight import Purpose, Trajectory, key_for, oracle_world
+from sim2gp.loops import psrl
 from sim2gp.models import (
     NLM,
     AbstractModel,
@@ -30,8 +30,9 @@ from sim2gp.models import (
     ResidualFunctionSpace,
     Sim2GP,
 )
-from sim2gp.oracle import accept_truth
-from sim2gp.planning import ICEM, MPC
+from sim2gp.oracle import accept_truth, flights
+from sim2gp.planning import ICEM, MPC, SAC, AbstractPlanner, World
+from sim2gp.randomised import randomised_world
 from sim2gp.runs import Progress
 from sim2gp.runs.cells import Cells
 from sim2gp.runs.plain import source
@@ -51,10 +52,14 @@ MISSING: dict[str, Effect] = {
 }
 CONDITIONS = ("nominal", "mismatch")
 WITH_TERM = "SIM2GP with the term"
-PLANNER = MPC()
-#: Of a quick look: three sequences in eight, in the same proportions, and networks
-#: trained for a quarter as long.
-QUICK_PLANNER = MPC(update=ICEM(samples=60, elites=6))
+#: Model-predictive control, and off-policy learning in the sampled world.
+PLANNERS: dict[str, AbstractPlanner] = {"mpc": MPC(), "sac": SAC()}
+#: Of a quick look: three sequences in eight, in the same proportions, smaller policies,
+#: and networks trained for a quarter as long.
+QUICK_PLANNERS: dict[str, AbstractPlanner] = {
+    "mpc": MPC(update=ICEM(samples=60, elites=6)),
+    "sac": SAC(hidden=(64, 64), updates=10),
+}
 QUICK_TRAINING = {"steps": 500, "refit_steps": 200}
 PERIOD = 0.02  # s, of the control on every task
 
@@ -98,9 +103,18 @@ METHODS: dict[str, Callable[[AbstractMechanism, Effect, Options], AbstractModel]
 }
 
 
-def planner_of(quick: bool) -> MPC:
+#: Trained in a world that real episodes do not change; and in which one.
+TRAINED: dict[str, Callable[[Task, AbstractMechanism], World]] = {
+    "off-policy oracle": lambda task, _: oracle_world(task),
+    "domain randomisation": lambda task, system: randomised_world(
+        task, system, Sim2GP(system).prior
+    ),
+}
+
+
+def planner_of(quick: bool, planning: str = "mpc") -> AbstractPlanner:
     """The planner of a whole study, or of a quick look."""
-    return QUICK_PLANNER if quick else PLANNER
+    return (QUICK_PLANNERS if quick else PLANNERS)[planning]
 
 
 def reach_of(task: Task, system: AbstractMechanism) -> dict[str, float]:
@@ -118,6 +132,7 @@ class Cell:
         its strength, as in ``coulomb mild``.
     update_every: steps between updates within an episode; None is the paper's way.
     quick: planned with fewer sequences, by the oracle as well, and trained for less.
+    planning: ``mpc``, or ``sac``; the oracle that scores are measured by is MPC's.
     """
 
     machine: str
@@ -127,11 +142,12 @@ class Cell:
     episodes: int
     update_every: int | None = None
     quick: bool = False
+    planning: str = "mpc"
 
     @property
-    def planner(self) -> MPC:
+    def planner(self) -> AbstractPlanner:
         """Whoever learns, it is the same one."""
-        return planner_of(self.quick)
+        return planner_of(self.quick, self.planning)
 
     @property
     def name(self) -> str:
@@ -139,6 +155,8 @@ class Cell:
         words = [self.machine, self.condition, self.method, str(self.seed)]
         if self.update_every is not None:
             words.append(f"every {self.update_every}")
+        if self.planning != "mpc":
+            words.append(self.planning)
         if self.quick:
             words.append("quick")
         return "_".join(words).replace(" ", "-")
@@ -147,7 +165,7 @@ class Cell:
     def arguments(self) -> dict[str, Any]:
         """All that its returns depend on, but for how many of them there are."""
         told = asdict(self) | {"planner": described(self.planner)}
-        del told["episodes"]
+        del told["episodes"], told["planning"]
         if not told.pop("quick"):
             return told
         return told | {"training": QUICK_TRAINING}
@@ -208,29 +226,38 @@ def meeting(
 
 def learner_cell(cell: Cell, redrawn: int) -> dict[str, Any]:
     """Fly one learner; an episode after a fit that failed was not flown."""
-    task, model, history = meeting(cell, cell.method, redrawn)
     returns: list[float] = []
     started, failure = time.perf_counter(), None
-
-    def note(episode: Episode) -> None:
-        returns.append(float(episode.trajectory.total))
-
     try:
-        psrl(
-            task,
-            model,
-            cell.planner,
-            episodes=cell.episodes,
-            key=jax.random.key(cell.seed),
-            history=history,
-            update_every=cell.update_every,
-            final_fit=False,
-            on_episode=note,
-        )
+        _fly(cell, redrawn, lambda flown: returns.append(float(flown.total)))
     except (NotConverged, NotFinite) as error:
         failure = str(error)
     seconds = time.perf_counter() - started
     return {"returns": returns, "failure": failure, "seconds": seconds}
+
+
+def _fly(cell: Cell, redrawn: int, note: Callable[[Trajectory], None]) -> None:
+    """The episodes of a learner, or of a policy that is trained elsewhere."""
+    key = jax.random.key(cell.seed)
+    if cell.method in TRAINED:
+        task, _, _ = meeting(cell, "SIM2GP", redrawn)
+        world = TRAINED[cell.method](task, MACHINES[cell.machine][0]())
+        planner, episodes = cell.planner, cell.episodes
+        for flown in flights(task, world, planner, key=key, episodes=episodes):
+            note(flown)
+        return
+    task, model, history = meeting(cell, cell.method, redrawn)
+    psrl(
+        task,
+        model,
+        cell.planner,
+        episodes=cell.episodes,
+        key=key,
+        history=history,
+        update_every=cell.update_every,
+        final_fit=False,
+        on_episode=lambda episode: note(episode.trajectory),
+    )
 
 
 def fly_cell(cell: Cell, out: Path) -> dict[str, Any]:
@@ -290,7 +317,7 @@ def study(
 
 def reference(cell: Cell) -> Cell:
     """The oracle's cell of the same machine."""
-    return replace(cell, method="oracle", episodes=0, update_every=None)
+    return replace(cell, method="oracle", episodes=0, update_every=None, planning="mpc")
 
 
 def scores(

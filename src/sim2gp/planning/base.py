@@ -91,14 +91,14 @@ class Observation(eqx.Module):
     """A state as a network sees it: turns of an angle are one, the rest of order one.
 
     angle: the state whose turns do not count, as (sin, cos), or None.
-    scale: of every state.
+    scale: of every state; what a world's state carries beyond these is not seen.
     """
 
     scale: Float[Array, " n"]
     angle: int | None = eqx.field(static=True, default=None)
 
     def __call__(self, s: State) -> Float[Array, " o"]:
-        scaled = s / self.scale
+        scaled = s[: self.scale.size] / self.scale
         if self.angle is None:
             return scaled
         turn = jnp.stack([jnp.sin(s[self.angle]), jnp.cos(s[self.angle])])

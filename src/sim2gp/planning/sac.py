@@ -88,7 +88,10 @@ def made(
 
 
 class Learner(eqx.Module):
-    """All that is trained, and what it is trained on."""
+    """All that is trained, and what it is trained on.
+
+    ``taught`` says whether anything in the replay could be followed.
+    """
 
     actor: MLP
     critics: Critics
@@ -96,6 +99,7 @@ class Learner(eqx.Module):
     log_temperature: Scalar
     moments: tuple[Moments, Moments, Moments]
     updates: Int[Array, ""]
+    taught: Bool[Array, ""]
     replay: Replay
 
 
@@ -124,11 +128,11 @@ class SAC(AbstractPlanner):
     updates: int = eqx.field(static=True, default=32)
     batch: int = eqx.field(static=True, default=256)
     capacity: int = eqx.field(static=True, default=4)
-    replayed: float = eqx.field(static=True, default=0.3)
-    discount: float = eqx.field(static=True, default=0.99)
-    rate: float = eqx.field(static=True, default=3e-4)
-    slow: float = eqx.field(static=True, default=0.005)
-    scale: float = eqx.field(static=True, default=1.0)
+    replayed: float | Scalar = 0.3
+    discount: float | Scalar = 0.99
+    rate: float | Scalar = 3e-4
+    slow: float | Scalar = 0.005
+    scale: float | Scalar = 1.0
 
     def init(self, world: World, *, key: Key) -> Learner:
         first, second, third = jax.random.split(key, 3)
@@ -140,8 +144,10 @@ class SAC(AbstractPlanner):
         moments = adam(critics), adam(actor), adam(log_temperature)
         rows = self.capacity * self.worlds * self.steps
         replay = Replay.empty(rows, n, m)
-        none = jnp.zeros((), int)
-        return Learner(actor, critics, critics, log_temperature, moments, none, replay)
+        none, taught = jnp.zeros((), int), jnp.asarray(False)
+        return Learner(
+            actor, critics, critics, log_temperature, moments, none, taught, replay
+        )
 
     def prepare(self, state: Learner, world: World, data: Any, *, key: Key) -> Learner:
         starts = jnp.asarray(data.state, state.replay.state.dtype)
@@ -154,8 +160,7 @@ class SAC(AbstractPlanner):
         return self.policy(state, world)(s), state
 
     def failed(self, state: Learner) -> Bool[Array, ""]:
-        # A world that could never be followed has taught nothing.
-        return ~jnp.any(state.replay.valid)
+        return ~state.taught
 
     def policy(self, state: Learner, world: World) -> Policy:
         """What was trained, ready for a machine."""
@@ -200,7 +205,9 @@ def _trained(
     t = jax.random.randint(ages, (sac.worlds,), 0, world.horizon)
     keys = jax.random.split(going, sac.steps)
     (learner, _), _ = jax.lax.scan(turn, (learner, Rollouts(S, t)), keys)
-    return learner
+    # A world that could never be followed has taught nothing.
+    taught = jnp.any(learner.replay.valid)
+    return eqx.tree_at(lambda l: l.taught, learner, taught)
 
 
 def _stepped(
@@ -269,7 +276,16 @@ def _updated(sac: SAC, learner: Learner, world: World, key: Key) -> Learner:
         lambda old, new: old + sac.slow * (new - old), learner.targets, critics
     )
     moments = of_critics, of_actor, of_temperature
-    return Learner(actor, critics, targets, log_temperature, moments, t + 1, replay)
+    return Learner(
+        actor,
+        critics,
+        targets,
+        log_temperature,
+        moments,
+        t + 1,
+        learner.taught,
+        replay,
+    )
 
 
 def _values(critics: Critics, O: Array, U: Array) -> Float[Array, "B two"]:

@@ -142,7 +142,8 @@ def _figure(summary: Summary, arrays: Arrays) -> Raw:
             "the ellipses hold one and two standard deviations."
         )
     elif summary.get("figure2"):
-        name, drawn = "Figure 2", figure2(arrays, summary)
+        name = f"Figure {summary['figure2'].get('number', '2')}"
+        drawn = figure2(arrays, summary)
         words = "best-seen score against episode, for every learner"
         more = (
             "Lines are medians over seeds, shades quartiles; 1 is the oracle's score, "

@@ -1,4 +1,4 @@
-"""Figure 2: best-seen score against episode, a panel per machine and condition."""
+"""Figures 2 and 4: best-seen score against episode, by machine and condition."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any

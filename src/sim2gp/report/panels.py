@@ -23,6 +23,8 @@ LINES = {
     "RES-FS": ("#cc79a7", "--"),
     "Auto": ("#8a5a00", "-."),
     "SIM2GP with the term": ("#1b1f24", ":"),
+    "off-policy oracle": ("#1b1f24", "-"),
+    "domain randomisation": ("#8b949e", ":"),
     # Signals of the same model have its colour; a dash says what was flown.
     "SIM2GP, step by step": ("#0072b2", "--"),
     "SIM2GP, random": ("#0072b2", ":"),
