@@ -13,7 +13,7 @@ from scipy.linalg import solve_discrete_are
 
 from double_integrator import A, B, Q, R
 from double_integrator import world as double_integrator
-from sim2gp.planning import SAC, MarkovObjective, World, sac
+from sim2gp.planning import SAC, MarkovObjective, Observation, World, sac
 from sim2gp.planning.networks import LOG_SD, MLP, squashed, values
 from sim2gp.transitions import Transitions
 from sim2gp.types import Box
@@ -230,6 +230,26 @@ def test_episodes_begin_where_the_machine_has_been() -> None:
         replay = trained(discounted(0.0), world(STAY, reward()), some).replay
         held = np.asarray(replay.state)[: int(replay.count), 0]
         assert np.mean(held == 5.0) == pytest.approx(share, abs=0.04)
+
+
+def test_episodes_begin_where_no_machine_has_been() -> None:
+    """As far as a policy sees, a turn for an angle; what it does not see stays."""
+    here = world(STAY, reward())
+    here = dataclasses.replace(here, seen=Observation(jnp.asarray([10.0])))
+    for some, share in ((0.3, 0.3), (0.0, 0.0)):
+        planner = dataclasses.replace(discounted(0.0), scattered=jnp.asarray(some))
+        held = np.asarray(trained(planner, here).replay.state)[: 16 * 60, 0]
+        assert np.mean(np.abs(held) > 1.0) == pytest.approx(0.9 * share, abs=0.04)
+        assert np.abs(held).max() <= 10.0
+    seen = Observation(jnp.asarray([2.0, jnp.inf]), angle=1)
+    here = double_integrator(seen=seen)
+    start = jnp.asarray([0.1, 0.2, 0.3])
+    keys = jax.random.split(KEY, 4000)
+    X = np.asarray(jax.vmap(lambda k: sac.elsewhere(here, start, k))(keys))
+    for column, half in ((0, 2.0), (1, np.pi)):
+        found = scipy.stats.kstest(X[:, column], "uniform", (-half, 2.0 * half))
+        assert found.pvalue > 0.01
+    np.testing.assert_array_equal(X[:, 2], np.float32(0.3))
 
 
 def test_a_new_draw_is_new_data() -> None:

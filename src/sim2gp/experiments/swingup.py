@@ -54,11 +54,11 @@ CONDITIONS = ("nominal", "mismatch")
 WITH_TERM = "SIM2GP with the term"
 #: Model-predictive control, and off-policy learning in the sampled world.
 PLANNERS: dict[str, AbstractPlanner] = {"mpc": MPC(), "sac": SAC()}
-#: Of a quick look: three sequences in eight, in the same proportions, smaller policies,
-#: and networks trained for a quarter as long.
+#: Of a quick look: three sequences in eight, in the same proportions, policies trained
+#: for a third as long, and networks for a quarter.
 QUICK_PLANNERS: dict[str, AbstractPlanner] = {
     "mpc": MPC(update=ICEM(samples=60, elites=6)),
-    "sac": SAC(hidden=(64, 64), updates=10),
+    "sac": SAC(updates=10),
 }
 QUICK_TRAINING = {"steps": 500, "refit_steps": 200}
 PERIOD = 0.02  # s, of the control on every task

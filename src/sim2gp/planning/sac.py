@@ -118,19 +118,21 @@ class SAC(AbstractPlanner):
     updates: gradient steps after each step of all worlds, on ``batch`` rows.
     capacity: of the replay, in preparations.
     replayed: share of the episodes that begin where the real machine has been.
+    scattered: share of those that begin anywhere: a world, unlike a machine, can.
     discount, rate, slow: of rewards per step, of Adam, of the critics' slow copies.
     scale: of the rewards, against the entropy of the policy.
     """
 
-    hidden: tuple[int, ...] = eqx.field(static=True, default=(128, 128))
+    hidden: tuple[int, ...] = eqx.field(static=True, default=(64, 64))
     worlds: int = eqx.field(static=True, default=64)
     steps: int = eqx.field(static=True, default=400)
     updates: int = eqx.field(static=True, default=32)
     batch: int = eqx.field(static=True, default=256)
     capacity: int = eqx.field(static=True, default=4)
     replayed: float | Scalar = 0.3
+    scattered: float | Scalar = 0.5
     discount: float | Scalar = 0.99
-    rate: float | Scalar = 3e-4
+    rate: float | Scalar = 1e-3
     slow: float | Scalar = 0.005
     scale: float | Scalar = 1.0
 
@@ -181,10 +183,13 @@ def _trained(
 
     def fresh(key: Key) -> State:
         where, which, how = jax.random.split(key, 3)
-        count = jnp.sum(mask)
+        start, count = world.reset(how), jnp.sum(mask)
         row = jax.random.randint(which, (), 0, jnp.maximum(count, 1))
-        seen = (count > 0) & (jax.random.uniform(where) < sac.replayed)
-        return jnp.where(seen, starts[row], world.reset(how))
+        u = jax.random.uniform(where)
+        replayed = (count > 0) & (u < sac.replayed)
+        scattered = (world.seen is not None) & (u > 1.0 - sac.scattered)
+        start = jnp.where(scattered, elsewhere(world, start, which), start)
+        return jnp.where(replayed, starts[row], start)
 
     def turn(carry: Any, key: Key) -> tuple[Any, None]:
         learner, rollouts = carry
@@ -208,6 +213,16 @@ def _trained(
     # A world that could never be followed has taught nothing.
     taught = jnp.any(learner.replay.valid)
     return eqx.tree_at(lambda l: l.taught, learner, taught)
+
+
+def elsewhere(world: World, start: State, key: Key) -> State:
+    """``start`` with what a policy sees of it drawn from the box that is trusted."""
+    observe = world.observe
+    half = observe.scale
+    if observe.angle is not None:
+        half = half.at[observe.angle].set(jnp.pi)
+    x = half * jax.random.uniform(key, half.shape, half.dtype, -1.0)
+    return jnp.concatenate([x, start[half.size :]])
 
 
 def _stepped(

@@ -1,0 +1,149 @@
+"""What was learned, for machines and tools that know nothing of JAX.
+
+Both are run directories: written at once or not at all, checked when they are read.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sim2gp.errors import InputError
+from sim2gp.models import AbstractBelief
+from sim2gp.planning import Policy
+from sim2gp.robot.policy import FORMAT
+from sim2gp.runs import new_run
+from sim2gp.systems import AbstractSystem, Channel
+from sim2gp.types import Key, in_float64, single
+
+
+def export_policy(policy: Policy, out: Path | str, system: AbstractSystem) -> None:
+    """Write a trained policy for `load_policy`; ``system`` names its channels.
+
+    Raises ValueError where the policy sees another number of states.
+    """
+    if policy.observe.scale.size != len(system.states):
+        seen, known = policy.observe.scale.size, len(system.states)
+        raise ValueError(f"the policy sees {seen} states, the system has {known}")
+    layers = policy.actor.weights, policy.actor.biases
+    arrays = {
+        f"{name}/{i}": x
+        for name, each in zip(("weights", "biases"), layers, strict=True)
+        for i, x in enumerate(each)
+    }
+    # An angle is seen by its sine and cosine, whatever its scale, which may be inf.
+    angle, scale = policy.observe.angle, np.array(policy.observe.scale)
+    if angle is not None:
+        scale[angle] = 1.0
+    arrays |= {"scale": scale, "low": policy.box.low, "high": policy.box.high}
+    about = {
+        "format": FORMAT,
+        "layers": len(policy.actor.weights),
+        "states": [channel.name for channel in system.states],
+        "actions": [channel.name for channel in system.actions],
+        "units": _units([*system.states, *system.actions]),
+        "angle": angle,
+    }
+    with new_run(out, "export policy") as writer:
+        single = {name: np.asarray(x, np.float32) for name, x in arrays.items()}
+        writer.write_arrays("arrays.npz", single)
+        writer.write_summary({"title": "A trained policy", "policy": about})
+
+
+def export_model(
+    belief: AbstractBelief,
+    out: Path | str,
+    system: AbstractSystem,
+    *,
+    dt: float,
+    draws: int,
+    key: Key,
+    compiled: bool = False,
+) -> None:
+    """Write a belief's constants, correlated draws of them, and perhaps its mean step.
+
+    ``arrays.npz`` holds ``draws/NAME``, in physical units: row ``i`` of all of them is
+    one machine, for whatever trainer randomises its simulator. ``compiled`` adds
+    ``step.jax``, the mean step ``(s, a) -> s'`` over ``dt`` seconds in float32, for
+    `jax.export.deserialize`; whether another version of JAX reads it is JAX's word.
+    Raises `InputError` E134 where the belief has no constants, E135 where writing
+    compiled code needs what is not installed.
+    """
+    known = getattr(belief, "posterior", None)
+    if known is None or known.mean.size != len(system.parameters):
+        raise InputError(
+            "E134",
+            f"no constants in a belief of type {type(belief).__name__}",
+            expected="the posterior of a simulator's constants",
+            fix="export the simulator's own belief",
+        )
+    rows, central = _constants(belief, system, draws, key)
+    table = system.parameters
+    units = dict(zip(table.names, table.units, strict=True))
+    constants = {
+        name: {
+            "unit": units.get(name),
+            "map": central[name],
+            "sd": float(np.std(rows[name])) if draws > 1 and name in units else None,
+        }
+        for name in central
+    }
+    about = {
+        "system": type(system).__name__,
+        "dt": dt,
+        "draws": draws,
+        "constants": constants,
+        "states": [channel.name for channel in system.states],
+        "actions": [channel.name for channel in system.actions],
+        "units": _units([*system.states, *system.actions]),
+    }
+    code = _compiled(belief, system) if compiled else None
+    with new_run(out, "export model") as writer:
+        named = {f"draws/{name}": value for name, value in rows.items()}
+        writer.write_arrays("arrays.npz", named)
+        if code is not None:
+            writer.write_bytes("step.jax", code)
+        writer.write_summary({"title": "A learned simulator", "model": about})
+
+
+@in_float64
+def _constants(
+    belief: Any, system: AbstractSystem, draws: int, key: Key
+) -> tuple[dict[str, np.ndarray], dict[str, float]]:
+    """Draws of every constant by name, and the one at the posterior's mean."""
+    table, posterior = system.parameters, belief.posterior
+    tt = jax.vmap(posterior.sample)(jax.random.split(key, draws))
+    rows = jax.vmap(table.values)(tt)
+    central = table.values(posterior.mean)
+    return (
+        {name: np.broadcast_to(np.asarray(x), (draws,)) for name, x in rows.items()},
+        {name: float(x) for name, x in central.items()},
+    )
+
+
+def _compiled(belief: AbstractBelief, system: AbstractSystem) -> bytes:
+    from jax import export
+
+    step = single(belief.point())
+    shapes = [
+        jax.ShapeDtypeStruct((len(each),), jnp.float32)
+        for each in (system.states, system.actions)
+    ]
+    exported = export.export(jax.jit(lambda s, a: step(s, a)))(*shapes)
+    try:
+        return bytes(exported.serialize())
+    except ImportError as error:
+        raise InputError(
+            "E135",
+            "compiled code cannot be written",
+            got=str(error),
+            expected="flatbuffers",
+            fix="pip install 'sim2gp[deploy]', or leave compiled out",
+        ) from error
+
+
+def _units(channels: Sequence[Channel]) -> dict[str, str]:
+    return {channel.name: channel.unit for channel in channels}

@@ -1,0 +1,183 @@
+"""What leaves the project: a policy that needs no JAX, constants for other trainers."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sim2gp.errors import InputError, NotFinite
+from sim2gp.flight import oracle_world
+from sim2gp.models import NLM, Sim2GP
+from sim2gp.planning import SAC, Observation, Policy
+from sim2gp.robot import load_policy
+from sim2gp.robot.export import export_model, export_policy
+from sim2gp.runs import load_run, new_run
+from sim2gp.systems import CartPole, Furuta
+from sim2gp.tasks import furuta_swingup
+
+KEY = jax.random.key(0)
+TASK, SYSTEM = furuta_swingup(), Furuta()
+
+
+@pytest.fixture(scope="module")
+def policy() -> Policy:
+    """Of networks as they begin, with wider layers than any action needs."""
+    world = oracle_world(TASK)
+    learner = SAC().init(world, key=KEY)
+    actor = jax.tree.map(lambda x: 3.0 * x, learner.actor)
+    return Policy(actor, world.observe, world.actions)
+
+
+@pytest.fixture(scope="module")
+def folder(policy: Policy, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("policy") / "policy"
+    export_policy(policy, out, SYSTEM)
+    return out
+
+
+def test_numpy_does_what_jax_does(policy: Policy, folder: Path) -> None:
+    """On 10,000 states, turned and fast ones as well."""
+    run = load_policy(folder)
+    reach = np.asarray([3.0, 40.0, 20.0, 40.0])
+    S = np.random.default_rng(0).uniform(-reach, reach, (10_000, 4)).astype("f4")
+    expected = np.asarray(jax.vmap(policy)(jnp.asarray(S)))
+    got = np.stack([run(s) for s in S])
+    assert got.dtype == np.float32
+    np.testing.assert_allclose(got, expected, rtol=0.0, atol=1e-5)
+    assert expected.std() > 1.0
+    assert run.states == tuple(c.name for c in SYSTEM.states)
+    assert np.abs(got).max() <= 5.0
+
+
+def test_states_without_an_angle(policy: Policy, tmp_path: Path) -> None:
+    plain = eqx.tree_at(
+        lambda p: (p.observe, p.actor.weights[0]),
+        policy,
+        (
+            Observation(jnp.asarray([1.0, 2.0, 3.0, 4.0])),
+            policy.actor.weights[0][:4],
+        ),
+    )
+    export_policy(plain, tmp_path / "plain", SYSTEM)
+    s = np.asarray([0.1, 3.0, -1.0, 2.0], "f4")
+    expected = np.asarray(plain(jnp.asarray(s)))
+    np.testing.assert_allclose(load_policy(tmp_path / "plain")(s), expected, atol=1e-5)
+
+
+def test_a_control_computer_needs_no_jax(folder: Path) -> None:
+    code = (
+        "import sys; from sim2gp.robot import load_policy\n"
+        f"a = load_policy({str(folder)!r})([0.1, 0.2, 0.3, 0.4])\n"
+        "assert a.shape == (1,), a\n"
+        "assert not {'jax', 'equinox', 'scipy'} & set(sys.modules)\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+def test_no_action_is_made_of_nothing(folder: Path) -> None:
+    run = load_policy(folder)
+    for bad in (np.nan, np.inf, -np.inf):
+        with pytest.raises(NotFinite, match="E203"):
+            run(np.asarray([0.0, 0.0, bad, bad]))
+    with pytest.raises(ValueError, match="shape"):
+        run(np.zeros(3))
+
+
+def test_what_is_no_policy_is_refused(folder: Path, tmp_path: Path) -> None:
+    with new_run(tmp_path / "other", "another") as writer:
+        writer.write_summary({})
+    with pytest.raises(InputError, match=r"E133.*another run"):
+        load_policy(tmp_path / "other")
+    found = load_run(folder)
+    about = found.summary["policy"]
+
+    def written(name: str, about: dict, arrays: dict) -> Path:
+        with new_run(tmp_path / name, "export policy") as writer:
+            writer.write_arrays("arrays.npz", arrays)
+            writer.write_summary({"policy": about})
+        return tmp_path / name
+
+    arrays = found.arrays
+    newer = written("newer", about | {"format": 2}, arrays)
+    few = {k: v for k, v in arrays.items() if k != "biases/1"}
+    bad = arrays | {"scale": arrays["scale"] * np.float32("nan")}
+    wide = arrays | {"scale": arrays["scale"].astype(float)}
+    for place, got in (
+        (newer, "another format"),
+        (written("few", about, few), "biases/1"),
+        (written("bad", about, bad), "not finite float32"),
+        (written("wide", about, wide), "not finite float32"),
+    ):
+        with pytest.raises(InputError, match=f"E133.*{got}"):
+            load_policy(place)
+    content = (folder / "arrays.npz").read_bytes()
+    try:
+        (folder / "arrays.npz").write_bytes(content[:-9] + b"x" + content[-8:])
+        with pytest.raises(InputError, match="E183"):
+            load_policy(folder)
+    finally:
+        (folder / "arrays.npz").write_bytes(content)
+
+
+def test_a_policy_of_another_machine_is_not_named_after_this_one(
+    policy: Policy, tmp_path: Path
+) -> None:
+    few = eqx.tree_at(lambda p: p.observe.scale, policy, jnp.ones(3))
+    with pytest.raises(ValueError, match="3 states, the system has 4"):
+        export_policy(few, tmp_path / "few", SYSTEM)
+    assert not (tmp_path / "few").exists()
+
+
+def test_draws_are_machines_and_keep_what_ties_their_constants(tmp_path: Path) -> None:
+    """Row by row the posterior's own draws: moments in virtual space."""
+    system = CartPole()
+    belief = Sim2GP(system).init(KEY)
+    p = belief.posterior.mean.size
+    mix = np.random.default_rng(1).normal(size=(p, p)) / np.sqrt(p)
+    with jax.enable_x64(True):
+        scale = jnp.asarray(0.3 * mix)
+    belief = eqx.tree_at(lambda b: b.posterior.scale, belief, scale)
+    out = tmp_path / "model"
+    export_model(belief, out, system, dt=0.02, draws=4000, key=KEY)
+    run = load_run(out)
+    table = system.parameters
+    rows = np.stack([run.arrays[f"draws/{name}"] for name in table.names], axis=1)
+    with jax.enable_x64(True):
+        tt = np.asarray(jax.vmap(table.unconstrain)(jnp.asarray(rows)))
+    cov = 0.09 * mix @ mix.T
+    np.testing.assert_allclose(np.cov(tt.T), cov, atol=0.12 * np.diag(cov).max())
+    about = run.summary["model"]
+    name = table.names[0]
+    assert about["constants"][name]["unit"] == table.units[0]
+    low, high = np.quantile(rows[:, 0], [0.45, 0.55])
+    assert low <= about["constants"][name]["map"] <= high
+    assert not (out / "step.jax").exists()
+
+
+def test_a_compiled_step_comes_back(tmp_path: Path) -> None:
+    pytest.importorskip("flatbuffers", reason="sim2gp[deploy] is not installed")
+    from jax import export
+
+    belief = Sim2GP(SYSTEM).init(KEY)
+    out = tmp_path / "model"
+    export_model(belief, out, SYSTEM, dt=0.02, draws=2, key=KEY, compiled=True)
+    step = export.deserialize(bytearray((out / "step.jax").read_bytes())).call
+    s, a = jnp.asarray([0.1, 0.5, 1.0, -2.0]), jnp.asarray([2.0])
+    central = load_run(out).summary["model"]["constants"]
+    record = SYSTEM.record(
+        {k: jnp.asarray(v["map"], jnp.float32) for k, v in central.items()}
+    )
+    expected = SYSTEM.bind(record, 0.02)(s, a)
+    np.testing.assert_allclose(step(s, a), expected, rtol=1e-5, atol=1e-6)
+
+
+def test_a_belief_without_constants_is_refused(tmp_path: Path) -> None:
+    belief = NLM(SYSTEM, hidden=(4,)).init(KEY)
+    with pytest.raises(InputError, match="E134"):
+        export_model(belief, tmp_path / "m", SYSTEM, dt=0.02, draws=2, key=KEY)
+    assert not (tmp_path / "m").exists()
