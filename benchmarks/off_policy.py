@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any
 
 import equinox as eqx
-import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -47,26 +46,30 @@ WIDTHS = (64, 128)
 OURS = replace(SAC(), steps=100, capacity=16)
 
 
-class WorldEnv(gymnasium.Env):
+def wrapped(world: World, seed: int) -> Any:
     """A world, one at a time, as Gymnasium sees it; actions in the unit box."""
+    import gymnasium
 
-    def __init__(self, world: World, seed: int) -> None:
-        m, size = world.actions.low.size, world.observe.size
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (m,))
-        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,))
-        self.world, self.key = world, jax.random.key(seed)
+    m, size = world.actions.low.size, world.observe.size
 
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        self.key, key = jax.random.split(self.key)
-        self.state, seen = _reset(self.world, key)
-        self.steps = 0
-        return np.asarray(seen), {}
+    class WorldEnv(gymnasium.Env):
+        action_space = gymnasium.spaces.Box(-1.0, 1.0, (m,))
+        observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,))
+        key = jax.random.key(seed)
 
-    def step(self, action: np.ndarray) -> Any:
-        self.state, seen, reward = _step(self.world, self.state, action)
-        self.steps += 1
-        over = self.steps >= self.world.horizon
-        return np.asarray(seen), float(reward), False, over, {}
+        def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+            self.key, key = jax.random.split(self.key)
+            self.state, seen = _reset(world, key)
+            self.steps = 0
+            return np.asarray(seen), {}
+
+        def step(self, action: np.ndarray) -> Any:
+            self.state, seen, reward = _step(world, self.state, action)
+            self.steps += 1
+            over = self.steps >= world.horizon
+            return np.asarray(seen), float(reward), False, over, {}
+
+    return WorldEnv()
 
 
 @eqx.filter_jit
@@ -123,7 +126,7 @@ def ours(task: Task, oracle: float, seed: int) -> list[tuple[float, float]]:
         learner = OURS.prepare(learner, world, nothing, key=again)
         jax.block_until_ready(learner.updates)
         seconds = time.perf_counter() - started - away
-        policy = OURS.policy(learner, world)
+        policy = learner.policy
         share = flown(task, lambda s, p=policy: _policy(p, s), key) / oracle
         away = time.perf_counter() - started - seconds
         looks.append((seconds, share))
@@ -135,7 +138,7 @@ def theirs(task: Task, oracle: float, seed: int, most: float) -> Any:
     world, key = oracle_world(task), jax.random.key(seed)
     looks: list[tuple[float, float]] = []
     started, away = time.perf_counter(), 0.0
-    model = Theirs("MlpPolicy", WorldEnv(world, seed), seed=seed)
+    model = Theirs("MlpPolicy", wrapped(world, seed), seed=seed)
 
     def act(s: jax.Array) -> Any:
         seen = np.asarray(world.observe(s))
@@ -169,7 +172,7 @@ def speed_ours(world: World, width: int) -> float:
 
 def speed_theirs(world: World, width: int, worlds: int) -> float:
     """Steps with as many updates, per second, compiled before."""
-    envs = DummyVecEnv([lambda i=i: WorldEnv(world, i) for i in range(worlds)])
+    envs = DummyVecEnv([lambda i=i: wrapped(world, i) for i in range(worlds)])
     model = Theirs(
         "MlpPolicy",
         envs,

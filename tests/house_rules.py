@@ -28,6 +28,7 @@ SIBLINGS: frozenset[tuple[str, str]] = frozenset(
         ("cli", "report"),
         ("experiments", "report"),
         ("randomised", "flight"),
+        ("robot", "runs"),
         ("ahead", "types"),
         ("descent", "types"),
         ("gaussian", "linalg"),

@@ -30,7 +30,7 @@ def policy() -> Policy:
     world = oracle_world(TASK)
     learner = SAC().init(world, key=KEY)
     actor = jax.tree.map(lambda x: 3.0 * x, learner.actor)
-    return Policy(actor, world.observe, world.actions)
+    return eqx.tree_at(lambda l: l.actor, learner, actor).policy
 
 
 @pytest.fixture(scope="module")

@@ -53,7 +53,7 @@ def test_a_policy_sees_the_machine_and_not_its_constants() -> None:
     np.testing.assert_array_equal(here.observe(x), here.observe(other))
     planner = SAC(hidden=(8,), worlds=4, steps=3, updates=1)
     learner = planner.init(here, key=KEY)
-    policy = planner.policy(learner, here)
+    policy = learner.policy
     np.testing.assert_array_equal(policy(x), policy(x[:4]))
     assert policy(x).shape == TASK.actions.low.shape
 

@@ -115,7 +115,7 @@ def test_the_actor_finds_what_the_reward_asks_of_each_state() -> None:
     """``-(a - s/2)^2``."""
     planner = discounted(0.0, scale=10.0)
     here = world(STAY, reward(aa=-1.0, sa=1.0, ss=-0.25))
-    policy = planner.policy(trained(planner, here), here)
+    policy = trained(planner, here).policy
     for s in (-0.8, 0.0, 0.8):
         assert float(policy(jnp.asarray([s]))[0]) == pytest.approx(0.5 * s, abs=0.1)
 
@@ -135,7 +135,7 @@ def test_a_policy_plans_ahead() -> None:
     planner = dataclasses.replace(SMALL, hidden=(64, 64), steps=200, discount=0.98)
     data = Transitions.empty(1, 2, 1)
     learner = trained(planner, here, data, times=3)
-    policy = planner.policy(learner, here)
+    policy = learner.policy
     P = solve_discrete_are(A, B, Q, R)
     K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
     ratios = []

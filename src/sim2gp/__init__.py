@@ -44,6 +44,7 @@ _CONTENTS = {
     "MPC": "planning",
     "ICEM": "planning",
     "MPPI": "planning",
+    "SAC": "planning",
     "Task": "tasks",
     "episode": "flight",
     "posterior_sampling": "loops",

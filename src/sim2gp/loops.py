@@ -46,7 +46,8 @@ class History(eqx.Module):
     """A whole run, as numpy arrays: E episodes of T steps.
 
     ``parameter_mean`` and ``parameter_sd`` (virtual) have E + 1 rows, the prior first;
-    they are None for beliefs without parameters. ``belief`` has seen all episodes.
+    they are None for beliefs without parameters. ``belief`` has seen all episodes;
+    ``planner`` is the planner's last state, in which SAC keeps its policy.
     """
 
     state: Float[np.ndarray, "E times n"]
@@ -57,6 +58,7 @@ class History(eqx.Module):
     parameter_sd: Float[np.ndarray, "rounds p"] | None
     belief: AbstractBelief
     data: Transitions
+    planner: Any
 
     @property
     def returns(self) -> Float[np.ndarray, " E"]:
@@ -133,7 +135,7 @@ def posterior_sampling(
         summaries.append(_parameters(belief))
         if on_episode is not None:
             on_episode(Episode(e, trajectory, belief))
-    return _history(trajectories, summaries, belief, data)
+    return _history(trajectories, summaries, belief, data, planner_state)
 
 
 def within(
@@ -301,6 +303,7 @@ def _history(
     summaries: list[tuple[np.ndarray, np.ndarray] | None],
     belief: AbstractBelief,
     data: Transitions,
+    planner: Any,
 ) -> History:
     flown = jax.tree.map(lambda *leaves: np.stack(leaves), *trajectories)
     known = [summary for summary in summaries if summary is not None]
@@ -314,4 +317,5 @@ def _history(
         np.stack([sd for _, sd in known]) if complete else None,
         belief,
         data,
+        planner,
     )

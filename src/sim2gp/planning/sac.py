@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp.descent import Moments, adam, adam_step
-from sim2gp.planning.base import AbstractPlanner, World
+from sim2gp.planning.base import AbstractPlanner, Observation, World
 from sim2gp.planning.mpc import from_unit
 from sim2gp.planning.networks import (
     MLP,
@@ -30,7 +30,7 @@ from sim2gp.planning.networks import (
     squashed,
     values,
 )
-from sim2gp.types import Action, Key, Scalar, State
+from sim2gp.types import Action, Box, Key, Scalar, State
 
 
 class Replay(eqx.Module):
@@ -93,6 +93,9 @@ class Learner(eqx.Module):
     ``taught`` says whether anything in the replay could be followed.
     """
 
+    observe: Observation
+    box: Box
+
     actor: MLP
     critics: Critics
     targets: Critics
@@ -101,6 +104,11 @@ class Learner(eqx.Module):
     updates: Int[Array, ""]
     taught: Bool[Array, ""]
     replay: Replay
+
+    @property
+    def policy(self) -> Policy:
+        """What was trained, ready for a machine."""
+        return Policy(self.actor, self.observe, self.box)
 
 
 class Rollouts(eqx.Module):
@@ -139,16 +147,25 @@ class SAC(AbstractPlanner):
     def init(self, world: World, *, key: Key) -> Learner:
         first, second, third = jax.random.split(key, 3)
         n, m = world.reset(third).size, world.actions.low.size
-        observed = world.observe.size
-        actor = MLP.random(first, (observed, *self.hidden, 2 * m))
-        critics = random_critics(second, observed, m, self.hidden)
+        observe = world.observe
+        actor = MLP.random(first, (observe.size, *self.hidden, 2 * m))
+        critics = random_critics(second, observe.size, m, self.hidden)
         log_temperature = jnp.zeros(())
         moments = adam(critics), adam(actor), adam(log_temperature)
         rows = self.capacity * self.worlds * self.steps
         replay = Replay.empty(rows, n, m)
         none, taught = jnp.zeros((), int), jnp.asarray(False)
         return Learner(
-            actor, critics, critics, log_temperature, moments, none, taught, replay
+            observe,
+            world.actions,
+            actor,
+            critics,
+            critics,
+            log_temperature,
+            moments,
+            none,
+            taught,
+            replay,
         )
 
     def prepare(self, state: Learner, world: World, data: Any, *, key: Key) -> Learner:
@@ -158,15 +175,11 @@ class SAC(AbstractPlanner):
     def act(
         self, state: Learner, world: World, s: State, *, key: Key
     ) -> tuple[Action, Learner]:
-        del key  # draws of the belief explore, not the policy
-        return self.policy(state, world)(s), state
+        del world, key  # draws of the belief explore, not the policy
+        return state.policy(s), state
 
     def failed(self, state: Learner) -> Bool[Array, ""]:
         return ~state.taught
-
-    def policy(self, state: Learner, world: World) -> Policy:
-        """What was trained, ready for a machine."""
-        return Policy(state.actor, world.observe, world.actions)
 
 
 @eqx.filter_jit
@@ -292,6 +305,8 @@ def _updated(sac: SAC, learner: Learner, world: World, key: Key) -> Learner:
     )
     moments = of_critics, of_actor, of_temperature
     return Learner(
+        learner.observe,
+        learner.box,
         actor,
         critics,
         targets,

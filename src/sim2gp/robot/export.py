@@ -29,7 +29,7 @@ def export_policy(policy: Policy, out: Path | str, system: AbstractSystem) -> No
         seen, known = policy.observe.scale.size, len(system.states)
         raise ValueError(f"the policy sees {seen} states, the system has {known}")
     layers = policy.actor.weights, policy.actor.biases
-    arrays = {
+    arrays: dict[str, Any] = {
         f"{name}/{i}": x
         for name, each in zip(("weights", "biases"), layers, strict=True)
         for i, x in enumerate(each)
