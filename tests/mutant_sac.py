@@ -3,6 +3,7 @@
 from mutant_list import Mutant
 
 SAC, NETWORKS = "planning/sac.py", "planning/networks.py"
+RANDOMISED, POLICY, EXPORT = "randomised.py", "robot/policy.py", "robot/export.py"
 
 OFF_POLICY = (
     Mutant(
@@ -78,8 +79,8 @@ OFF_POLICY = (
     Mutant(
         "sac: episodes never begin where the machine was",
         SAC,
-        "return jnp.where(seen, starts[row], world.reset(how))",
-        "return world.reset(how)",
+        "return jnp.where(replayed, starts[row], start)",
+        "return start",
         ("test_sac.py", "where_the_machine"),
     ),
     Mutant(
@@ -88,5 +89,69 @@ OFF_POLICY = (
         "jnp.sum(normal - slope)",
         "jnp.sum(normal)",
         ("test_sac.py", "squashed or temperature"),
+    ),
+    Mutant(
+        "sac: episodes never begin anywhere",
+        SAC,
+        "elsewhere(world, start, which)",
+        "start",
+        ("test_sac.py", "no_machine"),
+    ),
+    Mutant(
+        "sac: an angle is scattered over half of its turn",
+        SAC,
+        "set(jnp.pi)",
+        "set(0.5 * jnp.pi)",
+        ("test_sac.py", "no_machine"),
+    ),
+    Mutant(
+        "sac: empty rows become steps",
+        SAC,
+        "valid = valid & (jnp.arange(len(valid)) < self.count)",
+        "valid = valid",
+        ("test_sac.py", "tried_again"),
+    ),
+    Mutant(
+        "randomised: every episode has the mean machine",
+        RANDOMISED,
+        "self.constants.sample(which)",
+        "self.constants.mean",
+        ("test_randomised.py", "each_reset"),
+    ),
+    Mutant(
+        "randomised: constants wander",
+        RANDOMISED,
+        "return jnp.concatenate([s2, x[n:]])",
+        "return jnp.concatenate([s2, 0.99 * x[n:]])",
+        ("test_randomised.py", "each_reset"),
+    ),
+    Mutant(
+        "policy: infinity is a full action",
+        POLICY,
+        "np.isfinite(s).all() and np.isfinite(mean).all()",
+        "not np.isnan(s).any() and not np.isnan(mean).any()",
+        ("test_export.py", "made_of_nothing"),
+    ),
+    Mutant(
+        "policy: sine and cosine change places",
+        POLICY,
+        "np.sin(turn), np.cos(turn)",
+        "np.cos(turn), np.sin(turn)",
+        ("test_export.py", "jax_does"),
+    ),
+    Mutant(
+        "policy: damaged numbers are run",
+        POLICY,
+        "x.dtype != np.float32 or not np.isfinite(x).all()",
+        "x.dtype != np.float32",
+        ("test_export.py", "refused"),
+    ),
+    Mutant(
+        "export: constants are drawn apart from each other",
+        EXPORT,
+        "jax.vmap(posterior.sample)(jax.random.split(key, draws))",
+        "posterior.mean + posterior.sd() * jax.random.normal("
+        "key, (draws, posterior.mean.size))",
+        ("test_export.py", "draws_are_machines"),
     ),
 )
