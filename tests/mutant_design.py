@@ -33,11 +33,11 @@ DESIGN = (
         TOLD,
     ),
     Mutant(
-        "design: a prediction from the start alone",
+        "design: commands come a period early",
         EXPERIMENT,
         "whole = _piece(experiment, U, 0, experiment.steps)",
         "whole = _piece(experiment, U, 1, experiment.steps)",
-        TOLD,
+        ("test_design.py", "as_the_system_steps"),
     ),
     Mutant(
         "goal: the rest is taken for known",

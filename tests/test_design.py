@@ -103,6 +103,20 @@ def test_it_tells_what_the_log_of_it_would(system) -> None:
     np.testing.assert_allclose(scale @ scale.T, np.linalg.inv(precision), rtol=1e-6)
 
 
+def test_a_plan_moves_as_the_system_steps() -> None:
+    """Period by period, but for the blur of the inputs' edges."""
+    system = pendulum()
+    e, U = experiment(system), commands()
+    states = np.asarray(TRAJECTORY(e, jnp.zeros_like(e.belief.mean), U))
+    with jax.enable_x64(True):
+        params = e.record(jnp.zeros_like(e.belief.mean))
+        step = jax.jit(lambda s, a: system.step(params, s, a, PERIOD))
+        s = np.asarray(e.start)
+        for k, a in enumerate(np.asarray(U)):
+            s = np.asarray(step(jnp.asarray(s), jnp.asarray(a)))
+            np.testing.assert_allclose(states[k + 1], s, rtol=1e-3, atol=1e-3)
+
+
 # ----------------------------------------------------------------- goals
 def test_goals_are_those_of_dense_covariances() -> None:
     rng = np.random.default_rng(0)
