@@ -35,8 +35,8 @@ DESIGN = (
     Mutant(
         "design: commands come a period early",
         EXPERIMENT,
-        "whole = _piece(experiment, U, 0, experiment.steps)",
-        "whole = _piece(experiment, U, 1, experiment.steps)",
+        "(jnp.arange(rows, dtype=U.dtype) - before)",
+        "(jnp.arange(rows, dtype=U.dtype) - before - 1)",
         ("test_design.py", "as_the_system_steps"),
     ),
     Mutant(
