@@ -38,9 +38,12 @@ lint: $(VENV)/.test
 types: $(VENV)/.test
 	$(BIN)/mypy
 
-# Two processes, whole files each: what a file compiles is compiled once.
+# Two processes, whole files each, and one cache of what they compile, begun anew.
 unit: $(VENV)/.test
-	$(BIN)/python -m pytest -m "not nightly" -n 2 --dist loadfile $(ARGS)
+	@cache=$$(mktemp -d) && trap 'rm -rf "$$cache"' EXIT && \
+	  export JAX_COMPILATION_CACHE_DIR="$$cache" && \
+	  export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0.3 && \
+	  $(BIN)/python -m pytest -m "not nightly" -n 2 --dist loadfile $(ARGS)
 
 nightly: $(VENV)/.test
 	$(BIN)/python -m pytest -m nightly $(ARGS)

@@ -14,7 +14,7 @@ from sim2gp.errors import InputError, NotFinite
 from sim2gp.flight import oracle_world
 from sim2gp.models import NLM, Sim2GP
 from sim2gp.planning import SAC, Observation, Policy
-from sim2gp.robot import load_policy
+from sim2gp.robot import NumpyPolicy, load_policy
 from sim2gp.robot.export import export_model, export_policy
 from sim2gp.runs import load_run, new_run
 from sim2gp.systems import CartPole, Furuta
@@ -86,6 +86,13 @@ def test_no_action_is_made_of_nothing(folder: Path) -> None:
             run(np.asarray([0.0, 0.0, bad, bad]))
     with pytest.raises(ValueError, match="shape"):
         run(np.zeros(3))
+    one, none = np.ones((1, 1), "f4"), np.zeros(1, "f4")
+    wide = NumpyPolicy(
+        ("x",), ("u",), (one, one), (none, none), one[0], -one[0], one[0], None
+    )
+    assert wide(np.asarray([5.0]))[0] == pytest.approx(np.tanh(5.0))
+    with pytest.raises(NotFinite, match="E203"):
+        wide(np.asarray([np.inf]))
 
 
 def test_what_is_no_policy_is_refused(folder: Path, tmp_path: Path) -> None:

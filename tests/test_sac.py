@@ -107,7 +107,7 @@ def test_values_are_discounted_one_step_at_a_time() -> None:
 
 def test_time_that_is_up_is_no_end() -> None:
     """Episodes of one step, a reward of 1: the value is that of going on for ever."""
-    learner = trained(discounted(0.8), world(STAY, reward(one=1.0)), times=3)
+    learner = trained(discounted(0.8), world(STAY, reward(one=1.0)))
     assert worth(learner, 0.3, 0.2) == pytest.approx(5.0, rel=0.05)
 
 
