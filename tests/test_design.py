@@ -105,12 +105,11 @@ def test_it_tells_what_the_log_of_it_would(system) -> None:
 
 def test_a_plan_moves_as_the_system_steps() -> None:
     """Period by period, but for the blur of the inputs' edges."""
-    system = pendulum()
-    e, U = experiment(system), commands()
+    e, U = experiment(), commands()
     states = np.asarray(TRAJECTORY(e, jnp.zeros_like(e.belief.mean), U))
     with jax.enable_x64(True):
         params = e.record(jnp.zeros_like(e.belief.mean))
-        step = jax.jit(lambda s, a: system.step(params, s, a, PERIOD))
+        step = jax.jit(lambda s, a: e.system.step(params, s, a, PERIOD))
         s = np.asarray(e.start)
         for k, a in enumerate(np.asarray(U)):
             s = np.asarray(step(jnp.asarray(s), jnp.asarray(a)))
