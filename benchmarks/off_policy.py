@@ -32,7 +32,7 @@ from sim2gp.experiments.swingup import Cell, fly_cell, meeting, reference
 from sim2gp.flight import Purpose, key_for, oracle_world
 from sim2gp.planning import SAC, World
 from sim2gp.planning.mpc import from_unit
-from sim2gp.planning.sac import Learner
+from sim2gp.planning.sac import Learner, made
 from sim2gp.tasks import MACHINES, Task
 from sim2gp.transitions import Transitions
 
@@ -80,9 +80,7 @@ def _reset(world: World, key: jax.Array) -> Any:
 
 @eqx.filter_jit
 def _step(world: World, s: jax.Array, u: jax.Array) -> Any:
-    a = from_unit(u[None], world.actions)[0]
-    s2, _ = world.step(s, a)
-    _, reward = world.objective.step((), s, a, s2)
+    s2, reward, _ = made(world, s, u)
     return s2, world.observe(s2), reward
 
 

@@ -22,7 +22,6 @@ KEY = jax.random.key(0)
 SMALL = SAC(
     hidden=(32,), worlds=16, steps=60, updates=20, batch=64, rate=3e-3, slow=0.02
 )
-# As arrays they are data, like the rewards: the probe worlds are one program.
 NOTHING = Transitions.empty(1, 1, 1)
 
 
@@ -65,7 +64,7 @@ def world(dynamics, reward, *, horizon=1) -> World:
 
 
 def discounted(discount: float, scale: float = 1.0) -> SAC:
-    """The small planner, with numbers that are data."""
+    """The small planner; its numbers are data, so the probe worlds are one program."""
     discount, scale = jnp.asarray(discount), jnp.asarray(scale)
     return dataclasses.replace(SMALL, discount=discount, scale=scale)
 

@@ -12,6 +12,7 @@ last step is bootstrapped like any other. What was tried in older worlds is trie
 in the new one (`Replay.again`): states and actions are kept, what follows is not.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -304,17 +305,14 @@ def _updated(sac: SAC, learner: Learner, world: World, key: Key) -> Learner:
         lambda old, new: old + sac.slow * (new - old), learner.targets, critics
     )
     moments = of_critics, of_actor, of_temperature
-    return Learner(
-        learner.observe,
-        learner.box,
-        actor,
-        critics,
-        targets,
-        log_temperature,
-        moments,
-        t + 1,
-        learner.taught,
-        replay,
+    return replace(
+        learner,
+        actor=actor,
+        critics=critics,
+        targets=targets,
+        log_temperature=log_temperature,
+        moments=moments,
+        updates=t + 1,
     )
 
 

@@ -3,7 +3,6 @@
 Both are run directories: written at once or not at all, checked when they are read.
 """
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from sim2gp.models import AbstractBelief
 from sim2gp.planning import Policy
 from sim2gp.robot.policy import FORMAT
 from sim2gp.runs import new_run
-from sim2gp.systems import AbstractSystem, Channel
+from sim2gp.systems import AbstractSystem
 from sim2gp.types import Key, in_float64, single
 
 
@@ -42,14 +41,12 @@ def export_policy(policy: Policy, out: Path | str, system: AbstractSystem) -> No
     about = {
         "format": FORMAT,
         "layers": len(policy.actor.weights),
-        "states": [channel.name for channel in system.states],
-        "actions": [channel.name for channel in system.actions],
-        "units": _units([*system.states, *system.actions]),
         "angle": angle,
+        **_channels(system),
     }
     with new_run(out, "export policy") as writer:
-        single = {name: np.asarray(x, np.float32) for name, x in arrays.items()}
-        writer.write_arrays("arrays.npz", single)
+        plain = {name: np.asarray(x, np.float32) for name, x in arrays.items()}
+        writer.write_arrays("arrays.npz", plain)
         writer.write_summary({"title": "A trained policy", "policy": about})
 
 
@@ -96,9 +93,7 @@ def export_model(
         "dt": dt,
         "draws": draws,
         "constants": constants,
-        "states": [channel.name for channel in system.states],
-        "actions": [channel.name for channel in system.actions],
-        "units": _units([*system.states, *system.actions]),
+        **_channels(system),
     }
     code = _compiled(belief, system) if compiled else None
     with new_run(out, "export model") as writer:
@@ -145,5 +140,11 @@ def _compiled(belief: AbstractBelief, system: AbstractSystem) -> bytes:
         ) from error
 
 
-def _units(channels: Sequence[Channel]) -> dict[str, str]:
-    return {channel.name: channel.unit for channel in channels}
+def _channels(system: AbstractSystem) -> dict[str, Any]:
+    """Names in the order of the arrays, and the unit of each."""
+    states, actions = system.states, system.actions
+    return {
+        "states": [channel.name for channel in states],
+        "actions": [channel.name for channel in actions],
+        "units": {channel.name: channel.unit for channel in (*states, *actions)},
+    }
