@@ -105,6 +105,13 @@ OFF_POLICY = (
         ("test_sac.py", "no_machine"),
     ),
     Mutant(
+        "sac: every box that is scattered in is the whole one",
+        SAC,
+        "half = observe.scale * jax.random.uniform(how_far, (), observe.scale.dtype)",
+        "half = observe.scale",
+        ("test_sac.py", "no_machine"),
+    ),
+    Mutant(
         "sac: empty rows become steps",
         SAC,
         "valid = valid & (jnp.arange(len(valid)) < self.count)",

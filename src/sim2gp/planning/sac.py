@@ -139,10 +139,10 @@ class SAC(AbstractPlanner):
     batch: int = eqx.field(static=True, default=256)
     capacity: int = eqx.field(static=True, default=4)
     replayed: float | Scalar = 0.3
-    scattered: float | Scalar = 0.5
+    scattered: float | Scalar = 0.6
     discount: float | Scalar = 0.99
     rate: float | Scalar = 1e-3
-    slow: float | Scalar = 0.005
+    slow: float | Scalar = 0.02
     scale: float | Scalar = 1.0
 
     def init(self, world: World, *, key: Key) -> Learner:
@@ -230,12 +230,17 @@ def _trained(
 
 
 def elsewhere(world: World, start: State, key: Key) -> State:
-    """``start`` with what a policy sees of it drawn from the box that is trusted."""
+    """``start`` with what a policy sees of it drawn from the box that is trusted.
+
+    As often from a small box as from a large one, an angle anywhere in its turn: there
+    is little room to be caught in near rest, in a corner of speeds there is much.
+    """
+    how_far, where = jax.random.split(key)
     observe = world.observe
-    half = observe.scale
+    half = observe.scale * jax.random.uniform(how_far, (), observe.scale.dtype)
     if observe.angle is not None:
         half = half.at[observe.angle].set(jnp.pi)
-    x = half * jax.random.uniform(key, half.shape, half.dtype, -1.0)
+    x = half * jax.random.uniform(where, half.shape, half.dtype, -1.0)
     return jnp.concatenate([x, start[half.size :]])
 
 
