@@ -278,3 +278,26 @@ def test_a_new_draw_is_new_data() -> None:
             first = count
     assert count == first
     assert int(learner.updates) == 3 * 5 * 2
+
+
+def test_seeds_side_by_side_are_seeds_one_by_one() -> None:
+    """A preparation is pure: several learners train as one batch, in their worlds."""
+    planner = dataclasses.replace(discounted(0.5), steps=4, updates=2)
+    draws = Scaled(jnp.asarray([1.0, -1.0]))
+
+    def train(dynamics: Scaled, key: Array) -> sac.Learner:
+        here = world(dynamics, reward(sa=1.0), horizon=3)
+        learner = planner.init(here, key=key)
+        return planner.prepare(learner, here, NOTHING, key=key)
+
+    def of(learner: sac.Learner) -> list[Array]:
+        return jax.tree.leaves(
+            eqx.filter((learner.actor, learner.replay), eqx.is_array)
+        )
+
+    keys = jax.random.split(KEY, 2)
+    both = of(eqx.filter_jit(eqx.filter_vmap(train))(draws, keys))
+    for i in range(2):
+        alone = of(train(Scaled(draws.c[i]), keys[i]))
+        for batch, one in zip(both, alone, strict=True):
+            np.testing.assert_allclose(batch[i], one, atol=1e-5)
