@@ -14,19 +14,17 @@ import numpy as np
 from jax import Array
 
 from sim2gp.parameters import Parameter, Parameters
-from sim2gp.systems import AbstractSystem, Channel
+from sim2gp.systems import AbstractODE, Channel
 from sim2gp.transitions import Transitions
 
 
-class Linear(AbstractSystem):
+class Linear(AbstractODE):
     """``d`` outputs; as many constants as the table has, of whatever map."""
 
     parameters: Parameters = eqx.field(static=True)
     d: int = eqx.field(static=True)
 
     max_substep: ClassVar[float] = 1.0
-    history: ClassVar[int] = 0
-    longest_delay: ClassVar[float] = 0.0
 
     @property
     def states(self) -> tuple[Channel, ...]:
@@ -42,12 +40,6 @@ class Linear(AbstractSystem):
 
     def ode(self, params: Array, s: Array, a: Array) -> Array:
         return a.reshape(self.d, -1) @ params
-
-    def delays(self, params: Array) -> Array:
-        return jnp.zeros(len(self.actions))
-
-    def mean_inputs(self, params: Array, held: Array, dt: float, count: int) -> Array:
-        return jnp.broadcast_to(held[:1], (count, held.shape[1]))
 
 
 def linear(p: int, d: int, kind: str = "identity", **spec: float) -> Linear:

@@ -28,7 +28,7 @@ from sim2gp.gaussian import Gaussian
 from sim2gp.laplace import AbstractLikelihood, Fit, expectation, multi_start
 from sim2gp.least_squares import factor
 from sim2gp.models.linearized import jacobian_by_columns, value_and_jacobian
-from sim2gp.systems.base import AbstractSystem, rk4
+from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import AnyArray, Key, Scalar, in_float64
 
 NOISE_ROUNDS = 8  # fewer leave noise and starts of real logs short of a fixed point
@@ -127,7 +127,7 @@ def simulate(
 
     def step(x: Array, row: tuple[Array, Array]) -> tuple[Array, Array]:
         h, u = row
-        x = rk4(lambda y, v: system.ode(params, y, v), x, u, h)
+        x = system.flow(params, x, u, h)
         return x, x
 
     blur = DELAY_BLUR if system.longest_delay else 0.0

@@ -3,6 +3,8 @@
 from sim2gp.systems.actuator import Actuated, ActuatedParams, actuator_prior
 from sim2gp.systems.base import (
     AbstractMechanism,
+    AbstractODE,
+    AbstractPlant,
     AbstractSystem,
     Bound,
     Channel,
@@ -26,6 +28,7 @@ from sim2gp.systems.effects import (
 from sim2gp.systems.furuta import Furuta, FurutaParams
 from sim2gp.systems.lag import Lagged, LaggedParams, lagged_means
 from sim2gp.systems.library import Candidate, InputLag, library
+from sim2gp.systems.mujoco import MuJoCo
 from sim2gp.systems.perturbed import (
     STRENGTHS,
     InputDelay,
@@ -47,6 +50,8 @@ __all__ = [
     "STRENGTHS",
     "AbstractEffect",
     "AbstractMechanism",
+    "AbstractODE",
+    "AbstractPlant",
     "AbstractSystem",
     "Actuated",
     "ActuatedParams",
@@ -68,6 +73,7 @@ __all__ = [
     "InputLag",
     "Lagged",
     "LaggedParams",
+    "MuJoCo",
     "Payload",
     "Perturbed",
     "PerturbedParams",

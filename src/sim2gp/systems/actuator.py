@@ -4,9 +4,9 @@
 
 Each is an ordinary constant, ``<input>.gain``, ``<input>.offset`` (in the input's
 unit) and ``<input>.delay`` (in seconds): free with a prior, or fixed. Gain and offset
-act inside `ode`; the delay acts on the held input (`sim2gp.systems.base`), by `step` on
-the past actions that the state carries, or by whoever calls `ode` with the delayed mean
-input.
+act inside `flow`; the delay acts on the held input (`sim2gp.systems.base`), by `step`
+on the past actions that the state carries, or by whoever calls `flow` with the delayed
+mean input.
 """
 
 import dataclasses
@@ -24,6 +24,8 @@ from sim2gp.parameters import Parameter, Parameters
 from sim2gp.systems.base import AbstractSystem, Channel, delayed_means
 from sim2gp.types import Action, Scalar, State
 
+#: An input that moves within a period is averaged over no more than this, s.
+LONGEST_MEAN = 0.01
 _NEUTRAL = {"gain": 1.0, "offset": 0.0, "delay": 0.0}
 
 
@@ -61,7 +63,7 @@ class AbstractInputPath(AbstractSystem):
 
     @property
     def max_substep(self) -> float:
-        return self.system.max_substep
+        return min(self.system.max_substep, LONGEST_MEAN)
 
     @property
     def history(self) -> int:
@@ -75,7 +77,7 @@ class Actuated(AbstractInputPath):
     number (fixed); what is not named is neutral. For use as a one-step `Dynamics`,
     ``delay_max`` seconds of past actions of ``period`` seconds are carried in the
     state, as channels ``voltage[-1]``, ``voltage[-2]``, ...; without it the delay is
-    left to the caller of `ode` (the likelihood over windows). Raises `InputError` E145
+    left to the caller of `flow` (the likelihood over windows). Raises `InputError` E145
     for an unknown name, E141 for a delay that can be negative.
     """
 
@@ -123,9 +125,11 @@ class Actuated(AbstractInputPath):
             self.system.record(values), each("gain"), each("offset"), each("delay")
         )
 
-    def ode(self, params: ActuatedParams, s: State, a: Action) -> State:
+    def flow(
+        self, params: ActuatedParams, s: State, a: Action, h: float | Scalar
+    ) -> State:
         """The machine's own, under ``gain a + offset``; ``s`` is its physical state."""
-        return self.system.ode(params.system, s, params.gain * a + params.offset)
+        return self.system.flow(params.system, s, params.gain * a + params.offset, h)
 
     def delays(self, params: ActuatedParams) -> Float[Array, " m"]:
         return params.delay

@@ -46,10 +46,10 @@ class Channel:
 
 
 class AbstractSystem(eqx.Module):
-    """A machine: ``ds/dt = ode(params, s, a)`` and its one-step map ``step``.
+    """A machine: how it flows under a constant input, and its one-step map ``step``.
 
-    ``states`` name what `step` carries: the physical states that `ode` integrates,
-    then, newest first, ``history`` past actions (none but for delayed inputs).
+    ``states`` name what `step` carries: the physical states that `flow` takes on, then,
+    newest first, ``history`` past actions (none but for delayed inputs).
     All fields are static: a system is not data, its ``params`` are.
     """
 
@@ -68,7 +68,7 @@ class AbstractSystem(eqx.Module):
     @property
     @abc.abstractmethod
     def max_substep(self) -> float:
-        """Longest RK4 substep inside `step`, in seconds."""
+        """Longest time that one `flow` inside `step` may last, in seconds."""
 
     @property
     @abc.abstractmethod
@@ -85,8 +85,8 @@ class AbstractSystem(eqx.Module):
         """This system's constants, picked by name out of ``values``."""
 
     @abc.abstractmethod
-    def ode(self, params: Any, s: State, a: Action) -> State:
-        """Time derivative of the physical state under a constant input, per second."""
+    def flow(self, params: Any, s: State, a: Action, h: float | Scalar) -> State:
+        """Physical state ``h`` seconds later under a constant input, in one substep."""
 
     @abc.abstractmethod
     def delays(self, params: Any) -> Float[Array, " m"]:
@@ -103,7 +103,7 @@ class AbstractSystem(eqx.Module):
 
     @property
     def physical_states(self) -> tuple[Channel, ...]:
-        """The states that `ode` integrates, without the carried past actions."""
+        """The states that `flow` takes on, without the carried past actions."""
         return self.states[: len(self.states) - self.history * len(self.actions)]
 
     def nominal(self) -> Any:
@@ -120,7 +120,7 @@ class AbstractSystem(eqx.Module):
         h = dt / count
 
         def substep(x: State, u: Action) -> State:
-            return rk4(lambda y, w: self.ode(params, y, w), x, u, h)
+            return self.flow(params, x, u, h)
 
         if not self.history and not self.longest_delay:
             return _integrate(substep, s, a, count)
@@ -161,7 +161,40 @@ class Bound(eqx.Module):
         return self.system.step(self.params, s, a, self.dt)
 
 
-class AbstractMechanism(AbstractSystem):
+class AbstractPlant(AbstractSystem):
+    """A machine that remembers nothing: its inputs act at once."""
+
+    @property
+    def history(self) -> int:
+        return 0
+
+    @property
+    def longest_delay(self) -> float:
+        return 0.0
+
+    def delays(self, params: Any) -> Float[Array, " m"]:
+        """No input is delayed."""
+        return jnp.zeros(len(self.actions), jax.tree.leaves(params)[0].dtype)
+
+    def mean_inputs(
+        self, params: Any, held: Float[Array, "past m"], dt: float, count: int
+    ) -> Float[Array, "count m"]:
+        """The newest input."""
+        return jnp.broadcast_to(held[:1], (count, held.shape[1]))
+
+
+class AbstractODE(AbstractPlant):
+    """A plant as a differential equation, integrated by RK4."""
+
+    @abc.abstractmethod
+    def ode(self, params: Any, s: State, a: Action) -> State:
+        """Time derivative of the physical state under a constant input, per second."""
+
+    def flow(self, params: Any, s: State, a: Action, h: float | Scalar) -> State:
+        return rk4(lambda x, u: self.ode(params, x, u), s, a, h)
+
+
+class AbstractMechanism(AbstractODE):
     """Two joints ``q``: ``M(q) dv/dt = forces(q, v, a)``, solved in closed form.
 
     States are ``(q1, q2, v1, v2)``. A locked joint keeps its place: its velocity counts
@@ -179,16 +212,6 @@ class AbstractMechanism(AbstractSystem):
         self, params: Any, q: Float[Array, " 2"], v: Float[Array, " 2"], a: Action
     ) -> Float[Array, " 2"]:
         """Inputs, gyroscopic terms, gravity and friction: all but ``M dv/dt``."""
-
-    def delays(self, params: Any) -> Float[Array, " m"]:
-        """No input is delayed."""
-        return jnp.zeros(len(self.actions), jax.tree.leaves(params)[0].dtype)
-
-    def mean_inputs(
-        self, params: Any, held: Float[Array, "past m"], dt: float, count: int
-    ) -> Float[Array, "count m"]:
-        """The newest input."""
-        return jnp.broadcast_to(held[:1], (count, held.shape[1]))
 
     def mass_matrix(self, params: Any, q: Float[Array, " 2"]) -> Float[Array, "2 2"]:
         """Joint-space inertia ``M(q)``."""

@@ -84,8 +84,6 @@ class CartPole(AbstractMechanism):
         Channel("voltage", "V", low=-10.0, high=10.0),
     )
     max_substep: ClassVar[float] = 0.01
-    history: ClassVar[int] = 0
-    longest_delay: ClassVar[float] = 0.0
 
     def __init__(
         self,

@@ -87,8 +87,6 @@ class Furuta(AbstractMechanism):
         Channel("voltage", "V", low=-5.0, high=5.0),
     )
     max_substep: ClassVar[float] = 0.01
-    history: ClassVar[int] = 0
-    longest_delay: ClassVar[float] = 0.0
 
     def __init__(
         self,

@@ -82,9 +82,11 @@ class Lagged(AbstractInputPath):
     def record(self, values: Mapping[str, Scalar]) -> LaggedParams:
         return LaggedParams(self.system.record(values), values[f"{self.where}.lag"])
 
-    def ode(self, params: LaggedParams, s: State, a: Action) -> State:
+    def flow(
+        self, params: LaggedParams, s: State, a: Action, h: float | Scalar
+    ) -> State:
         """The machine's own; ``a`` is the filtered input."""
-        return self.system.ode(params.system, s, a)
+        return self.system.flow(params.system, s, a, h)
 
     def delays(self, params: LaggedParams) -> NoReturn:
         """A lag is no delay: whoever shifts inputs himself must not meet one (E145)."""

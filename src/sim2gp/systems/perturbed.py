@@ -104,14 +104,6 @@ class Perturbed(AbstractMechanism):
     def max_substep(self) -> float:
         return min([self.system.max_substep, *(e.max_substep for e in self.effects)])
 
-    @property
-    def history(self) -> int:
-        return 0
-
-    @property
-    def longest_delay(self) -> float:
-        return 0.0
-
     def record(self, values: Mapping[str, Scalar]) -> PerturbedParams:
         magnitudes = tuple(values[effect.name] for effect in self.effects)
         return PerturbedParams(self.system.record(values), magnitudes)

@@ -109,8 +109,6 @@ class TwoLink(AbstractMechanism):
         Channel("torque2", "N m", low=-6.0, high=6.0),
     )
     max_substep: ClassVar[float] = COULOMB_SUBSTEP
-    history: ClassVar[int] = 0
-    longest_delay: ClassVar[float] = 0.0
 
     def __init__(
         self,
@@ -206,8 +204,6 @@ class UniformRodArm(AbstractMechanism):
         Channel("torque2", "N m", low=-1.0, high=1.0),
     )
     max_substep: ClassVar[float] = 0.01
-    history: ClassVar[int] = 0
-    longest_delay: ClassVar[float] = 0.0
 
     def __init__(
         self,

@@ -1,0 +1,265 @@
+"""Constants of a MuJoCo model by path: what can be learned, and how it is set.
+
+| path                      | unit         | what is set                              |
+|---------------------------|--------------|------------------------------------------|
+| `joint/NAME/damping`      | N m s/rad    | viscous friction (of a slide, N s/m)     |
+| `joint/NAME/armature`     | kg m^2, kg   | inertia of the rotor                     |
+| `joint/NAME/frictionloss` | N m, N       | dry friction                             |
+| `joint/NAME/stiffness`    | N m/rad, N/m | spring                                   |
+| `body/NAME/mass`          | kg           | mass, and the inertia in proportion      |
+| `body/NAME/com_x` (y, z)  | m            | centre of mass in the body's frame       |
+| `body/NAME/length`        | m            | distance from the parent's frame         |
+| `actuator/NAME/gain`      | its own      | force for an input of one, of a motor    |
+| `actuator/NAME/kp`, `kv`  | its own      | gains of a servo                         |
+| `actuator/NAME/gear`      | 1            | gear ratio                               |
+| `geom/NAME/friction`      | 1            | sliding friction of a contact            |
+| `option/gravity`          | m/s^2        | strength, in the model's direction       |
+
+`NAME` may be a pattern (`joint/*/damping`).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import Any
+
+import numpy as np
+
+from sim2gp.errors import InputError, nearest
+
+#: Quantities that MuJoCo derives others from when it compiles a model.
+DERIVED = frozenset({"mass", "com_x", "com_y", "com_z", "length", "armature", "gear"})
+_HINGE = {
+    "damping": "N m s/rad",
+    "armature": "kg m^2",
+    "frictionloss": "N m",
+    "stiffness": "N m/rad",
+}
+_SLIDE = {
+    "damping": "N s/m",
+    "armature": "kg",
+    "frictionloss": "N",
+    "stiffness": "N/m",
+}
+_MEANING = {
+    "damping": "viscous friction of {}",
+    "armature": "rotor inertia of {}",
+    "frictionloss": "dry friction of {}",
+    "stiffness": "spring of {}",
+    "mass": "mass of {}, its inertia in proportion",
+    "com_x": "centre of mass of {}, x",
+    "com_y": "centre of mass of {}, y",
+    "com_z": "centre of mass of {}, z",
+    "length": "distance of {} from its parent",
+    "gain": "gain of {}",
+    "kp": "position gain of {}",
+    "kv": "velocity gain of {}",
+    "gear": "gear ratio of {}",
+    "friction": "sliding friction of {}",
+    "gravity": "gravity",
+}
+#: Quantities that may be negative.
+SIGNED = frozenset({"com_x", "com_y", "com_z"})
+
+
+@dataclass(frozen=True)
+class Constant:
+    """One number of a model: its path, unit and meaning, how it is read and set."""
+
+    path: str
+    unit: str
+    meaning: str
+    get: Callable[[Any], float]
+    put: Callable[[Any, float], None]
+
+    @property
+    def quantity(self) -> str:
+        return self.path.rsplit("/", 1)[-1]
+
+
+def constants_of(model: Any) -> dict[str, Constant]:
+    """Every constant of a compiled model that can be learned, by path.
+
+    What is set in proportion is so to the numbers of this model, however often it is.
+    """
+    found = [
+        *_joints(model),
+        *_bodies(model),
+        *_actuators(model),
+        *_geoms(model),
+        *([_gravity(model)] if np.any(model.opt.gravity) else []),
+    ]
+    return {c.path: c for c in found}
+
+
+def matching(known: dict[str, Constant], pattern: str) -> list[Constant]:
+    """The constants that a path or pattern names; E145 where there is none."""
+    found = [c for path, c in known.items() if fnmatchcase(path, pattern)]
+    if not found:
+        close = nearest(pattern, known)
+        raise InputError(
+            "E145",
+            "unknown constant of the model",
+            got=pattern,
+            expected=_kinds(known),
+            fix=f"did you mean {close}?" if close else "",
+        )
+    return found
+
+
+def name_of(model: Any, kind: str, index: int) -> str:
+    """An object's name; `joint2` and so on where it has none."""
+    return str(getattr(model, kind)(index).name) or f"{kind}{index}"
+
+
+def _kinds(known: dict[str, Constant]) -> str:
+    kinds = sorted({f"{p.split('/')[0]}/.../{p.split('/')[-1]}" for p in known})
+    return ", ".join(kinds)
+
+
+def _constant(kind: str, name: str, quantity: str, unit: str, **how: Any) -> Constant:
+    path = f"{kind}/{name}/{quantity}" if name else f"{kind}/{quantity}"
+    return Constant(path, unit, _MEANING[quantity].format(name), **how)
+
+
+def _cell(field: str, *index: int) -> dict[str, Callable[..., Any]]:
+    """Reading and setting of one number in an array of the model."""
+
+    def get(model: Any) -> float:
+        return float(getattr(model, field)[index])
+
+    def put(model: Any, value: float) -> None:
+        getattr(model, field)[index] = value
+
+    return {"get": get, "put": put}
+
+
+def _joints(model: Any) -> list[Constant]:
+    found = []
+    for j in range(model.njnt):
+        kind, name = int(model.jnt_type[j]), name_of(model, "joint", j)
+        if kind not in (2, 3):  # slide and hinge have one degree of freedom
+            continue
+        units, dof = (_SLIDE, _HINGE)[kind - 2], int(model.jnt_dofadr[j])
+        for quantity, unit in units.items():
+            spring = quantity == "stiffness"
+            how = _cell("jnt_stiffness", j) if spring else _cell(f"dof_{quantity}", dof)
+            found.append(_constant("joint", name, quantity, unit, **how))
+    return found
+
+
+def _bodies(model: Any) -> list[Constant]:
+    found = []
+    for b in range(1, model.nbody):
+        name = name_of(model, "body", b)
+        if model.body_mass[b] > 0.0:
+            found.append(_constant("body", name, "mass", "kg", **_mass(model, b)))
+            for axis, quantity in enumerate(("com_x", "com_y", "com_z")):
+                how = _cell("body_ipos", b, axis)
+                found.append(_constant("body", name, quantity, "m", **how))
+        if np.any(model.body_pos[b]):
+            found.append(_constant("body", name, "length", "m", **_length(model, b)))
+    return found
+
+
+def _actuators(model: Any) -> list[Constant]:
+    found = []
+    for i in range(model.nu):
+        name = name_of(model, "actuator", i)
+        kp, kv = model.actuator_biasprm[i, 1:3]
+        servo = model.actuator_biastype[i] != 0 and (kp != 0.0 or kv != 0.0)
+        if servo and kp != 0.0:
+            found.append(_constant("actuator", name, "kp", "1", **_servo(model, i, 1)))
+        if servo and kv != 0.0:
+            # Of a velocity servo the gain is kv, of a damped position servo only bias.
+            found.append(_constant("actuator", name, "kv", "1", **_servo(model, i, 2)))
+        if not servo:
+            how = _cell("actuator_gainprm", i, 0)
+            found.append(_constant("actuator", name, "gain", "1", **how))
+        if model.actuator_gear[i, 0] != 0.0:
+            how = _cell("actuator_gear", i, 0)
+            found.append(_constant("actuator", name, "gear", "1", **how))
+    return found
+
+
+def _geoms(model: Any) -> list[Constant]:
+    return [
+        _constant(
+            "geom",
+            name_of(model, "geom", g),
+            "friction",
+            "1",
+            **_cell("geom_friction", g, 0),
+        )
+        for g in range(model.ngeom)
+        if model.geom_contype[g] or model.geom_conaffinity[g]
+    ]
+
+
+def _gravity(model: Any) -> Constant:
+    pull = model.opt.gravity.copy()
+    strength = float(np.linalg.norm(pull))
+
+    def get(model: Any) -> float:
+        return float(np.linalg.norm(model.opt.gravity))
+
+    def put(model: Any, value: float) -> None:
+        model.opt.gravity[:] = pull * (value / strength)
+
+    return _constant("option", "", "gravity", "m/s^2", get=get, put=put)
+
+
+def _mass(model: Any, b: int) -> dict[str, Callable[..., Any]]:
+    """A body of another density: its inertia is in proportion to its mass."""
+    mass, inertia = float(model.body_mass[b]), model.body_inertia[b].copy()
+
+    def get(model: Any) -> float:
+        return float(model.body_mass[b])
+
+    def put(model: Any, value: float) -> None:
+        model.body_mass[b] = value
+        model.body_inertia[b] = inertia * (value / mass)
+
+    return {"get": get, "put": put}
+
+
+def _length(model: Any, b: int) -> dict[str, Callable[..., Any]]:
+    place = model.body_pos[b].copy()
+    length = float(np.linalg.norm(place))
+
+    def get(model: Any) -> float:
+        return float(np.linalg.norm(model.body_pos[b]))
+
+    def put(model: Any, value: float) -> None:
+        model.body_pos[b] = place * (value / length)
+
+    return {"get": get, "put": put}
+
+
+def _servo(model: Any, i: int, column: int) -> dict[str, Callable[..., Any]]:
+    """``force = gain u + bias . (1, length, velocity)``, a bias being ``-gain``."""
+    gain, bias = model.actuator_gainprm[i, 0], model.actuator_biasprm[i, column]
+    follows = bool(gain == -bias)
+
+    def get(model: Any) -> float:
+        return -float(model.actuator_biasprm[i, column])
+
+    def put(model: Any, value: float) -> None:
+        model.actuator_biasprm[i, column] = -value
+        if follows:
+            model.actuator_gainprm[i, 0] = value
+
+    return {"get": get, "put": put}
+
+
+def setter(
+    constants: Sequence[Sequence[Constant]],
+) -> Callable[[Any, np.ndarray], None]:
+    """Of a vector of values, each of which sets one constant or several tied ones."""
+
+    def put(model: Any, theta: np.ndarray) -> None:
+        for group, value in zip(constants, theta, strict=True):
+            for constant in group:
+                constant.put(model, float(value))
+
+    return put

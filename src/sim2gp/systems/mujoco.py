@@ -1,0 +1,315 @@
+"""Any MuJoCo model as a system: C MuJoCo steps it, constants are found by path.
+
+The state is ``(qpos, qvel, act)`` of hinges and slides; a substep is MuJoCo's own, no
+longer than the model's time step. Derivatives are central differences
+(`sim2gp.systems.external`): every feature of MuJoCo can be used, nothing is compiled.
+What MuJoCo derives from masses and lengths when it compiles a model is derived anew for
+every value that they take.
+"""
+
+import copy
+import math
+import os
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sim2gp.errors import InputError
+from sim2gp.parameters import Parameter, Parameters
+from sim2gp.systems.base import AbstractPlant, Channel
+from sim2gp.systems.external import AbstractSimulator, flow
+from sim2gp.systems.mjcf import (
+    DERIVED,
+    SIGNED,
+    Constant,
+    constants_of,
+    matching,
+    name_of,
+    setter,
+)
+from sim2gp.types import Action, Scalar, State
+
+#: Without a stated prior a constant is within this factor of the model's number.
+FACTOR = 3.0
+#: Fewer steps than these are not worth waking other threads for.
+FEW = 256
+
+
+class Engine(AbstractSimulator):
+    """C MuJoCo with some constants of a model open; the model itself stays as it is."""
+
+    def __init__(
+        self, model: Any, constants: Sequence[Sequence[Constant]], table: Parameters
+    ) -> None:
+        import mujoco
+        from mujoco import rollout
+
+        self.model = model
+        self.constants = tuple(tuple(group) for group in constants)
+        free = {p.name: p for p in table.free}
+        given = [free.get(group[0].path) for group in self.constants]
+        own = np.asarray([abs(group[0].get(model)) for group in self.constants])
+        self.low = np.asarray([p.low if p else -np.inf for p in given])
+        self.high = np.asarray([p.high if p else np.inf for p in given])
+        width = np.minimum(self.high - self.low, np.inf)
+        fallback = np.where(np.isfinite(width), width, 1.0)
+        self.scale = np.where(own > 0.0, own, fallback)
+        self._put = setter(self.constants)
+        self._derive = any(c.quantity in DERIVED for g in self.constants for c in g)
+        self._copies: list[Any] = []
+        self._held: list[bytes] = []
+        threads = max(1, len(os.sched_getaffinity(0)))
+        self._datas = [mujoco.MjData(model) for _ in range(threads)]
+        self._pool = rollout.Rollout(nthread=threads if threads > 1 else 0)
+        self._alone = rollout.Rollout(nthread=0)
+        self._lock = threading.Lock()  # JAX may call from several programs at once
+
+    def with_values(self, theta: Float[np.ndarray, " p"]) -> Any:
+        """A copy of the model in which the open constants have these values."""
+        import mujoco
+
+        model = copy.copy(self.model)
+        self._put(model, theta)
+        if self._derive:
+            mujoco.mj_setConst(model, mujoco.MjData(model))
+        return model
+
+    def flow(
+        self,
+        theta: Float[np.ndarray, "B p"],
+        s: Float[np.ndarray, "B n"],
+        a: Float[np.ndarray, "B m"],
+        h: Float[np.ndarray, " B"],
+    ) -> Float[np.ndarray, "B n"]:
+        out = s.copy()
+        good = np.isfinite(np.concatenate([theta, s, a, h[:, None]], axis=1)).all(1)
+        out[~good] = np.nan
+        values, which = np.unique(theta[good], axis=0, return_inverse=True)
+        index = np.flatnonzero(good)
+        with self._lock:
+            models = self._models(values)
+            for span in np.unique(h[good]):
+                mine = h[index] == span
+                if span > 0.0:
+                    at = index[mine]
+                    chosen = [models[k] for k in which.reshape(-1)[mine]]
+                    out[at] = self._rolled(chosen, models, s[at], a[at], float(span))
+        return out
+
+    def _models(self, values: Float[np.ndarray, "U p"]) -> list[Any]:
+        """A model for each vector of values; copies are used again."""
+        import mujoco
+
+        while len(self._copies) < len(values):
+            self._copies.append(copy.copy(self.model))
+            self._held.append(b"")
+        for k, theta in enumerate(values):
+            if self._held[k] == theta.tobytes():
+                continue
+            self._put(self._copies[k], theta)
+            if self._derive:
+                mujoco.mj_setConst(self._copies[k], self._datas[0])
+            self._held[k] = theta.tobytes()
+        return self._copies[: len(values)]
+
+    def _rolled(
+        self,
+        chosen: list[Any],
+        models: list[Any],
+        s: Float[np.ndarray, "B n"],
+        a: Float[np.ndarray, "B m"],
+        span: float,
+    ) -> Float[np.ndarray, "B n"]:
+        count = max(1, math.ceil(span / self.model.opt.timestep - 1e-9))
+        for model in models:
+            model.opt.timestep = span / count
+        start = np.concatenate([np.zeros((len(s), 1)), s], axis=1)
+        few = len(s) * count < FEW
+        pool = self._alone if few else self._pool
+        datas = self._datas[:1] if few else self._datas
+        control = np.broadcast_to(a[:, None], (len(a), count, a.shape[1]))
+        with _quiet():
+            out, _ = pool.rollout(chosen, datas, start, np.ascontiguousarray(control))
+        time, state = out[:, -1, 0], out[:, -1, 1:]
+        stopped = time < span * (1.0 - 1e-6)  # where MuJoCo saw that it ran away
+        return np.where(stopped[:, None], np.nan, state)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without warnings on the terminal and in a file: what ran away is NaN."""
+    import mujoco
+
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda _: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+class MuJoCo(AbstractPlant):
+    """A MuJoCo model whose constants are named by path (`sim2gp.systems.mjcf`).
+
+    Its joints are the states, ``<joint>`` and ``<joint>.velocity``, then activations of
+    actuators; its actuators are the inputs. ``constants`` are paths or patterns, all
+    with a non-zero value in the model where it is None. Those in one inner sequence are
+    tied: one number, under the first one's name. Priors are within a factor of 3 of the
+    model's number; ``parameters`` replaces them by name.
+
+    Raises `InputError` E145 for what the model does not have, E142 for a constant that
+    is zero in the model and has no prior, E172 for joints with quaternions.
+    """
+
+    engine: Engine = eqx.field(static=True)
+    parameters: Parameters = eqx.field(static=True)
+    channels: tuple[Channel, ...] = eqx.field(static=True)
+    inputs: tuple[Channel, ...] = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        model: Any,
+        constants: Sequence[str | Sequence[str]] | None = None,
+        priors: Mapping[str, Parameter | float] | None = None,
+    ) -> None:
+        model = loaded(model)
+        known = constants_of(model)
+        groups = _groups(model, known, constants)
+        priors = dict(priors or {})
+        table = Parameters(tuple(_prior(g[0], model, priors) for g in groups))
+        self.parameters = table.replace(**priors)
+        self.names = tuple(group[0].path for group in groups)
+        self.channels = _states(model)
+        self.inputs = _inputs(model)
+        self.engine = Engine(model, groups, self.parameters)
+
+    @property
+    def states(self) -> tuple[Channel, ...]:
+        return self.channels
+
+    @property
+    def actions(self) -> tuple[Channel, ...]:
+        return self.inputs
+
+    @property
+    def max_substep(self) -> float:
+        return math.inf  # the engine divides by its own time step
+
+    def record(self, values: Mapping[str, Scalar]) -> Float[Array, " p"]:
+        """Values in the order of the engine's constants."""
+        return jnp.stack([jnp.asarray(values[name]) for name in self.names])
+
+    def flow(
+        self, params: Float[Array, " p"], s: State, a: Action, h: float | Scalar
+    ) -> State:
+        theta = params.astype(s.dtype)
+        span = jnp.asarray(h, s.dtype)
+        return flow(self.engine, theta, s, a.astype(s.dtype), span)
+
+
+def loaded(model: Any) -> Any:
+    """A compiled model, of a path or of one that is compiled already (E170)."""
+    import mujoco
+
+    if isinstance(model, mujoco.MjModel):
+        found = copy.copy(model)
+    else:
+        path = Path(model)
+        try:
+            found = mujoco.MjModel.from_xml_path(str(path))
+        except ValueError as error:
+            what = " ".join(str(error).split())
+            raise InputError("E170", "model", where=str(path), got=what) from None
+    for j in range(found.njnt):
+        if found.jnt_type[j] not in (2, 3):
+            raise InputError(
+                "E172",
+                "joint with a quaternion",
+                got=name_of(found, "joint", j),
+                expected="hinges and slides",
+                fix="fix the base, or replace a free joint by slides and hinges",
+            )
+    # A state that ran away is one that cannot be followed, not the start again.
+    found.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    return found
+
+
+def _groups(
+    model: Any,
+    known: dict[str, Constant],
+    constants: Sequence[str | Sequence[str]] | None,
+) -> list[list[Constant]]:
+    """The open constants; each inner list is one number."""
+    if constants is None:
+        usual = ("damping", "armature", "frictionloss", "mass", "gain", "kp", "kv")
+        found = [c for c in known.values() if c.quantity in usual]
+        return [[c] for c in found if c.get(model) != 0.0]
+    groups: list[list[Constant]] = []
+    for entry in constants:
+        if isinstance(entry, str):
+            groups += [[c] for c in matching(known, entry)]
+        else:
+            groups.append([c for path in entry for c in matching(known, path)])
+    return groups
+
+
+def _prior(
+    constant: Constant, model: Any, given: Mapping[str, Parameter | float]
+) -> Parameter:
+    """Within a factor of the model's own number, unless a prior is given."""
+    value = constant.get(model)
+    about = constant.path, constant.unit, constant.meaning
+    if value > 0.0 and constant.quantity not in SIGNED:
+        return Parameter(
+            *about, "log_box", value / FACTOR, value * FACTOR, nominal=value
+        )
+    if constant.path in given:
+        return Parameter(*about, "identity")
+    raise InputError(
+        "E142",
+        f"no prior for {constant.path}",
+        got=f"{value:g} in the model",
+        expected="a positive number to start from",
+        fix="give its prior: mean and sd, or low and high",
+    )
+
+
+def _states(model: Any) -> tuple[Channel, ...]:
+    positions, velocities = [], []
+    for j in range(model.njnt):
+        name, hinge = name_of(model, "joint", j), model.jnt_type[j] == 3
+        unit, free = ("rad" if hinge else "m"), not model.jnt_limited[j]
+        low, high = (-math.inf, math.inf) if free else model.jnt_range[j].tolist()
+        turns = bool(hinge and free)
+        positions.append(Channel(name, unit, angle=turns, low=low, high=high))
+        velocities.append(Channel(f"{name}.velocity", f"{unit}/s"))
+    order = np.argsort(model.jnt_qposadr)
+    acts = [
+        Channel(f"{name_of(model, 'actuator', i)}.activation", "1")
+        for i in range(model.nu)
+        if model.actuator_actnum[i]
+    ]
+    return (
+        *(positions[j] for j in order),
+        *(velocities[j] for j in order),
+        *acts,
+    )
+
+
+def _inputs(model: Any) -> tuple[Channel, ...]:
+    found = []
+    for i in range(model.nu):
+        limited = model.actuator_ctrllimited[i]
+        low, high = (
+            model.actuator_ctrlrange[i].tolist() if limited else (-math.inf, math.inf)
+        )
+        found.append(Channel(name_of(model, "actuator", i), "1", low=low, high=high))
+    return tuple(found)
