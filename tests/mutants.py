@@ -21,6 +21,7 @@ from mutant_exploring import EXPLORING
 from mutant_list import MUTANTS as PHYSICS
 from mutant_list import Hunt, Mutant
 from mutant_misfit import MISFIT
+from mutant_mujoco import ON_THE_HOST
 from mutant_networks import NETWORKS
 from mutant_sac import OFF_POLICY
 from mutant_studies import STUDIES
@@ -34,6 +35,7 @@ MUTANTS = (
     *EXPLORING,
     *DESIGN,
     *OFF_POLICY,
+    *ON_THE_HOST,
 )
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -17,11 +17,24 @@ from sim2gp.planning import SAC, Observation, Policy
 from sim2gp.robot import NumpyPolicy, load_policy
 from sim2gp.robot.export import export_model, export_policy
 from sim2gp.runs import load_run, new_run
-from sim2gp.systems import CartPole, Furuta
+from sim2gp.systems import Actuated, CartPole, Furuta, MuJoCo
 from sim2gp.tasks import furuta_swingup
 
 KEY = jax.random.key(0)
 TASK, SYSTEM = furuta_swingup(), Furuta()
+
+
+CART = """
+<mujoco><worldbody><body name="cart">
+  <joint name="x" type="slide" axis="1 0 0" damping="2"/>
+  <geom type="box" size=".1 .05 .02" mass=".4"/>
+  <body name="pole">
+    <joint name="theta" axis="0 -1 0" damping="1e-3"/>
+    <geom type="capsule" size=".01" fromto="0 0 0 0 0 -.3" mass=".1"/>
+  </body>
+</body></worldbody>
+<actuator><motor name="voltage" joint="x" gear="1.5"/></actuator></mujoco>
+"""
 
 
 @pytest.fixture(scope="module")
@@ -164,6 +177,30 @@ def test_draws_are_machines_and_keep_what_ties_their_constants(tmp_path: Path) -
     low, high = np.quantile(rows[:, 0], [0.45, 0.55])
     assert low <= about["constants"][name]["map"] <= high
     assert not (out / "step.jax").exists()
+
+
+def test_draws_of_a_mujoco_model_are_its_files(tmp_path: Path) -> None:
+    """Behind a delayed input as well; row ``i`` of the arrays is file ``i``."""
+    mujoco = pytest.importorskip("mujoco", reason="sim2gp[mujoco] is not installed")
+    path = tmp_path / "cart.xml"
+    path.write_text(CART)
+    bare = MuJoCo(path, ["body/pole/mass", "joint/x/damping"])
+    system = Actuated(bare, {"voltage.delay": 0.01})
+    belief = Sim2GP(system).init(KEY)
+    export_model(belief, tmp_path / "model", system, dt=0.02, draws=3, key=KEY)
+    run = load_run(tmp_path / "model")
+    for i in range(3):
+        text = tmp_path / "model" / f"variant_{i:03d}.xml"
+        model = mujoco.MjModel.from_xml_path(str(text))
+        mass = run.arrays["draws/body/pole/mass"][i]
+        damping = run.arrays["draws/joint/x/damping"][i]
+        assert model.body("pole").mass[0] == pytest.approx(mass, rel=1e-5)
+        assert model.joint("x").damping[0] == pytest.approx(damping, rel=1e-5)
+    with pytest.raises(InputError, match="E135"):
+        export_model(
+            belief, tmp_path / "m", system, dt=0.02, draws=1, key=KEY, compiled=True
+        )
+    assert not (tmp_path / "m").exists()
 
 
 def test_a_compiled_step_comes_back(tmp_path: Path) -> None:

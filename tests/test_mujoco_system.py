@@ -58,7 +58,7 @@ CRAWLER = """
       <body name="leg" pos="0 0 .08">
         <joint name="hip" axis="0 1 0" armature="{armature}" range="-.9 .9"
                damping=".02"/>
-        <geom type="capsule" fromto="0 0 0 .05 0 -.08" size=".015" mass=".2"/>
+        <geom type="capsule" fromto="0 0 0 .05 0 -.08" size=".015" mass="{leg}"/>
         <body name="shin" pos=".05 0 -.08">
           <joint name="knee" axis="0 1 0" stiffness="1.5" frictionloss="{dry}"/>
           <geom name="foot" type="sphere" size=".03" pos="0 0 -.07" mass=".1"
@@ -76,6 +76,7 @@ CRAWLER = """
 """
 USUAL = {
     "trunk": 0.8,
+    "leg": 0.2,
     "armature": 0.01,
     "dry": 0.05,
     "slip": 0.7,
@@ -84,6 +85,7 @@ USUAL = {
 }
 PATHS = {
     "trunk": "body/torso/mass",
+    "leg": "body/leg/mass",
     "armature": "joint/hip/armature",
     "dry": "joint/knee/frictionloss",
     "slip": "geom/foot/friction",
@@ -96,7 +98,11 @@ def crawled(
     values: dict[str, float], s: np.ndarray, a: np.ndarray, steps: int
 ) -> np.ndarray:
     """C MuJoCo alone, of a model that was written with these constants."""
-    model = mujoco.MjModel.from_xml_string(CRAWLER.format(**values))
+    return rolled(CRAWLER.format(**values), s, a, steps)
+
+
+def rolled(text: str, s: np.ndarray, a: np.ndarray, steps: int) -> np.ndarray:
+    model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:], data.act[:] = s[:4], s[4:8], s[8:]
     data.ctrl[:] = a
@@ -117,7 +123,7 @@ ACTION = np.array([0.5, -0.3])
 def test_a_step_is_c_mujocos_with_the_constants_written_into_the_file(tmp_path):
     """Contacts, limits, dry friction, a servo, activation; derived constants too."""
     system = crawler(tmp_path, constants=list(PATHS.values()))
-    changed = dict(zip(USUAL, (1.7, 0.03, 0.11, 0.3, 15.0, 0.9), strict=True))
+    changed = dict(zip(USUAL, (1.7, 0.35, 0.03, 0.11, 0.3, 15.0, 0.9), strict=True))
     for values in (USUAL, changed, USUAL):
         params = system.record({PATHS[k]: jnp.asarray(v) for k, v in values.items()})
         found = jax.jit(system.step, static_argnums=3)(
@@ -145,7 +151,7 @@ def test_a_batch_is_its_rows(tmp_path):
     """Different constants, states and spans in one call, in several threads."""
     system = crawler(tmp_path, constants=list(PATHS.values()))
     rng = np.random.default_rng(0)
-    theta = np.asarray([list(USUAL.values())] * 60) * rng.uniform(0.7, 1.4, (60, 6))
+    theta = np.asarray([list(USUAL.values())] * 60) * rng.uniform(0.7, 1.4, (60, 7))
     theta[30:] = theta[0]
     S = STATE + 0.05 * rng.standard_normal((60, 9))
     A = rng.uniform(-1.0, 1.0, (60, 2))
@@ -160,6 +166,17 @@ def test_a_batch_is_its_rows(tmp_path):
         values = dict(zip(USUAL, theta[i], strict=True))
         expected = crawled(values, S[i], A[i], steps)
         np.testing.assert_allclose(found[i], expected, atol=1e-9)
+
+
+def test_an_uneven_span_is_divided_evenly(tmp_path):
+    """7 ms at a time step of 2 ms: four substeps of 1.75 ms."""
+    system = crawler(tmp_path, constants=["body/torso/mass"])
+    found = system.engine.flow(
+        np.array([[0.8]]), STATE[None], ACTION[None], np.array([7e-3])
+    )
+    text = CRAWLER.format(**USUAL).replace('timestep="0.002"', 'timestep="0.00175"')
+    expected = rolled(text, STATE, ACTION, 4)
+    np.testing.assert_allclose(found[0], expected, atol=1e-12)
 
 
 @in_float64
@@ -225,6 +242,40 @@ def test_tied_constants_are_one_number(tmp_path):
     model = system.engine.with_values(np.array([0.3]))
     assert model.dof_damping.tolist() == [0.3, 0.0, 0.3, 0.0]
     assert system.engine.model.dof_damping.tolist() == [0.05, 0.0, 0.02, 0.0]
+
+
+def test_a_file_with_other_constants_makes_that_model(tmp_path):
+    """Of every kind of constant; six digits."""
+    system = crawler(tmp_path)
+    extra = ["body/leg/com_x", "body/shin/length", "actuator/*/gear", "option/gravity"]
+    paths = [*system.names, *extra, "geom/*/friction", "joint/knee/stiffness"]
+    place = Parameter("", "m", "place", "identity", mean=0.025, sd=0.01)
+    system = crawler(tmp_path, constants=paths, priors={"body/leg/com_x": place})
+    rng = np.random.default_rng(0)
+    own = [g[0].get(system.engine.model) for g in system.engine.constants]
+    values = dict(zip(system.names, own * rng.uniform(0.6, 1.6, len(own)), strict=True))
+    text = system.mjcf(values, tmp_path)
+    found = mujoco.MjModel.from_xml_string(text)
+    theta = np.asarray(list(values.values()))
+    expected = system.engine.with_values(theta)
+    for group in system.engine.constants:
+        got, wanted = (group[0].get(m) for m in (found, expected))
+        assert got == pytest.approx(wanted, rel=1e-5), group[0].path
+    for field in ("body_inertia", "dof_invweight0", "actuator_acc0"):
+        pair = (getattr(m, field) for m in (found, expected))
+        np.testing.assert_allclose(*pair, rtol=1e-4)
+
+
+def test_a_file_that_cannot_say_it_is_refused(tmp_path):
+    text = CRAWLER.format(**USUAL)
+    text = text.replace('autolimits="true"', 'autolimits="true" inertiafromgeom="true"')
+    path = written(tmp_path, text)
+    system = sy.MuJoCo(path, ["body/torso/mass"])
+    with pytest.raises(InputError, match=r"E170 body/torso/mass cannot be written"):
+        system.mjcf({"body/torso/mass": 1.3}, tmp_path)
+    compiled = sy.MuJoCo(mujoco.MjModel.from_xml_path(str(path)), ["body/torso/mass"])
+    with pytest.raises(InputError, match="E170 a model without a file"):
+        compiled.mjcf({"body/torso/mass": 1.3}, tmp_path)
 
 
 def test_what_is_zero_in_the_model_is_left_alone_or_needs_a_prior(tmp_path):

@@ -15,7 +15,8 @@ from sim2gp.models import AbstractBelief
 from sim2gp.planning import Policy
 from sim2gp.robot.policy import FORMAT
 from sim2gp.runs import new_run
-from sim2gp.systems import AbstractSystem
+from sim2gp.systems import AbstractSystem, MuJoCo
+from sim2gp.systems.actuator import AbstractInputPath
 from sim2gp.types import Key, in_float64, single
 
 
@@ -63,7 +64,8 @@ def export_model(
     """Write a belief's constants, correlated draws of them, and perhaps its mean step.
 
     ``arrays.npz`` holds ``draws/NAME``, in physical units: row ``i`` of all of them is
-    one machine, for whatever trainer randomises its simulator. ``compiled`` adds
+    one machine, for whatever trainer randomises its simulator; of a MuJoCo model with a
+    file, ``variant_000.xml`` and so on are those machines. ``compiled`` adds
     ``step.jax``, the mean step ``(s, a) -> s'`` over ``dt`` seconds in float32, for
     `jax.export.deserialize`; whether another version of JAX reads it is JAX's word.
     Raises `InputError` E134 where the belief has no constants, E135 where writing
@@ -99,6 +101,8 @@ def export_model(
     with new_run(out, "export model") as writer:
         named = {f"draws/{name}": value for name, value in rows.items()}
         writer.write_arrays("arrays.npz", named)
+        for i, text in enumerate(_variants(system, rows, Path(out))):
+            writer.write_text(f"variant_{i:03d}.xml", text)
         if code is not None:
             writer.write_bytes("step.jax", code)
         writer.write_summary({"title": "A learned simulator", "model": about})
@@ -119,9 +123,35 @@ def _constants(
     )
 
 
+def _variants(
+    system: AbstractSystem, rows: dict[str, np.ndarray], out: Path
+) -> list[str]:
+    """Of a MuJoCo model, its file with each draw's constants."""
+    bare = _bare(system)
+    if not isinstance(bare, MuJoCo) or bare.source is None:
+        return []
+    draws = len(next(iter(rows.values())))
+    each = [{name: float(x[i]) for name, x in rows.items()} for i in range(draws)]
+    return [bare.mjcf(values, out) for values in each]
+
+
+def _bare(system: AbstractSystem) -> AbstractSystem:
+    """Without what lies before its inputs."""
+    while isinstance(system, AbstractInputPath):
+        system = system.system
+    return system
+
+
 def _compiled(belief: AbstractBelief, system: AbstractSystem) -> bytes:
     from jax import export
 
+    if isinstance(_bare(system), MuJoCo):
+        raise InputError(
+            "E135",
+            "compiled code cannot be written",
+            got="a simulator that runs on the host",
+            fix="leave compiled out; the model's file has the constants",
+        )
     step = single(belief.point())
     shapes = [
         jax.ShapeDtypeStruct((len(each),), jnp.float32)

@@ -56,7 +56,6 @@ _MEANING = {
     "kv": "velocity gain of {}",
     "gear": "gear ratio of {}",
     "friction": "sliding friction of {}",
-    "gravity": "gravity",
 }
 #: Quantities that may be negative.
 SIGNED = frozenset({"com_x", "com_y", "com_z"})
@@ -67,10 +66,15 @@ class Constant:
     """One number of a model: its path, unit and meaning, how it is read and set."""
 
     path: str
+    index: int  # of the object in the model
     unit: str
     meaning: str
     get: Callable[[Any], float]
     put: Callable[[Any, float], None]
+
+    @property
+    def kind(self) -> str:
+        return self.path.split("/", 1)[0]
 
     @property
     def quantity(self) -> str:
@@ -117,9 +121,12 @@ def _kinds(known: dict[str, Constant]) -> str:
     return ", ".join(kinds)
 
 
-def _constant(kind: str, name: str, quantity: str, unit: str, **how: Any) -> Constant:
-    path = f"{kind}/{name}/{quantity}" if name else f"{kind}/{quantity}"
-    return Constant(path, unit, _MEANING[quantity].format(name), **how)
+def _constant(
+    model: Any, kind: str, i: int, quantity: str, unit: str, how: Any
+) -> Constant:
+    name = name_of(model, kind, i)
+    meaning = _MEANING[quantity].format(name)
+    return Constant(f"{kind}/{name}/{quantity}", i, unit, meaning, **how)
 
 
 def _cell(field: str, *index: int) -> dict[str, Callable[..., Any]]:
@@ -137,62 +144,49 @@ def _cell(field: str, *index: int) -> dict[str, Callable[..., Any]]:
 def _joints(model: Any) -> list[Constant]:
     found = []
     for j in range(model.njnt):
-        kind, name = int(model.jnt_type[j]), name_of(model, "joint", j)
+        kind, dof = int(model.jnt_type[j]), int(model.jnt_dofadr[j])
         if kind not in (2, 3):  # slide and hinge have one degree of freedom
             continue
-        units, dof = (_SLIDE, _HINGE)[kind - 2], int(model.jnt_dofadr[j])
-        for quantity, unit in units.items():
+        for quantity, unit in (_SLIDE, _HINGE)[kind - 2].items():
             spring = quantity == "stiffness"
             how = _cell("jnt_stiffness", j) if spring else _cell(f"dof_{quantity}", dof)
-            found.append(_constant("joint", name, quantity, unit, **how))
+            found.append(_constant(model, "joint", j, quantity, unit, how))
     return found
 
 
 def _bodies(model: Any) -> list[Constant]:
     found = []
     for b in range(1, model.nbody):
-        name = name_of(model, "body", b)
         if model.body_mass[b] > 0.0:
-            found.append(_constant("body", name, "mass", "kg", **_mass(model, b)))
+            found.append(_constant(model, "body", b, "mass", "kg", _mass(model, b)))
             for axis, quantity in enumerate(("com_x", "com_y", "com_z")):
                 how = _cell("body_ipos", b, axis)
-                found.append(_constant("body", name, quantity, "m", **how))
+                found.append(_constant(model, "body", b, quantity, "m", how))
         if np.any(model.body_pos[b]):
-            found.append(_constant("body", name, "length", "m", **_length(model, b)))
+            found.append(_constant(model, "body", b, "length", "m", _length(model, b)))
     return found
 
 
 def _actuators(model: Any) -> list[Constant]:
     found = []
     for i in range(model.nu):
-        name = name_of(model, "actuator", i)
-        kp, kv = model.actuator_biasprm[i, 1:3]
-        servo = model.actuator_biastype[i] != 0 and (kp != 0.0 or kv != 0.0)
-        if servo and kp != 0.0:
-            found.append(_constant("actuator", name, "kp", "1", **_servo(model, i, 1)))
-        if servo and kv != 0.0:
-            # Of a velocity servo the gain is kv, of a damped position servo only bias.
-            found.append(_constant("actuator", name, "kv", "1", **_servo(model, i, 2)))
-        if not servo:
-            how = _cell("actuator_gainprm", i, 0)
-            found.append(_constant("actuator", name, "gain", "1", **how))
-        if model.actuator_gear[i, 0] != 0.0:
-            how = _cell("actuator_gear", i, 0)
-            found.append(_constant("actuator", name, "gear", "1", **how))
+        affine = model.actuator_biastype[i] != 0
+        how = [
+            (quantity, _servo(model, i, column))
+            for quantity, column in (("kp", 1), ("kv", 2))
+            if affine and model.actuator_biasprm[i, column] != 0.0
+        ]
+        how = how or [("gain", _cell("actuator_gainprm", i, 0))]
+        how.append(("gear", _cell("actuator_gear", i, 0)))
+        found += [_constant(model, "actuator", i, q, "1", access) for q, access in how]
     return found
 
 
 def _geoms(model: Any) -> list[Constant]:
+    touching = np.flatnonzero(model.geom_contype | model.geom_conaffinity)
     return [
-        _constant(
-            "geom",
-            name_of(model, "geom", g),
-            "friction",
-            "1",
-            **_cell("geom_friction", g, 0),
-        )
-        for g in range(model.ngeom)
-        if model.geom_contype[g] or model.geom_conaffinity[g]
+        _constant(model, "geom", g, "friction", "1", _cell("geom_friction", g, 0))
+        for g in touching.tolist()
     ]
 
 
@@ -206,7 +200,7 @@ def _gravity(model: Any) -> Constant:
     def put(model: Any, value: float) -> None:
         model.opt.gravity[:] = pull * (value / strength)
 
-    return _constant("option", "", "gravity", "m/s^2", get=get, put=put)
+    return Constant("option/gravity", 0, "m/s^2", "gravity", get, put)
 
 
 def _mass(model: Any, b: int) -> dict[str, Callable[..., Any]]:

@@ -34,6 +34,7 @@ from sim2gp.systems.mjcf import (
     name_of,
     setter,
 )
+from sim2gp.systems.mjcf_file import rewritten
 from sim2gp.types import Action, Scalar, State
 
 #: Without a stated prior a constant is within this factor of the model's number.
@@ -138,7 +139,8 @@ class Engine(AbstractSimulator):
         with _quiet():
             out, _ = pool.rollout(chosen, datas, start, np.ascontiguousarray(control))
         time, state = out[:, -1, 0], out[:, -1, 1:]
-        stopped = time < span * (1.0 - 1e-6)  # where MuJoCo saw that it ran away
+        # Where a state runs away MuJoCo stops, or begins again.
+        stopped = time < span * (1.0 - 1e-6)
         return np.where(stopped[:, None], np.nan, state)
 
 
@@ -173,6 +175,7 @@ class MuJoCo(AbstractPlant):
     channels: tuple[Channel, ...] = eqx.field(static=True)
     inputs: tuple[Channel, ...] = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
+    source: Path | None = eqx.field(static=True)
 
     def __init__(
         self,
@@ -180,6 +183,7 @@ class MuJoCo(AbstractPlant):
         constants: Sequence[str | Sequence[str]] | None = None,
         priors: Mapping[str, Parameter | float] | None = None,
     ) -> None:
+        self.source = Path(model) if isinstance(model, str | os.PathLike) else None
         model = loaded(model)
         known = constants_of(model)
         groups = _groups(model, known, constants)
@@ -198,6 +202,19 @@ class MuJoCo(AbstractPlant):
     @property
     def actions(self) -> tuple[Channel, ...]:
         return self.inputs
+
+    def mjcf(self, values: Mapping[str, float], folder: Path) -> str:
+        """The model's file with these constants, to be kept in ``folder``.
+
+        Raises `InputError` E170 where there is no file, or it cannot say them.
+        """
+        if self.source is None:
+            fix = "give the path of its file instead of a compiled model"
+            raise InputError("E170", "a model without a file", fix=fix)
+        theta = np.asarray([values[name] for name in self.names], float)
+        constants = [c for group in self.engine.constants for c in group]
+        made = self.engine.with_values(theta)
+        return rewritten(self.source, made, constants, folder)
 
     @property
     def max_substep(self) -> float:
@@ -237,8 +254,6 @@ def loaded(model: Any) -> Any:
                 expected="hinges and slides",
                 fix="fix the base, or replace a free joint by slides and hinges",
             )
-    # A state that ran away is one that cannot be followed, not the start again.
-    found.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     return found
 
 
