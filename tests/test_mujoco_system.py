@@ -244,40 +244,6 @@ def test_tied_constants_are_one_number(tmp_path):
     assert system.engine.model.dof_damping.tolist() == [0.05, 0.0, 0.02, 0.0]
 
 
-def test_a_file_with_other_constants_makes_that_model(tmp_path):
-    """Of every kind of constant; six digits."""
-    system = crawler(tmp_path)
-    extra = ["body/leg/com_x", "body/shin/length", "actuator/*/gear", "option/gravity"]
-    paths = [*system.names, *extra, "geom/*/friction", "joint/knee/stiffness"]
-    place = Parameter("", "m", "place", "identity", mean=0.025, sd=0.01)
-    system = crawler(tmp_path, constants=paths, priors={"body/leg/com_x": place})
-    rng = np.random.default_rng(0)
-    own = [g[0].get(system.engine.model) for g in system.engine.constants]
-    values = dict(zip(system.names, own * rng.uniform(0.6, 1.6, len(own)), strict=True))
-    text = system.mjcf(values, tmp_path)
-    found = mujoco.MjModel.from_xml_string(text)
-    theta = np.asarray(list(values.values()))
-    expected = system.engine.with_values(theta)
-    for group in system.engine.constants:
-        got, wanted = (group[0].get(m) for m in (found, expected))
-        assert got == pytest.approx(wanted, rel=1e-5), group[0].path
-    for field in ("body_inertia", "dof_invweight0", "actuator_acc0"):
-        pair = (getattr(m, field) for m in (found, expected))
-        np.testing.assert_allclose(*pair, rtol=1e-4)
-
-
-def test_a_file_that_cannot_say_it_is_refused(tmp_path):
-    text = CRAWLER.format(**USUAL)
-    text = text.replace('autolimits="true"', 'autolimits="true" inertiafromgeom="true"')
-    path = written(tmp_path, text)
-    system = sy.MuJoCo(path, ["body/torso/mass"])
-    with pytest.raises(InputError, match=r"E170 body/torso/mass cannot be written"):
-        system.mjcf({"body/torso/mass": 1.3}, tmp_path)
-    compiled = sy.MuJoCo(mujoco.MjModel.from_xml_path(str(path)), ["body/torso/mass"])
-    with pytest.raises(InputError, match="E170 a model without a file"):
-        compiled.mjcf({"body/torso/mass": 1.3}, tmp_path)
-
-
 def test_what_is_zero_in_the_model_is_left_alone_or_needs_a_prior(tmp_path):
     names = crawler(tmp_path).parameters.names
     assert "joint/x/frictionloss" in names
@@ -307,27 +273,3 @@ def test_what_ran_away_is_not_the_start_again(tmp_path, monkeypatch, capfd, spee
     np.testing.assert_allclose(found[1], expected, atol=1e-8)
     assert os.listdir(tmp_path) == ["model.xml"]
     assert capfd.readouterr() == ("", "")
-
-
-FLOATING = """
-<mujoco><worldbody>
-  <body><freejoint name="base"/><geom size="1"/></body>
-</worldbody></mujoco>
-"""
-
-
-@pytest.mark.parametrize(
-    ("text", "code"),
-    [
-        ("<mujoco><worldbody></mujoco>", "E170 model"),
-        (FLOATING, "E172 joint with a quaternion.*got base"),
-    ],
-)
-def test_models_that_cannot_be_used_are_refused(tmp_path, text, code):
-    with pytest.raises(InputError, match=code):
-        sy.MuJoCo(written(tmp_path, text))
-
-
-def test_an_unknown_constant_names_the_nearest(tmp_path):
-    with pytest.raises(InputError, match=r"E145.*did you mean joint/hip/damping"):
-        crawler(tmp_path, constants=["joint/hip/dampin"])

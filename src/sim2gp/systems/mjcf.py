@@ -97,12 +97,12 @@ def constants_of(model: Any) -> dict[str, Constant]:
 
 
 def matching(known: dict[str, Constant], pattern: str) -> list[Constant]:
-    """The constants that a path or pattern names; E145 where there is none."""
+    """The constants that a path or pattern names; E170 where there is none."""
     found = [c for path, c in known.items() if fnmatchcase(path, pattern)]
     if not found:
         close = nearest(pattern, known)
         raise InputError(
-            "E145",
+            "E170",
             "unknown constant of the model",
             got=pattern,
             expected=_kinds(known),

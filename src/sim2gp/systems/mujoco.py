@@ -35,6 +35,7 @@ from sim2gp.systems.mjcf import (
     setter,
 )
 from sim2gp.systems.mjcf_file import rewritten
+from sim2gp.systems.mjcf_load import compiled
 from sim2gp.types import Action, Scalar, State
 
 #: Without a stated prior a constant is within this factor of the model's number.
@@ -164,10 +165,12 @@ class MuJoCo(AbstractPlant):
     actuators; its actuators are the inputs. ``constants`` are paths or patterns, all
     with a non-zero value in the model where it is None. Those in one inner sequence are
     tied: one number, under the first one's name. Priors are within a factor of 3 of the
-    model's number; ``parameters`` replaces them by name.
+    model's number; ``priors`` replaces them by name, or fixes the constant. ``root`` is
+    the folder that the model's files must lie in, its own if None.
 
-    Raises `InputError` E145 for what the model does not have, E142 for a constant that
-    is zero in the model and has no prior, E172 for joints with quaternions.
+    Raises `InputError` E130, E170 and E171 for a file that is no model, E170 for what
+    the model does not have, E142 for a constant that is zero in the model and has no
+    prior, E172 for joints with quaternions.
     """
 
     engine: Engine = eqx.field(static=True)
@@ -182,9 +185,11 @@ class MuJoCo(AbstractPlant):
         model: Any,
         constants: Sequence[str | Sequence[str]] | None = None,
         priors: Mapping[str, Parameter | float] | None = None,
+        *,
+        root: Path | None = None,
     ) -> None:
         self.source = Path(model) if isinstance(model, str | os.PathLike) else None
-        model = loaded(model)
+        model = loaded(model, root)
         known = constants_of(model)
         groups = _groups(model, known, constants)
         priors = dict(priors or {})
@@ -232,19 +237,14 @@ class MuJoCo(AbstractPlant):
         return flow(self.engine, theta, s, a.astype(s.dtype), span)
 
 
-def loaded(model: Any) -> Any:
-    """A compiled model, of a path or of one that is compiled already (E170)."""
+def loaded(model: Any, root: Path | None = None) -> Any:
+    """A compiled model, of a file or of one that is compiled already."""
     import mujoco
 
     if isinstance(model, mujoco.MjModel):
         found = copy.copy(model)
     else:
-        path = Path(model)
-        try:
-            found = mujoco.MjModel.from_xml_path(str(path))
-        except ValueError as error:
-            what = " ".join(str(error).split())
-            raise InputError("E170", "model", where=str(path), got=what) from None
+        found = compiled(Path(model), root)
     for j in range(found.njnt):
         if found.jnt_type[j] not in (2, 3):
             raise InputError(
@@ -320,11 +320,15 @@ def _states(model: Any) -> tuple[Channel, ...]:
 
 
 def _inputs(model: Any) -> tuple[Channel, ...]:
+    joints = [name_of(model, "joint", j) for j in range(model.njnt)]
     found = []
     for i in range(model.nu):
         limited = model.actuator_ctrllimited[i]
         low, high = (
             model.actuator_ctrlrange[i].tolist() if limited else (-math.inf, math.inf)
         )
-        found.append(Channel(name_of(model, "actuator", i), "1", low=low, high=high))
+        name = name_of(model, "actuator", i)
+        if name in joints:
+            name += ".control"  # a joint has the name already
+        found.append(Channel(name, "1", low=low, high=high))
     return tuple(found)

@@ -1,0 +1,136 @@
+"""A model's file becomes a compiled model: paths checked, parsed in a child process.
+
+A parser that crashes or runs away on somebody's file ends the child and not whoever
+asked. Files that a model names must lie in its own folder or below, or in ``root``.
+A URDF has no actuators: every hinge and slide gets a motor, ``<joint>.motor``.
+"""
+
+import os
+import re
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from sim2gp.errors import InputError
+
+SECONDS = 60  # that a model may take to compile
+_BYTES = 50_000_000  # of one file of text
+_NAMED = re.compile(r'<\s*(\w+)[^>]*?\b(?:file|filename)\s*=\s*["\']([^"\']*)["\']')
+_FOLDER = re.compile(r'\b(meshdir|texturedir|assetdir)\s*=\s*["\']([^"\']*)["\']')
+_CHILD = """
+import sys
+try:
+    import resource
+    resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30))
+    resource.setrlimit(resource.RLIMIT_CPU, ({seconds}, {seconds}))
+except ImportError:
+    pass
+import mujoco
+try:
+    spec = mujoco.MjSpec.from_file(sys.argv[1])
+    if sys.argv[1].lower().endswith(".urdf"):
+        for joint in spec.joints:
+            if joint.type in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
+                motor = spec.add_actuator(name=joint.name + ".motor")
+                motor.trntype, motor.target = mujoco.mjtTrn.mjTRN_JOINT, joint.name
+    model = spec.compile()
+except (ValueError, mujoco.FatalError) as error:
+    sys.stderr.write("REFUSED " + str(error))
+    sys.exit(3)
+mujoco.mj_saveModel(model, sys.argv[2])
+"""
+
+
+def compiled(path: Path, root: Path | None = None) -> Any:
+    """The model of an MJCF or URDF file.
+
+    Raises `InputError` E130 where there is no such file, E170 with MuJoCo's words where
+    it is no model, E171 where it names files outside ``root`` (its own folder) or
+    the parser crashed or took more than a minute.
+    """
+    import mujoco
+
+    check_paths(path, path.parent if root is None else root)
+    with tempfile.TemporaryDirectory() as folder:
+        binary = os.path.join(folder, "model.mjb")
+        code = _CHILD.format(seconds=SECONDS)
+        command = [sys.executable, "-I", "-c", code, str(path.resolve()), binary]
+        try:
+            done = subprocess.run(
+                command,
+                cwd=folder,  # where MuJoCo leaves its log
+                capture_output=True,
+                text=True,
+                timeout=2 * SECONDS,
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            raise _died(path, f"no answer in {2 * SECONDS} s") from None
+        if done.returncode == 3:
+            said = " ".join(done.stderr.split("REFUSED ", 1)[-1].split())
+            raise InputError("E170", "no model", where=str(path), got=said)
+        if done.returncode != 0:
+            last = done.stderr.strip().splitlines()[-1:] or ["no words"]
+            raise _died(path, f"exit {done.returncode}, {last[0]}")
+        return mujoco.MjModel.from_binary_path(binary)
+
+
+def check_paths(path: Path, root: Path) -> None:
+    """Every file that a model includes or names lies below ``root`` (E130, E171)."""
+    inside = root.resolve()
+    todo, seen = [path], set()
+    while todo:
+        file = todo.pop()
+        if file.resolve() in seen:
+            continue
+        seen.add(file.resolve())
+        for kind, name in _files(_read(file, path)):
+            named = name.removeprefix("package://")
+            place = (path.parent / named).resolve()
+            if not place.is_relative_to(inside):
+                raise InputError(
+                    "E171",
+                    f"{kind} outside the model's folder",
+                    where=str(file),
+                    got=name,
+                    expected=f"a file below {inside}",
+                    fix="move it there, or give a folder that holds both as root",
+                )
+            if kind == "include":
+                todo.append(place)
+
+
+def _files(text: str) -> Iterator[tuple[str, str]]:
+    """What each element names, with the folder that its kind is looked for in."""
+    text = re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
+    folders: dict[str, str] = dict(_FOLDER.findall(text))
+    assets = folders.get("assetdir", "")
+    for kind, name in _NAMED.findall(text):
+        where = {"mesh": "meshdir", "texture": "texturedir"}.get(kind, "")
+        yield kind, os.path.join(folders.get(where, assets) if where else "", name)
+
+
+def _read(file: Path, model: Path) -> str:
+    try:
+        with open(file, "rb") as opened:
+            return opened.read(_BYTES).decode("utf-8", errors="replace")
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        where = "" if file == model else str(model)
+        raise InputError(
+            "E130", f"cannot read {file}", where=where, got=reason
+        ) from None
+
+
+def _died(path: Path, got: str) -> InputError:
+    return InputError(
+        "E171",
+        "MuJoCo's parser did not come back",
+        where=str(path),
+        got=got,
+        expected="a model",
+        fix="see whether MuJoCo's own viewer opens it",
+    )
