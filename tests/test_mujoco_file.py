@@ -36,12 +36,18 @@ def test_a_file_with_other_constants_makes_that_model(tmp_path):
 
 
 def test_a_file_that_cannot_say_it_is_refused(tmp_path):
+    """An inertial that the file overrules by its geoms would be read."""
     text = CRAWLER.format(**USUAL)
     text = text.replace('autolimits="true"', 'autolimits="true" inertiafromgeom="true"')
     path = written(tmp_path, text)
-    system = sy.MuJoCo(path, ["body/torso/mass"])
-    with pytest.raises(InputError, match=r"E170 body/torso/mass cannot be written"):
-        system.mjcf({"body/torso/mass": 1.3}, tmp_path)
+    name = "body/torso/mass"
+    found = sy.MuJoCo(path, [name]).mjcf({name: 1.3}, tmp_path)
+    assert mujoco.MjModel.from_xml_string(found).body("torso").mass[0] == 1.3
+    heavy = '<inertial pos="0 0 0" mass="3" diaginertia="1 1 1"/>'
+    shin = '<body name="shin" pos=".05 0 -.08">'
+    path = written(tmp_path, text.replace(shin, shin + heavy))
+    with pytest.raises(InputError, match=r"E170 body/shin/mass cannot be written"):
+        sy.MuJoCo(path, [name]).mjcf({name: 1.3}, tmp_path)
     compiled = sy.MuJoCo(mujoco.MjModel.from_xml_path(str(path)), ["body/torso/mass"])
     with pytest.raises(InputError, match="E170 a model without a file"):
         compiled.mjcf({"body/torso/mass": 1.3}, tmp_path)

@@ -18,10 +18,10 @@ from jaxtyping import Array, Float
 from sim2gp.gaussian import Gaussian
 from sim2gp.least_squares import over
 from sim2gp.linalg import triangular
-from sim2gp.models.cutting import MAX_SUBSTEP, TOLERANCE
+from sim2gp.models.cutting import TOLERANCE
 from sim2gp.models.linearized import value_and_jacobian
 from sim2gp.models.windows import DELAY_BLUR, Stretch, simulate
-from sim2gp.systems.base import AbstractSystem
+from sim2gp.systems.base import WINDOW_SUBSTEP, AbstractSystem
 
 #: Commands over each period, in the units of the inputs.
 Commands = Float[Array, "T m"]
@@ -47,7 +47,7 @@ class Experiment(eqx.Module):
     period: float = eqx.field(static=True)
     steps: int = eqx.field(static=True)
     window: int = eqx.field(static=True)
-    substep: float = eqx.field(static=True, default=MAX_SUBSTEP)
+    substep: float = eqx.field(static=True, default=WINDOW_SUBSTEP)
 
     @property
     def substeps(self) -> int:

@@ -17,7 +17,6 @@ from sim2gp.logs import Log
 from sim2gp.models.windows import DELAY_BLUR, Windows
 from sim2gp.systems.base import AbstractSystem
 
-MAX_SUBSTEP = 2e-3  # s
 HALF_WIDTH = 0.025  # s, half the span of the local parabola that guesses a start
 PAST = 0.049  # s, the span of the causal one: 25 samples of 2 ms
 SPACING = 0.1  # s, between the starts of forecasts
@@ -112,7 +111,7 @@ def assemble(
     W, c = len(pieces), len(measured)
     held = [knots_of(log, actions, system.longest_delay) for log in logs]
     guesses = [_local_parabolas(log, measured, start) for log in logs]
-    steps = [_steps(log.time) for log in logs]
+    steps = [_steps(log.time, system.window_substep) for log in logs]
     L = max(int(steps[k][0][j - 1] - steps[k][0][i]) + 1 for k, i, j in pieces)
     spans = [
         (k, logs[k].time[i], logs[k].time[j - 1] - logs[k].time[i])
@@ -200,13 +199,15 @@ def _has_data(log: Log, measured: Sequence[str], piece: tuple[int, int, int]) ->
     return bool(mask[piece[1] : piece[2]].any()) and piece[2] - piece[1] > 1
 
 
-def _steps(time: Float[np.ndarray, " N"]) -> tuple[np.ndarray, np.ndarray]:
-    """Integration steps of at most `MAX_SUBSTEP` that meet every stamp.
+def _steps(
+    time: Float[np.ndarray, " N"], longest: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Integration steps of at most ``longest`` seconds that meet every stamp.
 
     Returns each stamp's place among the steps' ends, and the steps' lengths.
     """
     gaps = np.diff(time)
-    count = np.maximum(1, np.ceil(gaps / MAX_SUBSTEP - TOLERANCE)).astype(int)
+    count = np.maximum(1, np.ceil(gaps / longest - TOLERANCE)).astype(int)
     place = np.concatenate([[0], np.cumsum(count)])
     return place, np.repeat(gaps / count, count)
 

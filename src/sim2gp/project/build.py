@@ -75,7 +75,7 @@ def build_system(
     system: AbstractSystem = kind(parameters=table, **options)
     if spec.effects:
         system = _perturbed(system, spec.effects, source)
-    return _actuated(system, spec.actuators, source) if spec.actuators else system
+    return actuated(system, spec.actuators, source)
 
 
 def _options(
@@ -120,6 +120,8 @@ def _table(
     changes = {}
     for name, stated in specs.items():
         where = source.where(*path, name)
+        if isinstance(stated, PriorSpec) and stated.tie:
+            raise unknown("option", "tie", (), where)
         if name in table.names:
             base = table[name]
         elif name in fixed:
@@ -171,10 +173,12 @@ def _effect(
     return made
 
 
-def _actuated(
+def actuated(
     system: AbstractSystem, specs: Mapping[str, ActuatorSpec], source: Source
 ) -> AbstractSystem:
     """The machine behind its actuators; what the file does not name is neutral."""
+    if not specs:
+        return system
     channels = {channel.name: channel for channel in system.actions}
     stated: dict[str, Parameter | float] = {}
     for name, spec in specs.items():

@@ -1,8 +1,8 @@
 """What the file says of a constant, turned into a prior or a fixed value.
 
 ``value`` fixes; ``mean, sd`` are physical moments, inside ``low, high`` where these
-stand too; ``low, high`` alone make a nearly uniform box (logarithmic where the
-system's own prior is).
+stand too; ``relative_sd`` is an sd as a share of the mean; ``low, high`` alone make a
+nearly uniform box (logarithmic where the system's own prior is).
 """
 
 import math
@@ -30,7 +30,10 @@ def prior(spec: PriorSpec | float, base: Parameter, where: str) -> Parameter | f
     """The prior, or the fixed value, that a table of the file states (E141 to E144)."""
     if not isinstance(spec, PriorSpec):
         return float(spec)
-    given = spec.model_dump(exclude_none=True, include=set(PriorSpec.model_fields))
+    if spec.relative_sd is not None:
+        spec = _absolute(spec, spec.relative_sd, base, where)
+    fields = set(PriorSpec.model_fields) - {"tie"}
+    given = spec.model_dump(exclude_none=True, include=fields)
     if spec.value is not None:
         if len(given) > 1:
             raise _conflict(where, "value", given, "value alone, or a prior")
@@ -44,6 +47,16 @@ def prior(spec: PriorSpec | float, base: Parameter, where: str) -> Parameter | f
         return _moments(spec, spec.mean, spec.sd, base)
     except InputError as error:
         raise located(error, where) from error
+
+
+def _absolute(spec: PriorSpec, share: float, base: Parameter, where: str) -> PriorSpec:
+    """``relative_sd`` as an sd, about the stated mean or the machine's own number."""
+    mean = base.nominal if spec.mean is None else spec.mean
+    if mean is None or mean == 0.0 or spec.sd is not None:
+        given = spec.model_dump(exclude_none=True)
+        raise _conflict(where, "relative_sd", given, "a mean that is not 0, and no sd")
+    changes = {"mean": mean, "sd": share * abs(mean), "relative_sd": None}
+    return spec.model_copy(update=changes)
 
 
 def _conflict(

@@ -140,7 +140,12 @@ def load_project(path: Path | str) -> Project:
     # Imported late: a misspelt key is reported before the simulators are loaded.
     from sim2gp.project.build import build_system, check_names
 
-    system = build_system(spec, source, system_class(spec.system))
+    if is_model(spec.system):
+        from sim2gp.project.model import build_model
+
+        system = build_model(spec, source, path.parent)
+    else:
+        system = build_system(spec, source, system_class(spec.system))
     check_names(spec, source, system)
     return Project(path, source, spec, system)
 
@@ -150,17 +155,22 @@ def read_spec(path: Path | str) -> tuple[Source, ProjectSpec]:
     source = read_source(Path(path))
     spec = validated(source)
     _check_planner(spec, source)
-    if spec.system not in SYSTEMS:
+    if spec.system not in SYSTEMS and not is_model(spec.system):
         close = nearest(spec.system, SYSTEMS)
         raise InputError(
             "E160",
             "unknown system",
             where=source.where("system"),
             got=repr(spec.system),
-            expected="one of " + ", ".join(SYSTEMS),
+            expected="one of " + ", ".join(SYSTEMS) + ", or a model's file (.xml)",
             fix=f"did you mean {close}" if close else "name one of these",
         )
     return source, spec
+
+
+def is_model(name: str) -> bool:
+    """Whether a system is a file of MuJoCo's, MJCF or URDF."""
+    return name.lower().endswith((".xml", ".mjcf", ".urdf"))
 
 
 def system_class(name: str) -> "type[AbstractSystem]":

@@ -1,6 +1,6 @@
 """The shape of a project file, section by section, and its faults in one line each.
 
-    system = "two_link"
+    system = "two_link"                           (or a model's file, "robot.xml")
     [options]  [parameters.NAME]  [effects.CHANNEL.EFFECT]  [[logs]]
     [actuators.INPUT]  [likelihood]  [task]  [limits]  [rates]  [model]  [planner]
 
@@ -26,11 +26,17 @@ class Section(BaseModel):
 
 
 class PriorSpec(Section):
-    """What is believed of one constant: a value, moments, a box, or both of these."""
+    """What is believed of one constant: a value, moments, a box, or both of these.
+
+    ``relative_sd`` is a share of the mean, or of the machine's own number. ``tie``
+    makes all constants of a pattern one number (of a model's file alone).
+    """
 
     value: FiniteFloat | None = None
     mean: FiniteFloat | None = None
     sd: FiniteFloat | None = None
+    relative_sd: Positive | None = None
+    tie: bool = False
     low: FiniteFloat | None = None
     high: FiniteFloat | None = None
     map: Literal["box", "log_box", "log", "identity"] | None = None

@@ -66,6 +66,10 @@ class AbstractInputPath(AbstractSystem):
         return min(self.system.max_substep, LONGEST_MEAN)
 
     @property
+    def window_substep(self) -> float:
+        return self.system.window_substep
+
+    @property
     def history(self) -> int:
         return self.past
 

@@ -27,6 +27,8 @@ from sim2gp.errors import InputError, nearest
 from sim2gp.parameters import Parameters, parameters_of, unknown_parameter
 from sim2gp.types import Action, Scalar, State
 
+#: Of RK4 inside the windows that logs are cut into, s.
+WINDOW_SUBSTEP = 2e-3
 R = TypeVar("R")
 Inertia = tuple[Scalar, Scalar, Scalar]
 
@@ -69,6 +71,11 @@ class AbstractSystem(eqx.Module):
     @abc.abstractmethod
     def max_substep(self) -> float:
         """Longest time that one `flow` inside `step` may last, in seconds."""
+
+    @property
+    @abc.abstractmethod
+    def window_substep(self) -> float:
+        """Longest time that one `flow` may last between two rows of a log, in s."""
 
     @property
     @abc.abstractmethod
@@ -185,6 +192,10 @@ class AbstractPlant(AbstractSystem):
 
 class AbstractODE(AbstractPlant):
     """A plant as a differential equation, integrated by RK4."""
+
+    @property
+    def window_substep(self) -> float:
+        return WINDOW_SUBSTEP
 
     @abc.abstractmethod
     def ode(self, params: Any, s: State, a: Action) -> State:

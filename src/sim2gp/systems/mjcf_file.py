@@ -35,6 +35,8 @@ def rewritten(
 
     spec = mujoco.MjSpec.from_file(str(source))
     spec.compile()  # numbers the elements
+    auto = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
+    spec.compiler.inertiafromgeom = auto  # or no inertial would be read
     for constant in constants:
         _say(spec, model, constant)
     made = _compiled(spec, source)
@@ -47,7 +49,7 @@ def rewritten(
                 where=str(source),
                 got=f"{found:g}",
                 expected=f"{wanted:g}",
-                fix="leave inertiafromgeom at its default",
+                fix="drop inertials that inertiafromgeom overrules",
             )
     if spec.meshes or spec.textures or spec.hfields:
         for where in ("meshdir", "texturedir"):

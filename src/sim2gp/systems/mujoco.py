@@ -23,6 +23,7 @@ from jaxtyping import Array, Float
 
 from sim2gp.errors import InputError
 from sim2gp.parameters import Parameter, Parameters
+from sim2gp.systems.actuator import LONGEST_MEAN
 from sim2gp.systems.base import AbstractPlant, Channel
 from sim2gp.systems.external import AbstractSimulator, flow
 from sim2gp.systems.mjcf import (
@@ -166,7 +167,8 @@ class MuJoCo(AbstractPlant):
     with a non-zero value in the model where it is None. Those in one inner sequence are
     tied: one number, under the first one's name. Priors are within a factor of 3 of the
     model's number; ``priors`` replaces them by name, or fixes the constant. ``root`` is
-    the folder that the model's files must lie in, its own if None.
+    the folder that the model's files must lie in, its own if None; ``source`` the file
+    that a compiled model was made of.
 
     Raises `InputError` E130, E170 and E171 for a file that is no model, E170 for what
     the model does not have, E142 for a constant that is zero in the model and has no
@@ -187,8 +189,10 @@ class MuJoCo(AbstractPlant):
         priors: Mapping[str, Parameter | float] | None = None,
         *,
         root: Path | None = None,
+        source: Path | None = None,
     ) -> None:
-        self.source = Path(model) if isinstance(model, str | os.PathLike) else None
+        named = isinstance(model, str | os.PathLike)
+        self.source = Path(model) if named else source
         model = loaded(model, root)
         known = constants_of(model)
         groups = _groups(model, known, constants)
@@ -224,6 +228,10 @@ class MuJoCo(AbstractPlant):
     @property
     def max_substep(self) -> float:
         return math.inf  # the engine divides by its own time step
+
+    @property
+    def window_substep(self) -> float:
+        return LONGEST_MEAN  # of a delayed input, which is averaged between rows
 
     def record(self, values: Mapping[str, Scalar]) -> Float[Array, " p"]:
         """Values in the order of the engine's constants."""
@@ -276,22 +284,28 @@ def _groups(
     return groups
 
 
+def default_prior(constant: Constant, model: Any) -> Parameter | None:
+    """Within a factor of the model's own number; None where that is not positive."""
+    value = constant.get(model)
+    if value <= 0.0 or constant.quantity in SIGNED:
+        return None
+    about = constant.path, constant.unit, constant.meaning
+    return Parameter(*about, "log_box", value / FACTOR, value * FACTOR, nominal=value)
+
+
 def _prior(
     constant: Constant, model: Any, given: Mapping[str, Parameter | float]
 ) -> Parameter:
-    """Within a factor of the model's own number, unless a prior is given."""
-    value = constant.get(model)
-    about = constant.path, constant.unit, constant.meaning
-    if value > 0.0 and constant.quantity not in SIGNED:
-        return Parameter(
-            *about, "log_box", value / FACTOR, value * FACTOR, nominal=value
-        )
+    """The default, or room for the one that is given."""
+    default = default_prior(constant, model)
+    if default is not None:
+        return default
     if constant.path in given:
-        return Parameter(*about, "identity")
+        return Parameter(constant.path, constant.unit, constant.meaning, "identity")
     raise InputError(
         "E142",
         f"no prior for {constant.path}",
-        got=f"{value:g} in the model",
+        got=f"{constant.get(model):g} in the model",
         expected="a positive number to start from",
         fix="give its prior: mean and sd, or low and high",
     )

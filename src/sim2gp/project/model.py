@@ -1,0 +1,73 @@
+"""A model's file as the project's machine: which constants are open, tied, and how.
+
+    system = "robot.xml"
+    [parameters."joint/*/damping"]
+    tie = true
+    relative_sd = 0.5
+
+Every table of ``[parameters]`` opens what its path or pattern names; without any, all
+usual constants that are not zero in the model are open.
+"""
+
+from pathlib import Path
+
+from sim2gp.errors import InputError
+from sim2gp.parameters import Parameter
+from sim2gp.project.build import actuated, unknown
+from sim2gp.project.priors import located, prior
+from sim2gp.project.schema import PriorSpec, ProjectSpec
+from sim2gp.project.source import Source
+from sim2gp.systems import AbstractSystem, MuJoCo
+from sim2gp.systems.mjcf import Constant, constants_of, matching
+from sim2gp.systems.mujoco import default_prior, loaded
+
+
+def build_model(spec: ProjectSpec, source: Source, folder: Path) -> AbstractSystem:
+    """The machine of a model's file, behind its actuators (E130 to E172)."""
+    if spec.effects:
+        line = source.where("effects")
+        raise unknown("table", "effects", (), line)
+    path = folder / spec.system
+    root = _root(spec, source, folder)
+    try:
+        model = loaded(path, root)
+    except InputError as error:
+        raise located(error, error.where or source.where("system")) from error
+    known = constants_of(model)
+    groups: list[list[str]] = []
+    priors: dict[str, Parameter | float] = {}
+    for pattern, stated in spec.parameters.items():
+        where = source.where("parameters", pattern)
+        try:
+            found = matching(known, pattern)
+        except InputError as error:
+            raise located(error, where) from error
+        tied = isinstance(stated, PriorSpec) and stated.tie
+        for group in [found] if tied else [[c] for c in found]:
+            groups.append([c.path for c in group])
+            priors[group[0].path] = _prior(stated, group[0], model, where)
+    system = MuJoCo(model, groups or None, priors, source=path)
+    return actuated(system, spec.actuators, source)
+
+
+def _root(spec: ProjectSpec, source: Source, folder: Path) -> Path | None:
+    """The folder that the model's files must lie in, where the file names one."""
+    options = dict(spec.options)
+    root = options.pop("root", None)
+    for name in options:
+        raise unknown("option", name, ("root",), source.where("options", name))
+    if not isinstance(root, str | None):
+        raise unknown("folder", str(root), (), source.where("options", "root"))
+    return None if root is None else folder / root
+
+
+def _prior(
+    stated: PriorSpec | float, constant: Constant, model: object, where: str
+) -> Parameter | float:
+    """What the file says, about the model's own number."""
+    base = default_prior(constant, model)
+    bare = PriorSpec(tie=True)
+    if base is not None and stated in (bare, PriorSpec()):
+        return base
+    empty = Parameter(constant.path, constant.unit, constant.meaning, "identity")
+    return prior(stated, base or empty, where)
