@@ -58,17 +58,14 @@ class Engine(AbstractSimulator):
         self.constants = tuple(tuple(group) for group in constants)
         free = {p.name: p for p in table.free}
         given = [free.get(group[0].path) for group in self.constants]
-        own = np.asarray([abs(group[0].get(model)) for group in self.constants])
         self.low = np.asarray([p.low if p else -np.inf for p in given])
         self.high = np.asarray([p.high if p else np.inf for p in given])
-        width = np.minimum(self.high - self.low, np.inf)
-        fallback = np.where(np.isfinite(width), width, 1.0)
-        self.scale = np.where(own > 0.0, own, fallback)
+        self.scale = np.asarray([_spread(p) if p else 1.0 for p in given])
         self._put = setter(self.constants)
         self._derive = any(c.quantity in DERIVED for g in self.constants for c in g)
         self._copies: list[Any] = []
         self._held: list[bytes] = []
-        threads = max(1, len(os.sched_getaffinity(0)))
+        threads = _cores()
         self._datas = [mujoco.MjData(model) for _ in range(threads)]
         self._pool = rollout.Rollout(nthread=threads if threads > 1 else 0)
         self._alone = rollout.Rollout(nthread=0)
@@ -144,6 +141,18 @@ class Engine(AbstractSimulator):
         # Where a state runs away MuJoCo stops, or begins again.
         stopped = time < span * (1.0 - 1e-6)
         return np.where(stopped[:, None], np.nan, state)
+
+
+def _spread(p: Parameter) -> float:
+    """Half the distance between the prior's quantiles of an sd, in physical units."""
+    return 0.5 * abs(p.constrain(p.mean + p.sd) - p.constrain(p.mean - p.sd))
+
+
+def _cores() -> int:
+    """That this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 @contextmanager
