@@ -1,6 +1,7 @@
 """A model's file as the machine of a project: patterns, ties, priors, faults."""
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -65,6 +66,27 @@ relative_sd = 0.1
         assert np.mean(draws) == pytest.approx(mean, rel=0.1)
         assert np.std(draws) == pytest.approx(sd, rel=0.1)
     assert (table["body/upper/mass"].low, table["body/upper/mass"].unit) == (0.0, "kg")
+
+
+def test_a_path_is_the_exception_to_a_pattern(tmp_path: Path) -> None:
+    text = """
+[parameters."joint/*/damping"]
+tie = true
+[parameters."joint/elbow/damping"]
+value = 0.3
+"""
+    system = load_project(project(tmp_path, text)).system
+    assert system.parameters.names == ("joint/shoulder/damping",)
+    assert dict(system.parameters.fixed) == {"joint/elbow/damping": 0.3}
+    text = '[parameters]\n"joint/*/damping" = 1.0\n"joint/s*/damping" = 2.0\n'
+    with pytest.raises(InputError, match=r"E145 a constant named twice.*line 2"):
+        load_project(project(tmp_path, text))
+
+
+def test_without_mujoco_the_extra_is_named(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(InputError, match=r"E135.*pip install 'sim2gp\[mujoco\]'"):
+        load_project(project(tmp_path, ""))
 
 
 def test_without_parameters_all_usual_ones_are_open(tmp_path: Path) -> None:

@@ -42,11 +42,16 @@ def build_model(spec: ProjectSpec, source: Source, folder: Path) -> AbstractSyst
             found = matching(known, pattern)
         except InputError as error:
             raise located(error, where) from error
+        # A path of its own is the exception to a pattern.
+        found = [c for c in found if c.path == pattern or c.path not in spec.parameters]
         tied = isinstance(stated, PriorSpec) and stated.tie
-        for group in [found] if tied else [[c] for c in found]:
+        for group in [found] if tied and found else [[c] for c in found]:
             groups.append([c.path for c in group])
             priors[group[0].path] = _prior(stated, group[0], model, where)
-    system = MuJoCo(model, groups or None, priors, source=path)
+    try:
+        system = MuJoCo(model, groups or None, priors, source=path)
+    except InputError as error:
+        raise located(error, source.where("parameters")) from error
     return actuated(system, spec.actuators, source)
 
 

@@ -255,8 +255,20 @@ class MuJoCo(AbstractPlant):
 
 
 def loaded(model: Any, root: Path | None = None) -> Any:
-    """A compiled model, of a file or of one that is compiled already."""
-    import mujoco
+    """A compiled model, of a file or of one that is compiled already.
+
+    Raises `InputError` E135 where MuJoCo is not installed.
+    """
+    try:
+        import mujoco
+    except ImportError as error:
+        raise InputError(
+            "E135",
+            "a MuJoCo model cannot be read",
+            got=str(error),
+            expected="mujoco",
+            fix="pip install 'sim2gp[mujoco]'",
+        ) from error
 
     if isinstance(model, mujoco.MjModel):
         found = copy.copy(model)
@@ -290,6 +302,11 @@ def _groups(
             groups += [[c] for c in matching(known, entry)]
         else:
             groups.append([c for path in entry for c in matching(known, path)])
+    paths = [c.path for group in groups for c in group]
+    for path in paths:
+        if paths.count(path) > 1:
+            fix = "let one path or pattern name it"
+            raise InputError("E145", "a constant named twice", got=path, fix=fix)
     return groups
 
 
