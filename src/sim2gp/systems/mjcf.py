@@ -18,7 +18,7 @@
 `NAME` may be a pattern (`joint/*/damping`).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any
@@ -244,16 +244,3 @@ def _servo(model: Any, i: int, column: int) -> dict[str, Callable[..., Any]]:
             model.actuator_gainprm[i, 0] = value
 
     return {"get": get, "put": put}
-
-
-def setter(
-    constants: Sequence[Sequence[Constant]],
-) -> Callable[[Any, np.ndarray], None]:
-    """Of a vector of values, each of which sets one constant or several tied ones."""
-
-    def put(model: Any, theta: np.ndarray) -> None:
-        for group, value in zip(constants, theta, strict=True):
-            for constant in group:
-                constant.put(model, float(value))
-
-    return put

@@ -33,7 +33,6 @@ from sim2gp.systems.mjcf import (
     constants_of,
     matching,
     name_of,
-    setter,
 )
 from sim2gp.systems.mjcf_file import rewritten
 from sim2gp.systems.mjcf_load import compiled
@@ -61,7 +60,6 @@ class Engine(AbstractSimulator):
         self.low = np.asarray([p.low if p else -np.inf for p in given])
         self.high = np.asarray([p.high if p else np.inf for p in given])
         self.scale = np.asarray([_spread(p) if p else 1.0 for p in given])
-        self._put = setter(self.constants)
         self._derive = any(c.quantity in DERIVED for g in self.constants for c in g)
         self._copies: list[Any] = []
         self._held: list[bytes] = []
@@ -76,10 +74,18 @@ class Engine(AbstractSimulator):
         import mujoco
 
         model = copy.copy(self.model)
-        self._put(model, theta)
-        if self._derive:
-            mujoco.mj_setConst(model, mujoco.MjData(model))
+        self._set(model, theta, mujoco.MjData(model))
         return model
+
+    def _set(self, model: Any, theta: Float[np.ndarray, " p"], data: Any) -> None:
+        """All open constants, and what MuJoCo derives of them; ``data`` is scratch."""
+        import mujoco
+
+        for group, value in zip(self.constants, theta, strict=True):
+            for constant in group:
+                constant.put(model, float(value))
+        if self._derive:
+            mujoco.mj_setConst(model, data)
 
     def flow(
         self,
@@ -105,17 +111,13 @@ class Engine(AbstractSimulator):
 
     def _models(self, values: Float[np.ndarray, "U p"]) -> list[Any]:
         """A model for each vector of values; copies are used again."""
-        import mujoco
-
         while len(self._copies) < len(values):
             self._copies.append(copy.copy(self.model))
             self._held.append(b"")
         for k, theta in enumerate(values):
             if self._held[k] == theta.tobytes():
                 continue
-            self._put(self._copies[k], theta)
-            if self._derive:
-                mujoco.mj_setConst(self._copies[k], self._datas[0])
+            self._set(self._copies[k], theta, self._datas[0])
             self._held[k] = theta.tobytes()
         return self._copies[: len(values)]
 
