@@ -208,7 +208,7 @@ def in_reach(values: Values, channel: ChannelLike, source: str) -> None:
         )
 
 
-def _fit(time: Values, q: Values, dq: Values) -> tuple[float, float] | None:
+def follows(time: Values, q: Values, dq: Values) -> tuple[float, float] | None:
     """Slope and correlation of displacements on integrated velocities, or None."""
     k = max(3, round(0.1 / float(np.median(np.diff(time)))))
     k = min(k, len(time) // 10)
@@ -230,7 +230,7 @@ def velocity_agrees(
     time: Values, q: Values, dq: Values, name: str, source: str
 ) -> None:
     """The velocity column is the rate of the position column (E106, E107)."""
-    found = _fit(time, q, dq)
+    found = follows(time, q, dq)
     if found is None:
         return
     slope, correlation = found
@@ -239,7 +239,7 @@ def velocity_agrees(
     got = f"slope {slope:.3g}, correlation {correlation:.2f}"
     where = f"{source}: {name} and {name}.velocity"
     expected = f"{name}.velocity to be the rate of {name} (slope 1)"
-    swapped = _fit(time, dq, q)
+    swapped = follows(time, dq, q)
     if swapped and swapped[1] > 0.9 and 2 / 3 < swapped[0] < 1.5:
         what, fix = "columns swapped", "exchange the two columns"
         raise InputError("E106", what, where=where, got=got, expected=expected, fix=fix)
