@@ -235,7 +235,7 @@ def test_published_models_score_as_known(
     shared_data: Path, model: str, pooled: tuple[float, float]
 ) -> None:
     """The figures that the recordings come with, through the package's own path."""
-    from sim2gp.logs import Column, read_csv
+    from sim2gp.logs import Column, read_log
 
     arm_folder = shared_data / "double_pendulum"
     text = (arm_folder / "published_parameters" / f"c1_model_{model}.yml").read_text()
@@ -251,7 +251,7 @@ def test_published_models_score_as_known(
     logs = [
         log
         for file in sorted((arm_folder / "excitation").glob("*.csv"))
-        for log in read_csv(
+        for log in read_log(
             file, columns, states=system.physical_states, actions=system.actions
         )
     ]

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sim2gp.errors import InputError
-from sim2gp.logs import Column, Log, period_matches, read_csv, shared_rows
+from sim2gp.logs import Column, Log, period_matches, read_log, shared_rows
 from sim2gp.logs.units import UNITS, factor
 
 
@@ -49,7 +49,7 @@ def write(path: Path, table: np.ndarray, header: str = HEADER, **style: str) -> 
 
 def read(path: Path, columns: object = None, **options: object) -> tuple[Log, ...]:
     options = {"states": STATES, "actions": ACTIONS, "time": "t"} | options
-    return read_csv(path, columns or COLUMNS, **options)
+    return read_log(path, columns or COLUMNS, **options)
 
 
 def codes(log: Log) -> list[str]:
@@ -286,7 +286,7 @@ def test_real_arm(shared_data: Path) -> None:
         ]
     }
     files = sorted((shared_data / "double_pendulum" / "excitation").glob("*.csv"))
-    logs = [read_csv(f, columns, states=states, actions=actions) for f in files]
+    logs = [read_log(f, columns, states=states, actions=actions) for f in files]
     assert [len(pieces) for pieces in logs] == [1] * 6
     assert sum(len(log) for (log,) in logs) == 29987
     raw = np.genfromtxt(files[0], delimiter=",", names=True)
@@ -301,7 +301,7 @@ def test_real_furuta_has_spaces_in_its_header(shared_data: Path) -> None:
         "voltage": Column("plant_input"),
     }
     for file in sorted((shared_data / "qube").glob("*.csv")):
-        (log,) = read_csv(
+        (log,) = read_log(
             file, columns, states=states, actions=(Channel("voltage", "V"),), time="t"
         )
         assert len(log) == 10000

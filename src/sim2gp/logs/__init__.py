@@ -2,7 +2,9 @@
 
 from sim2gp.logs.checks import period_matches as period_matches
 from sim2gp.logs.checks import shared_rows as shared_rows
-from sim2gp.logs.csv import read_csv as read_csv
+from sim2gp.logs.formats import columns_of as columns_of
 from sim2gp.logs.log import Column as Column
 from sim2gp.logs.log import Log as Log
 from sim2gp.logs.log import Note as Note
+from sim2gp.logs.read import read_log as read_log
+from sim2gp.logs.resample import Resample as Resample

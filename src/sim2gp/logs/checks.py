@@ -9,14 +9,14 @@ dq, whose slope is 1 for a healthy pair, -1 for a flipped sign, 57.3 for degrees
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from sim2gp.errors import InputError
 from sim2gp.logs.log import ChannelLike, Log, Note
+from sim2gp.logs.table import Rows
 
 Values = Float[np.ndarray, " N"]
 Mask = Bool[np.ndarray, " N"]
-Lines = Int[np.ndarray, " N"]
 
 GAP = 5.0  # periods without a row that end an episode
 JITTER = 0.10  # relative spread of the period that is worth stating
@@ -34,30 +34,29 @@ _FACTORS = {  # slope of displacement on integrated velocity -> what it betrays
 }
 
 
-def finite(
-    columns: Mapping[str, Values], lines: Lines, source: str, skip: Mask
-) -> None:
+def finite(columns: Mapping[str, Values], rows: Rows, skip: Mask) -> None:
     """No NaN or infinity in a used column outside the skipped rows (E101)."""
     bad = {name: ~np.isfinite(v) & ~skip for name, v in columns.items()}
     count = sum(int(b.sum()) for b in bad.values())
     if count == 0:
         return
-    rows = lines[np.logical_or.reduce(list(bad.values()))]
+    numbers = rows.numbers[np.logical_or.reduce(list(bad.values()))]
     name = next(name for name, b in bad.items() if b.any())
     first = int(np.flatnonzero(bad[name])[0])
     value = columns[name][first]
-    some = ", ".join(str(r) for r in rows[:5]) + (", ..." if len(rows) > 5 else "")
+    some = ", ".join(str(r) for r in numbers[:5])
+    some += ", ..." if len(numbers) > 5 else ""
     raise InputError(
         "E101",
         "value that is not finite",
-        where=f"{source}:line {lines[first]}, column {name}",
-        got=f"{value:g} ({count} such on {len(rows)} lines: {some})",
+        where=f"{rows.at(first)}, column {name}",
+        got=f"{value:g} ({count} such on {len(numbers)} {rows.word}s: {some})",
         expected="finite numbers",
         fix="mend the rows, exclude their times, or set drop_nonfinite = true",
     )
 
 
-def stamps(time: Values, lines: Lines, source: str) -> None:
+def stamps(time: Values, rows: Rows) -> None:
     """Time goes forward at every row (E108, E109, E112)."""
     steps = np.diff(time)
     forward = steps[steps > 0]
@@ -67,7 +66,7 @@ def stamps(time: Values, lines: Lines, source: str) -> None:
     if bad.size == 0 and jumps.size == 0:
         return
     i = int(bad[0]) if bad.size else int(jumps[0])
-    where = f"{source}:line {lines[i + 1]}"
+    where = rows.at(i + 1)
     got = f"{time[i + 1]:.9g} s after {time[i]:.9g} s"
     lost = float(np.spacing(np.float32(np.max(np.abs(time)))))
     single = bool(np.all(time.astype(np.float32).astype(np.float64) == time))
@@ -98,15 +97,18 @@ def stamps(time: Values, lines: Lines, source: str) -> None:
         where=where,
         got=f"{got} ({bad.size} such rows)",
         expected="increasing time",
-        fix="keep the first row of each stamp" if same else "sort or split the file",
+        fix="set keep_first = true" if same else "sort or split the file",
     )
 
 
-def rate(time: Values, cuts: Mask, source: str) -> list[Note]:
-    """A period that is no control period is a unit (E107); jitter is stated (W110)."""
+def rate(time: Values, cuts: Mask, source: str, *, in_seconds: bool) -> list[Note]:
+    """A period that is no control period is a unit (E107); jitter is stated (W110).
+
+    ``in_seconds`` tells that the format itself gives the unit.
+    """
     steps = np.diff(time)
     period = float(np.median(steps))
-    if period >= 0.5:
+    if period >= 0.5 and not in_seconds:
         raise InputError(
             "E107",
             "time in another unit",
@@ -122,7 +124,8 @@ def rate(time: Values, cuts: Mask, source: str) -> list[Note]:
     low, high = float(np.min(steady)), float(np.max(steady))
     text = (
         f"period varies in {source}: {1e3 * low:.3g}, {1e3 * period:.3g}, "
-        f"{1e3 * high:.3g} ms (minimum, median, maximum); the time column is used"
+        f"{1e3 * high:.3g} ms (minimum, median, maximum); the stamps are used as they "
+        f"are (resample = {{period = {period:.2g}}} would even them out)"
     )
     return [Note("W110", text)]
 
@@ -144,9 +147,7 @@ def period_matches(log: Log, dt: float) -> None:
         )
 
 
-def sentinels(
-    values: Values, name: str, lines: Lines, source: str
-) -> tuple[Mask, list[Note]]:
+def sentinels(values: Values, name: str, rows: Rows) -> tuple[Mask, list[Note]]:
     """Samples that mean "no value" (-9999, 65535, ...): masked, above 1 % an error."""
     bad = np.zeros(len(values), dtype=bool)
     for mark in SENTINELS:
@@ -160,7 +161,7 @@ def sentinels(
         return bad, []
     first = int(np.flatnonzero(bad)[0])
     share = float(np.mean(bad))
-    where = f"{source}:line {lines[first]}, column {name}"
+    where = f"{rows.at(first)}, column {name}"
     if share > 0.01:
         raise InputError(
             "E102",
@@ -285,14 +286,14 @@ def excitation(
 def shared_rows(train: Sequence[Log], test: Sequence[Log]) -> list[Note]:
     """Rows that stand in both sets: a test on them proves nothing (W128)."""
 
-    def rows(log: Log) -> set[bytes]:
+    def rows_of(log: Log) -> set[bytes]:
         parts = [log.time, *log.channels.values(), *log.inputs.values()]
         return {row.tobytes() for row in np.stack(parts, axis=1)}
 
-    known = set().union(*(rows(log) for log in train)) if train else set()
+    known = set().union(*(rows_of(log) for log in train)) if train else set()
     notes = []
     for log in test:
-        count = len(rows(log) & known)
+        count = len(rows_of(log) & known)
         if count:
             text = f"{count} rows of {log.source} were also fitted to"
             notes.append(Note("W128", text))

@@ -7,136 +7,67 @@ Lines are counted as an editor counts them: the header is line 1.
 """
 
 import csv
-import os
 import re
-import stat
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from sim2gp.errors import InputError, nearest
+from sim2gp.logs.file import COMPRESSED, MAGIC, compressed, read_bytes, shown
+from sim2gp.logs.log import Note
 
-MAX_BYTES = 2 * 1024**3  # of one text file; the numbers need about as much again
-_COMPRESSED = (b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"PK\x03\x04", b"\x28\xb5\x2f\xfd")
-_BINARY = (b"PAR1", b"\x89HDF", b"\x93NUMPY", b"\x89MCAP", b"SQLite format 3")
+_BINARY = (*(m for k, m in MAGIC.items() if k != "npz"), b"\x93NUMPY", b"\x80")
 _DATE = re.compile(
     r"\d{4}-\d\d-\d\d|\d{1,2}:\d\d(:\d\d)?|\d{1,2}[/.]\d{1,2}[/.]\d{2,4}"
 )
 
 
 @dataclass(frozen=True)
-class Table:
-    """The numbers of one file: ``columns[name]`` (N,), and the line of each row."""
+class Rows:
+    """What the rows of a table are called in messages: ``run.csv:line 9``."""
 
     source: str
+    numbers: Int[np.ndarray, " N"]
+    word: str = "line"
+
+    def at(self, i: int) -> str:
+        """The place of the row at position ``i``."""
+        return f"{self.source}:{self.word} {self.numbers[i]}"
+
+    def kept(self, which: Int[np.ndarray, " K"] | slice) -> "Rows":
+        """Some of the rows, by their positions."""
+        return replace(self, numbers=self.numbers[which])
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns of one clock: ``columns[name]`` (N,), and what their rows are called.
+
+    ``clock`` is in s where the format has stamps of its own, None where a column or the
+    user says the time. ``stream`` names a table among several of one recording.
+    """
+
+    rows: Rows
     header: tuple[str, ...]
     columns: dict[str, Float[np.ndarray, " N"]]
-    lines: Int[np.ndarray, " N"]
+    clock: Float[np.ndarray, " N"] | None = None
+    stream: str = ""
+    notes: tuple[Note, ...] = ()
 
-
-def shown(path: Path) -> str:
-    """A path as the user would write it: relative when it lies below the folder."""
-    try:
-        return str(path.relative_to(Path.cwd()))
-    except ValueError:
-        return str(path)
-
-
-def read_bytes(path: Path, limit: int = MAX_BYTES) -> bytes:
-    """The content of a regular file; folders, devices and pipes are refused (E130)."""
-    where = shown(path)
-    if "\x00" in str(path):
-        raise InputError(
-            "E131",
-            "NUL in a path",
-            where=repr(where),
-            got="a NUL character",
-            expected="a plain path",
-            fix="remove the character",
-        )
-    try:
-        before = os.stat(path)
-        if not stat.S_ISREG(before.st_mode):
-            raise _not_a_file(where, before.st_mode)
-        if before.st_size > limit:
-            raise InputError(
-                "E126",
-                "file too large",
-                where=where,
-                got=f"{before.st_size} bytes",
-                expected=f"at most {limit} bytes",
-                fix="split the file",
-            )
-        content = path.read_bytes()
-        after = os.stat(path)
-    except OSError as error:
-        raise _unreadable(path, error) from error
-    if (before.st_size, before.st_mtime_ns) != (after.st_size, after.st_mtime_ns):
-        raise InputError(
-            "E129",
-            "file changed while it was read",
-            where=where,
-            got=f"{before.st_size} then {after.st_size} bytes",
-            expected="a finished recording",
-            fix="wait until the recording has ended",
-        )
-    return content
-
-
-def _not_a_file(where: str, mode: int) -> InputError:
-    kinds = {
-        stat.S_IFDIR: "a folder",
-        stat.S_IFIFO: "a pipe",
-        stat.S_IFSOCK: "a socket",
-        stat.S_IFCHR: "a device",
-        stat.S_IFBLK: "a device",
-    }
-    return InputError(
-        "E130",
-        "not a file",
-        where=where,
-        got=kinds.get(stat.S_IFMT(mode), "something else"),
-        expected="a regular file",
-        fix="name the file itself",
-    )
-
-
-def _unreadable(path: Path, error: OSError) -> InputError:
-    folder = path.parent
-    hint = "check the path"
-    if isinstance(error, FileNotFoundError):
-        if path.is_symlink():
-            hint = f"the link points to {os.readlink(path)}, which is not there"
-        elif folder.is_dir():
-            stems = [p.stem for p in folder.iterdir() if p.suffix == path.suffix]
-            close = nearest(path.stem, stems)
-            hint = f"did you mean {close}{path.suffix}" if close else hint
-    elif isinstance(error, PermissionError):
-        hint = "give yourself the right to read it"
-    return InputError(
-        "E130",
-        "file cannot be read",
-        where=shown(path),
-        got=(error.strerror or str(error)).lower(),
-        expected="a readable file",
-        fix=hint,
-    )
+    def kept(self, which: Int[np.ndarray, " K"] | slice) -> "Table":
+        """Some of the rows, by their positions."""
+        columns = {name: values[which] for name, values in self.columns.items()}
+        clock = None if self.clock is None else self.clock[which]
+        return replace(self, rows=self.rows.kept(which), columns=columns, clock=clock)
 
 
 def decode(content: bytes, where: str) -> str:
     """Bytes to text: UTF-8 with or without a byte-order mark, no NUL bytes (E120)."""
-    if content.startswith(_COMPRESSED):
-        raise InputError(
-            "E126",
-            "compressed file",
-            where=where,
-            got=f"first bytes {content[:2].hex()}",
-            expected="plain text",
-            fix="unpack the file first",
-        )
+    if content.startswith(COMPRESSED):
+        raise compressed(where, content)
     nul = content.find(b"\x00")
     faults = [0] if content.startswith(_BINARY) else [nul] if nul >= 0 else []
     try:
@@ -156,8 +87,13 @@ def decode(content: bytes, where: str) -> str:
     )
 
 
-def read_table(path: Path, wanted: Sequence[str], time: str | None = None) -> Table:
-    """Read the wanted columns of a CSV file as float64; empty cells become NaN."""
+def read_table(
+    path: Path, wanted: Sequence[str] | None, time: str | None = None
+) -> Table:
+    """Read the wanted columns of a CSV file as float64; empty cells become NaN.
+
+    None wants every named column whose first cell is a number.
+    """
     where = shown(path)
     text = decode(read_bytes(path), where)
     lines = text.splitlines()
@@ -183,12 +119,13 @@ def read_table(path: Path, wanted: Sequence[str], time: str | None = None) -> Ta
         )
     numbers = np.asarray(filled[1:], dtype=np.int64) + 1
     rows = [lines[i] for i in filled[1:]]
+    wanted = _numeric(header, rows[0]) if wanted is None else wanted
     columns = [_position(name, header, where) for name in wanted]
     quoted = '"' in text
     _check_widths(rows, header, numbers, where, quoted)
     values = _parse(rows, columns, header, numbers, where, quoted, time)
     found = {name: values[:, i] for i, name in enumerate(wanted)}
-    return Table(where, header, found, numbers)
+    return Table(Rows(where, numbers), header, found)
 
 
 def _header(line: str, where: str) -> tuple[str, ...]:
@@ -217,6 +154,12 @@ def _header(line: str, where: str) -> tuple[str, ...]:
                 fix="rename one of them",
             )
     return tuple(names)
+
+
+def _numeric(header: tuple[str, ...], row: str) -> list[str]:
+    cells = [cell.strip() for cell in next(csv.reader([row], skipinitialspace=True))]
+    pairs = zip(header, cells, strict=False)
+    return [name for name, cell in pairs if name and (not cell or _is_number(cell))]
 
 
 def _delimiter(line: str, where: str, word: str) -> InputError:

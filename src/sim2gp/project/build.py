@@ -17,6 +17,7 @@ from sim2gp.project.schema import (
     EFFECT_OPTIONS,
     ActuatorSpec,
     EffectSpec,
+    LogSpec,
     PriorSpec,
     ProjectSpec,
 )
@@ -240,6 +241,7 @@ def check_names(spec: ProjectSpec, source: Source, system: AbstractSystem) -> No
                     fix="name the column, or leave the channel out",
                 )
         _check_complete(list(group.columns), states, inputs, source, i)
+        _check_clock(group, source, i)
         for name in group.fixed:
             if name not in constants:
                 where = source.where("logs", i, "fixed", name)
@@ -285,6 +287,25 @@ def _check_complete(
         expected="every input, and at least one measured channel",
         fix=f'add {lacking[0]} = "its column" (an input may be a constant number)',
     )
+
+
+def _check_clock(group: LogSpec, source: Source, i: int) -> None:
+    """Time comes from a column or a period; rows from a period or from stamps."""
+    pairs: list[tuple[str, str, object, object]]
+    pairs = [("time", "period", group.time, group.period)]
+    if group.resample is not None:
+        rule = group.resample
+        pairs += [("resample.period", "resample.stamps", rule.period, rule.stamps)]
+    for one, other, first, second in pairs:
+        if first is not None and second is not None:
+            raise InputError(
+                "E160",
+                f"{one} and {other}",
+                where=source.where("logs", i, *other.split(".")),
+                got=f"{other} = {second!r}",
+                expected="one of the two",
+                fix=f"remove {one} or {other}",
+            )
 
 
 def _check_pair(what: str, low: float, high: float, where: str) -> None:

@@ -13,9 +13,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sim2gp.errors import InputError, nearest
-from sim2gp.logs import Column, Log, read_csv
-from sim2gp.logs.table import shown
-from sim2gp.project.schema import ColumnSpec, LogSpec, ProjectSpec, validated
+from sim2gp.logs import Column, Log, Resample, read_log
+from sim2gp.logs.file import shown
+from sim2gp.project.schema import (
+    ColumnSpec,
+    LogSpec,
+    ProjectSpec,
+    ResampleSpec,
+    validated,
+)
 from sim2gp.project.source import Source, read_source
 
 if TYPE_CHECKING:
@@ -119,14 +125,18 @@ class Project:
         return list(found)
 
     def _read(self, path: Path, group: int, spec: LogSpec) -> tuple[Log, ...]:
-        return read_csv(
+        return read_log(
             path,
             {name: _column(value) for name, value in spec.columns.items()},
             states=self.system.physical_states,
             actions=self.system.actions,
-            time=_clock(spec.time),
+            time=None if spec.time is None else _clock(spec.time),
+            period=spec.period,
+            episode=spec.episode,
+            resample=_resample(spec.resample),
             exclude=[(a, b) for a, b in spec.exclude],
             drop_nonfinite=spec.drop_nonfinite,
+            keep_first=spec.keep_first,
             limits={name: (a, b) for name, (a, b) in self.spec.limits.items()},
             fixed=spec.fixed,
             group=group,
@@ -214,6 +224,12 @@ def _column(value: str | float | ColumnSpec) -> Column | float:
 def _clock(value: str | ColumnSpec) -> Column | str:
     found = _column(value)
     return found if isinstance(found, Column) else str(found)
+
+
+def _resample(spec: ResampleSpec | None) -> Resample | None:
+    if spec is None:
+        return None
+    return Resample(spec.method, spec.period, spec.stamps)
 
 
 def _no_group(source: Source) -> InputError:

@@ -72,11 +72,30 @@ class ColumnSpec(Section):
     saturation: Pair | None = None
 
 
+class ResampleSpec(Section):
+    """How streams with clocks of their own become one: every period, or as one has it.
+
+    With neither, at the stamps of the stream that measures most.
+    """
+
+    method: Literal["linear", "hold"] = "linear"
+    period: Positive | None = None
+    stamps: str | None = None
+
+
 class LogSpec(Section):
-    """A group of files with the same columns and the same fixed values."""
+    """A group of files with the same columns and the same fixed values.
+
+    ``time`` is a column (default "time"; in a bag "header" or "log"), or rows have a
+    fixed ``period``. ``episode`` is a column of episode numbers.
+    """
 
     files: Annotated[list[str], Field(min_length=1)]
-    time: str | ColumnSpec = "time"
+    time: str | ColumnSpec | None = None
+    period: Positive | None = None
+    episode: str | None = None
+    resample: ResampleSpec | None = None
+    keep_first: bool = False
     exclude: list[Pair] = []
     columns: dict[str, str | FiniteFloat | ColumnSpec]
     fixed: dict[str, FiniteFloat] = {}
@@ -190,7 +209,8 @@ def _keys_at(path: Path_) -> list[str]:
         last = section == "parameters" or len(path) > 2
         model = PriorSpec if last else ActuatorSpec
     elif section == "logs":
-        model = ColumnSpec if len(path) > 2 else LogSpec
+        inner = ResampleSpec if "resample" in path else ColumnSpec
+        model = inner if len(path) > 2 else LogSpec
     elif section:
         model = type(ProjectSpec.model_fields[str(section)].default)
     return list(model.model_fields)

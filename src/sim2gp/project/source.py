@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from sim2gp.errors import InputError
-from sim2gp.logs.table import decode, read_bytes, shown
+from sim2gp.logs.file import read_bytes, shown
+from sim2gp.logs.table import decode
 
 MAX_BYTES = 1_000_000
 MAX_DEPTH = 64

@@ -1,0 +1,280 @@
+"""Files of robot data before they are parsed: what kind, whole, unchanged, not a bomb.
+
+The suffix names the format and the first bytes must agree. Readers of other projects
+raise many kinds of errors on damaged files; `readable` makes one line of them.
+"""
+
+import importlib
+import os
+import stat
+import struct
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from sim2gp.errors import InputError, nearest
+
+MAX_BYTES = 2 * 1024**3  # of one text file; the numbers need about as much again
+#: Above this much memory, a file that claims to hold RATIO times its size is refused.
+LARGE = 64 * 1024**2
+RATIO = 200
+
+SUFFIXES = {
+    ".npz": "npz",
+    ".parquet": "parquet",
+    ".pq": "parquet",
+    ".h5": "hdf5",
+    ".hdf5": "hdf5",
+    ".bag": "rosbag1",
+    ".db3": "rosbag2",
+    ".mcap": "mcap",
+}
+FOLDERS = {
+    "lerobot": ("meta/info.json",),
+    "rosbag2": ("metadata.yaml",),
+    "minari": ("data/metadata.json", "metadata.json"),
+}
+MAGIC = {
+    "npz": b"PK\x03\x04",
+    "parquet": b"PAR1",
+    "hdf5": b"\x89HDF\r\n\x1a\n",
+    "rosbag1": b"#ROSBAG V2.0\n",
+    "rosbag2": b"SQLite format 3\x00",
+    "mcap": b"\x89MCAP0\r\n",
+}
+COMPRESSED = (b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"PK\x03\x04", b"\x28\xb5\x2f\xfd")
+_PICKLES = (".pkl", ".pickle", ".pt", ".pth", ".ckpt", ".joblib")
+_PICKLED = tuple(bytes([0x80, protocol]) for protocol in range(2, 6))
+#: What parsers of other projects raise on bytes that they did not expect.
+FAULTS = (
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    EOFError,
+    LookupError,
+    MemoryError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+    struct.error,
+    zlib.error,
+)
+
+
+def shown(path: Path) -> str:
+    """A path as the user would write it: relative when it lies below the folder."""
+    try:
+        return str(path.relative_to(Path.cwd()))
+    except ValueError:
+        return str(path)
+
+
+def kind_of(path: Path) -> str:
+    """The format of a file or folder: "csv" or one of `SUFFIXES` and `FOLDERS`.
+
+    Raises `InputError` E115, E120, E126, E130, E180 where name and content differ.
+    """
+    _check_nul(path)
+    if path.is_dir():
+        for kind, marks in FOLDERS.items():
+            if any((path / mark).is_file() for mark in marks):
+                return kind
+        raise _not_a_file(shown(path), stat.S_IFDIR)
+    if path.suffix.lower() in _PICKLES:
+        raise pickled(shown(path), path.suffix)
+    kind = SUFFIXES.get(path.suffix.lower(), "csv")
+    if kind != "csv":
+        with steady(path), path.open("rb") as file:
+            _check_magic(file.read(16), kind, shown(path))
+    return kind
+
+
+def _check_magic(first: bytes, kind: str, where: str) -> None:
+    if first.startswith(MAGIC[kind]):
+        return
+    if not first:
+        raise InputError(
+            "E115",
+            "empty file",
+            where=where,
+            got="0 bytes",
+            expected=f"a recording as {kind}",
+            fix="record the log again",
+        )
+    if first.startswith(_PICKLED):
+        raise pickled(where, "a pickle")
+    if first.startswith(COMPRESSED) and not first.startswith(MAGIC["npz"]):
+        raise compressed(where, first)
+    other = [name for name, magic in MAGIC.items() if first.startswith(magic)]
+    raise InputError(
+        "E120",
+        f"not what its name says ({kind})",
+        where=where,
+        got=f"the first bytes of {other[0]}" if other else f"first bytes {first[:4]!r}",
+        expected=f"first bytes {MAGIC[kind][:6]!r}",
+        fix="rename the file, or record it again",
+    )
+
+
+def pickled(where: str, got: str) -> InputError:
+    """E180: loading a pickle runs the code in it, so none is ever opened."""
+    return InputError(
+        "E180",
+        "pickle refused",
+        where=where,
+        got=got,
+        expected="plain numbers",
+        fix="save arrays of numbers, with numpy.savez or as Parquet",
+    )
+
+
+def compressed(where: str, first: bytes) -> InputError:
+    """E126: what a compressed text would unpack to is not known."""
+    return InputError(
+        "E126",
+        "compressed file",
+        where=where,
+        got=f"first bytes {first[:2].hex()}",
+        expected="the file itself",
+        fix="unpack the file first",
+    )
+
+
+def read_bytes(path: Path, limit: int = MAX_BYTES) -> bytes:
+    """The content of a regular file; folders, devices and pipes are refused (E130)."""
+    with steady(path, limit):
+        return path.read_bytes()
+
+
+@contextmanager
+def steady(path: Path, limit: int | None = None) -> Iterator[int]:
+    """The size of a regular file that is the same afterwards (E126, E129 to E131)."""
+    where = shown(path)
+    _check_nul(path)
+    try:
+        before = os.stat(path)
+        if not stat.S_ISREG(before.st_mode):
+            raise _not_a_file(where, before.st_mode)
+        if limit is not None and before.st_size > limit:
+            raise InputError(
+                "E126",
+                "file too large",
+                where=where,
+                got=f"{before.st_size} bytes",
+                expected=f"at most {limit} bytes",
+                fix="split the file",
+            )
+        yield before.st_size
+        after = os.stat(path)
+    except OSError as error:
+        raise _unreadable(path, error) from error
+    if (before.st_size, before.st_mtime_ns) != (after.st_size, after.st_mtime_ns):
+        raise InputError(
+            "E129",
+            "file changed while it was read",
+            where=where,
+            got=f"{before.st_size} then {after.st_size} bytes",
+            expected="a finished recording",
+            fix="wait until the recording has ended",
+        )
+
+
+@contextmanager
+def readable(where: str, *others: type[Exception]) -> Iterator[None]:
+    """Whatever a parser raises inside becomes E125: the file is cut off or damaged."""
+    faults: tuple[type[Exception], ...] = (*FAULTS, *others)
+    try:
+        yield
+    except faults as error:
+        text = " ".join(str(error).split())
+        raise InputError(
+            "E125",
+            "file incomplete or damaged",
+            where=where,
+            got=(text or type(error).__name__)[:120].rstrip("."),
+            expected="a whole file",
+            fix="copy or record it again, once the recorder has closed it",
+        ) from error
+
+
+def check_declared(declared: int, size: int, where: str, what: str = "numbers") -> None:
+    """What a file claims to unpack to is in proportion to its size (E126)."""
+    bomb = declared > LARGE and declared > RATIO * size
+    if declared > MAX_BYTES or bomb:
+        raise InputError(
+            "E126",
+            f"declares more {what} than it can hold" if bomb else f"too many {what}",
+            where=where,
+            got=f"{declared} bytes in a file of {size}",
+            expected=f"at most {MAX_BYTES} bytes, and {RATIO} times its size",
+            fix="split the file, or name fewer columns",
+        )
+
+
+def library(module: str, extra: str, what: str) -> Any:
+    """A module of an optional package, imported when a file needs it (E135)."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise InputError(
+            "E135",
+            f"{what} cannot be read",
+            got=str(error),
+            expected=module.split(".")[0],
+            fix=f"pip install 'sim2gp[{extra}]'",
+        ) from error
+
+
+def _check_nul(path: Path) -> None:
+    if "\x00" in str(path):
+        raise InputError(
+            "E131",
+            "NUL in a path",
+            where=repr(shown(path)),
+            got="a NUL character",
+            expected="a plain path",
+            fix="remove the character",
+        )
+
+
+def _not_a_file(where: str, mode: int) -> InputError:
+    kinds = {
+        stat.S_IFDIR: "a folder",
+        stat.S_IFIFO: "a pipe",
+        stat.S_IFSOCK: "a socket",
+        stat.S_IFCHR: "a device",
+        stat.S_IFBLK: "a device",
+    }
+    return InputError(
+        "E130",
+        "not a file",
+        where=where,
+        got=kinds.get(stat.S_IFMT(mode), "something else"),
+        expected="a regular file, or a folder of LeRobot, Minari or rosbag2",
+        fix="name the file itself",
+    )
+
+
+def _unreadable(path: Path, error: OSError) -> InputError:
+    folder = path.parent
+    hint = "check the path"
+    if isinstance(error, FileNotFoundError):
+        if path.is_symlink():
+            hint = f"the link points to {os.readlink(path)}, which is not there"
+        elif folder.is_dir():
+            stems = [p.stem for p in folder.iterdir() if p.suffix == path.suffix]
+            close = nearest(path.stem, stems)
+            hint = f"did you mean {close}{path.suffix}" if close else hint
+    elif isinstance(error, PermissionError):
+        hint = "give yourself the right to read it"
+    return InputError(
+        "E130",
+        "file cannot be read",
+        where=shown(path),
+        got=(error.strerror or str(error)).lower(),
+        expected="a readable file",
+        fix=hint,
+    )
