@@ -125,14 +125,15 @@ def _is_number(word: str) -> bool:
 
 def _check_loose(words: list[str], wanted: dict[str, tuple[Any, str]]) -> None:
     shown = [name for _, name in wanted.values()]
-    if len(words) > len(wanted):
+    many = bool(wanted) and get_origin([*wanted.values()][-1][0]) is tuple
+    if len(words) > len(wanted) and not many:
         expected = " ".join(shown) or "options only"
         word = words[len(wanted)]
         raise usage_error("unexpected argument", word, expected, "remove it")
     if len(words) < len(wanted):
         got, lacking = " ".join(words) or "nothing", shown[len(words)]
         raise usage_error(f"missing {lacking}", got, " ".join(shown), f"add {lacking}")
-    for word, (kind, name) in zip(words, wanted.values(), strict=True):
+    for word, (kind, name) in zip(words, wanted.values(), strict=not many):
         _check_value(name, word, kind)
 
 

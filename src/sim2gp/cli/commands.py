@@ -13,7 +13,7 @@ from tyro.conf import Positional, arg
 
 from sim2gp.cli.arguments import numbers, pairs, usage_error
 from sim2gp.runs import Progress, load_run
-from sim2gp.runs.store import check_target
+from sim2gp.runs.store import check_absent, check_target
 from sim2gp.runs.workers import cores
 
 #: Figure, and the module of `sim2gp.experiments` that makes it.
@@ -72,6 +72,39 @@ class Demo(Writes):
             truth=self.truth,
             progress=progress,
         )
+
+
+@dataclass(kw_only=True)
+class Init(Common):
+    """Draft a project file from a model and logs: columns, signs, units, zeros."""
+
+    model: Annotated[Positional[str], arg(metavar="MODEL")]
+    """A bundled machine's name, or an MJCF or URDF file."""
+    logs: Annotated[Positional[tuple[Path, ...]], arg(metavar="LOGS...")]
+    """Recordings of the machine, alike in their columns."""
+    out: Annotated[Path | None, arg(metavar="FILE")] = None
+    """The project file; default MODEL's name, here."""
+    period: float | None = None
+    """Time between rows in s, where no column says it."""
+    seed: int = 0
+    """Draws the constants that readings are tried with."""
+
+    def run(self, progress: Progress) -> dict[str, Any]:
+        import jax
+
+        out = self.out or Path(Path(self.model).stem + ".toml")
+        check_absent(out)
+        drafts = import_module("sim2gp.project.draft")
+        progress.say("trying readings of the columns on the machine")
+        draft = drafts.draft_project(
+            self.model,
+            self.logs,
+            out,
+            key=jax.random.key(self.seed),
+            period=self.period,
+        )
+        found: dict[str, Any] = drafts.told(draft, out)
+        return found
 
 
 @dataclass(kw_only=True)
@@ -294,6 +327,7 @@ class Reproduce(Writes):
 
 COMMANDS: dict[str, type[Common]] = {
     "demo": Demo,
+    "init": Init,
     "identify": Identify,
     "evaluate": Evaluate,
     "explain": Explain,

@@ -6,13 +6,12 @@ file before it replaces the old one, whole or not at all.
 """
 
 import dataclasses
-import os
 import re
-import tempfile
 from pathlib import Path
 
 from sim2gp.errors import InputError, Sim2GPError
-from sim2gp.project.project import load_project
+from sim2gp.project.project import Project
+from sim2gp.project.replace import replace_project
 from sim2gp.project.schema import EFFECT_OPTIONS
 from sim2gp.systems import AbstractEffect, Candidate, InputDelay
 
@@ -71,19 +70,13 @@ def amended(text: str, candidate: Candidate, note: str = "") -> str:
 def amend(path: Path, candidate: Candidate, note: str = "") -> None:
     """Add a candidate to a project file (E160 where the result is not one)."""
     text = amended(path.read_text(encoding="utf-8"), candidate, note)
-    handle, aside = tempfile.mkstemp(
-        dir=path.parent, prefix=f".{path.stem}-", suffix=".toml"
-    )
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8", newline="") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        found = load_project(aside)
+
+    def freed(found: Project) -> None:
         if candidate.name not in found.system.parameters.names:
             raise InputError("E160", f"{candidate.name} did not become free")
-        os.chmod(aside, path.stat().st_mode & 0o777)
-        os.replace(aside, path)
+
+    try:
+        replace_project(path, text, freed)
     except Sim2GPError as error:
         header, lines = lines_for(candidate)
         raise InputError(
@@ -94,9 +87,6 @@ def amend(path: Path, candidate: Candidate, note: str = "") -> None:
             expected="a file that can end with a table more",
             fix="add by hand: " + ", ".join([header, *lines]),
         ) from error
-    finally:
-        if os.path.exists(aside):
-            os.unlink(aside)
 
 
 def _key(name: str) -> str:

@@ -1,79 +1,80 @@
 """Signs, zeros and units that no name tells: the reading that the machine explains.
 
-Every reading of the columns is tried on the machine itself, twice. Forecasts of 0.2 s
-at constants drawn from the prior leave the few that are near the best, by
+Every reading of the columns is tried on the machine itself, twice, on the windows with
+the most motion. Forecasts at constants drawn from the prior leave the few that are near
+the best, by
 
-    mean over channels of  1/2 log( error^2 / motion^2 ),
+    mean over channels of  1/2 log( error^2 / motion^2 )
 
-of the better quarter of the draws; of those the one with the highest evidence is taken: the likelihood of `identify`, its
-constants fitted, on the windows with the most motion. The plain reading is kept unless
-another one is better by `SURE` nats, and what no reading decides is said to be open.
+of the better quarter of the draws; of those the one with the highest evidence is taken,
+with the likelihood of `identify` and its constants fitted. The plainest reading is kept
+unless another one is better by `SURE` nats; what no reading decides is said to be open.
 """
 
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from sim2gp.errors import NotConverged, NotFinite
 from sim2gp.logs import Column, Log
 from sim2gp.logs.units import factor
 from sim2gp.models.cutting import cut
-from sim2gp.models.grid import evaluation_windows
 from sim2gp.models.windows import Windows, fit_windows, simulate
-from sim2gp.systems.base import AbstractSystem, Channel
+from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import Key, in_float64
 
 SURE = 5.0  # nats of evidence that a reading is better than another by
-HORIZON = 0.2  # s
+WINDOW = 0.2  # s
 DRAWS, BEST = 16, 4
-WINDOWS = 40  # that are tried, those with the most motion
+WINDOWS = 40  # that are tried
 EXHAUSTIVE = 128  # readings at most; beyond, one channel after the other
 FINAL = 6  # readings that are fitted
 NEAR = 1.5  # of the first score, from the best one
-LARGE = 3.2  # of a travel that may be degrees or millimetres
 _FLOOR, _CAP = 1e-3, 10.0  # of error / motion
 
 
 @dataclass(frozen=True)
 class Reading:
-    """How one joint (with its velocity) or input is read: sign, unit, zero."""
+    """How a joint (with its velocity) or an input is read: its sign and its zero."""
 
     sign: int = 1
-    unit: str | None = None
     offset: float = 0.0
 
     def of(self, column: Column, rate: bool = False) -> Column:
-        """The column read so; a velocity has neither a zero nor the joint's unit."""
-        unit = None if self.unit is None else self.unit + "/s" * rate
-        return replace(
-            column,
-            sign=self.sign * column.sign,
-            unit=column.unit or unit,
-            offset=0.0 if rate else self.offset,
-        )
+        """The column read so; a velocity has no zero."""
+        offset = 0.0 if rate else self.offset
+        return replace(column, sign=self.sign * column.sign, offset=offset)
 
 
 PLAIN = Reading()
 Readings = dict[str, Reading]  # of joints and inputs, by channel
 
 
+class Version(NamedTuple):
+    """The columns in certain units, and the logs as these read them."""
+
+    columns: Mapping[str, Column]
+    logs: Sequence[Log]
+
+
 @dataclass(frozen=True)
 class Found:
-    """The best reading of each channel, and by how many nats each beats the next.
+    """The best version, and its best reading of each channel.
 
-    ``surer[name]`` compares with the best reading in which this channel has another
-    sign, zero or unit, among those that were fitted (infinite where there is none).
-    ``images`` readings, this one among them, the machine cannot tell apart: a pendulum
-    and its mirror image.
+    ``surer[name]``: by how many nats of evidence this beats the best reading in which
+    the channel has another sign or zero, or unit, of those that were fitted (infinite
+    where there is none). ``images`` readings, this one among them, the machine cannot
+    tell apart: a pendulum and its mirror image.
     """
 
+    version: Version
     readings: Readings
     surer: dict[str, float]
     images: int
@@ -81,144 +82,117 @@ class Found:
 
 @in_float64
 def find_readings(
-    system: AbstractSystem,
-    logs: Sequence[Log],
-    stated: Mapping[str, Column],
-    *,
-    key: Key,
+    system: AbstractSystem, versions: Sequence[Version], *, key: Key
 ) -> Found:
-    """The reading of every measured joint and every input that explains the logs best.
+    """The reading of joints and inputs that explains the logs best.
 
-    ``stated`` are the columns that the logs were read by; a unit that one states stays.
+    Raises `NotConverged` where the constants can be fitted in no reading.
     """
-    joints = {c.name: c for c in system.physical_states}
-    options: dict[str, list[Reading]] = {}
-    for name, column in stated.items():
-        if name in joints and not name.endswith(".velocity"):
-            options[name] = _of_joint(joints[name], column, logs)
-        elif name not in joints:
-            options[name] = [PLAIN, Reading(-1)]
-    trial = _Trial(system, logs, key)
-    tried = _tried(trial, options)
-    first = list(dict(reversed([(score, r) for r, score in tried])).items())
-    near = [r for score, r in sorted(first)[:FINAL] if score < tried[0][1] + NEAR]
-    evidence = [trial.evidence(reading) for reading in near]
+    trials = [_Trial(system, version, key) for version in versions]
+    tried = sorted(
+        ((score, k, r) for k, t in enumerate(trials) for score, r in t.tried()),
+        key=lambda x: (x[0], x[1], _departs(x[2])),
+    )
+    plainest = {score: (k, r) for score, k, r in reversed(tried)}
+    near = [x for s, x in sorted(plainest.items()) if s < tried[0][0] + NEAR][:FINAL]
+    evidence = [trials[k].evidence(reading) for k, reading in near]
     top = max(evidence)
-    good = [r for r, e in zip(near, evidence, strict=True) if e >= top - SURE]
-    chosen = min(good, key=_departs)
-    surer = {
-        name: top
-        - max(
-            (e for r, e in zip(near, evidence, strict=True) if r[name] != chosen[name]),
-            default=-np.inf,
-        )
-        for name in options
-    }
-    score = dict((tuple(r.items()), s) for r, s in tried)[tuple(chosen.items())]
-    return Found(chosen, surer, sum(s == score for _, s in tried))
-
-
-def _of_joint(channel: Channel, column: Column, logs: Sequence[Log]) -> list[Reading]:
-    """The plain reading first; half a turn's zero where the joint turns freely."""
-    units: list[str | None] = [None]
-    travel = max(np.ptp(log.channels[channel.name]) for log in logs)
-    if column.unit is None and travel > LARGE:
-        units += {"rad": ["deg"], "m": ["mm", "cm"]}.get(channel.unit, [])
-    zeros = (0.0, np.pi) if channel.angle else (0.0,)
-    return [
-        Reading(sign, unit, zero)
-        for unit in units
-        for zero in zeros
-        for sign in (1, -1)
-    ]
+    if not np.isfinite(top):
+        raise NotConverged("E201", "no reading of the columns can be fitted")
+    good = [x for x, e in zip(near, evidence, strict=True) if e >= top - SURE]
+    k, chosen = min(good, key=lambda x: (x[0], _departs(x[1])))
+    surer = {}
+    for name in chosen:
+        other = [
+            e
+            for (j, r), e in zip(near, evidence, strict=True)
+            if r[name] != chosen[name] or j != k
+        ]
+        surer[name] = top - max(other, default=-np.inf)
+    score = next(s for s, j, r in tried if (j, r) == (k, chosen))
+    images = sum((s, j) == (score, k) for s, j, _ in tried)
+    return Found(versions[k], chosen, surer, images)
 
 
 def _departs(reading: Readings) -> int:
     return sum(r != PLAIN for r in reading.values())
 
 
-def _tried(
-    trial: "_Trial", options: Mapping[str, list[Reading]]
-) -> list[tuple[Readings, float]]:
-    """Readings with their scores, best first; of equal ones the plainer first.
-
-    All of them where they are few, else channel by channel, twice around.
-    """
-    if np.prod([len(choices) for choices in options.values()]) <= EXHAUSTIVE:
-        every = [
-            dict(zip(options, chosen, strict=True))
-            for chosen in itertools.product(*options.values())
-        ]
-    else:
-        best, every = dict.fromkeys(options, PLAIN), []
-        for name in [*options, *options]:
-            here = [{**best, name: reading} for reading in options[name]]
-            best = min(here, key=lambda r: (trial.score(r), _departs(r)))
-            every += [r for r in here if r not in every]
-    scored = [(reading, round(trial.score(reading), 6)) for reading in every]
-    return sorted(scored, key=lambda x: (x[1], _departs(x[0])))
-
-
 class _Trial:
-    """What readings are worth; each of the two programs is compiled once."""
+    """What readings of one version are worth."""
 
-    def __init__(self, system: AbstractSystem, logs: Sequence[Log], key: Key) -> None:
-        self.system, self.logs, self.key = system, logs, key
-        self.known: dict[Any, float] = {}
+    def __init__(self, system: AbstractSystem, version: Version, key: Key) -> None:
+        self.system, self.version, self.key = system, version, key
+        windows, _ = cut(version.logs, system, window=WINDOW)
+        self.windows = _moving(windows)
         prior = system.parameters.prior()
         draws = jax.random.normal(key, (DRAWS - 1, prior.mean.size))
         z = jnp.concatenate([jnp.zeros((1, prior.mean.size)), draws])
-        self.tt = prior.mean + z @ prior.scale.T
-        grid = evaluation_windows(logs, system, longest=HORIZON)
-        known = np.isfinite(grid.lag).all(axis=1)
-        self.ahead = _moving(grid.windows, known)
-        windows, _ = cut(logs, system, window=HORIZON)
-        self.fitted = _moving(windows, np.ones(len(windows), bool))
+        self.tt = prior.mean[None] + z @ prior.scale.T
+        self.options = {
+            name: _options(name, system)
+            for name in version.columns
+            if not name.endswith(".velocity")
+        }
+
+    def tried(self) -> list[tuple[float, Readings]]:
+        """All readings where they are few, else channel by channel, twice around."""
+        choices = self.options.values()
+        if np.prod([len(readings) for readings in choices]) <= EXHAUSTIVE:
+            every = itertools.product(*choices)
+            readings = [dict(zip(self.options, r, strict=True)) for r in every]
+            return [(self.score(reading), reading) for reading in readings]
+        best = dict.fromkeys(self.options, PLAIN)
+        known: dict[tuple[tuple[str, Reading], ...], float] = {}
+        for name in [*self.options, *self.options]:
+            here = [{**best, name: reading} for reading in self.options[name]]
+            scored = [(self.score(r), _departs(r), i) for i, r in enumerate(here)]
+            known |= {tuple(here[i].items()): s for s, _, i in scored}
+            best = here[min(scored)[2]]
+        return [(score, dict(reading)) for reading, score in known.items()]
 
     def score(self, readings: Readings) -> float:
-        """Of forecasts at draws of the prior, from centred starts."""
-        name = tuple(readings.items())
-        if name not in self.known:
-            logs = [_read(log, readings, self.system) for log in self.logs]
-            grid = evaluation_windows(logs, self.system, longest=HORIZON)
-            start = grid.windows.start - np.nan_to_num(grid.lag)
-            some = _some(replace(grid.windows, start=start), self.ahead)
-            motion = np.maximum(_motion(some).mean(axis=0), 1e-30)
-            share = np.sqrt(np.asarray(_errors(self.system, some, self.tt)) / motion)
-            share = np.where(np.isfinite(share), np.clip(share, _FLOOR, _CAP), _CAP)
-            each = np.sort(np.log(share).mean(axis=1))
-            self.known[name] = float(each[:BEST].mean())
-        return self.known[name]
+        """Of forecasts at draws of the prior."""
+        windows = _read(self.windows, readings, self.system)
+        motion = np.maximum(_motion(windows).mean(axis=0), 1e-30)
+        share = np.sqrt(np.asarray(_errors(self.system, windows, self.tt)) / motion)
+        share = np.where(np.isfinite(share), np.clip(share, _FLOOR, _CAP), _CAP)
+        each = np.sort(np.log(share).mean(axis=1))
+        return round(float(each[:BEST].mean()), 6)
 
     def evidence(self, readings: Readings) -> float:
-        """Log evidence of what the files say, in nats, after a fit of the constants."""
-        logs = [_read(log, readings, self.system) for log in self.logs]
-        windows, _ = cut(logs, self.system, window=HORIZON)
-        some = _some(windows, self.fitted)
+        """Log evidence of the numbers in the files, in nats, constants fitted."""
+        windows = _read(self.windows, readings, self.system)
         try:
-            belief = fit_windows(self.system, some, key=self.key, starts=1)
+            belief = fit_windows(self.system, windows, key=self.key, starts=1)
         except (NotConverged, NotFinite):
             return -np.inf
-        states = [c.name for c in self.system.physical_states]
-        scales = [_scale(states[i], readings, self.system) for i in some.outputs]
-        samples = np.asarray(some.mask).sum(axis=(0, 1))
-        density = float(samples @ np.log(np.abs(scales)))  # of the file's own numbers
-        return float(belief.log_evidence) + density
+        units = {c.name: c.unit for c in self.system.physical_states}
+        names = [list(units)[i] for i in windows.outputs]
+        scales = [
+            factor(self.version.columns[name].unit, units[name], name) for name in names
+        ]
+        samples = np.asarray(windows.mask).sum(axis=(0, 1))
+        return float(belief.log_evidence) + float(samples @ np.log(scales))
 
 
-def _moving(windows: Windows, known: Bool[np.ndarray, " W"]) -> Int[np.ndarray, " K"]:
-    """The windows with the most motion, of whole ones."""
-    whole = known & np.asarray(windows.mask).any(axis=(1, 2))
-    motion = np.where(whole, _motion(windows).mean(axis=1), -1.0)
-    most = np.argsort(-motion, kind="stable")[:WINDOWS]
-    return np.sort(most[motion[most] >= 0.0])
+def _options(name: str, system: AbstractSystem) -> list[Reading]:
+    """Both signs; half a turn's zero where a joint turns freely."""
+    turns = any(c.name == name and c.angle for c in system.physical_states)
+    return [Reading(s, z) for z in (0.0, np.pi)[: 1 + turns] for s in (1, -1)]
 
 
-def _some(windows: Windows, which: Int[np.ndarray, " K"]) -> Windows:
-    floor = windows.floor
-    rest = eqx.tree_at(lambda w: w.floor, windows, None)
-    some = jax.tree.map(lambda x: np.asarray(x)[which], rest)
-    return eqx.tree_at(lambda w: w.floor, some, floor, is_leaf=lambda x: x is None)
+def _moving(windows: Windows) -> Windows:
+    """Those with the most motion; the noise of starts is that of all."""
+    most = np.argsort(-_motion(windows).mean(axis=1), kind="stable")[:WINDOWS]
+    which: Int[np.ndarray, " K"] = np.sort(most)
+    some = jax.tree.map(
+        lambda x: np.asarray(x)[which], eqx.tree_at(lambda w: w.floor, windows, None)
+    )
+    kept: Windows = eqx.tree_at(
+        lambda w: w.floor, some, windows.floor, is_leaf=lambda x: x is None
+    )
+    return kept
 
 
 def _motion(windows: Windows) -> Float[np.ndarray, "W c"]:
@@ -240,7 +214,7 @@ def _errors(
         def one(window: Windows) -> Array:
             states = simulate(system, params, window, window.start)
             away = states[:, np.asarray(window.outputs)] - window.y
-            count = jnp.maximum(window.mask.sum(axis=0), 1)
+            count = jnp.maximum(window.mask.sum(axis=0, dtype=away.dtype), 1.0)
             return jnp.where(window.mask, away**2, 0.0).sum(axis=0) / count
 
         found: Array = windows.each(one)
@@ -249,22 +223,28 @@ def _errors(
     return jax.vmap(at)(tt)
 
 
-def _scale(channel: str, readings: Readings, system: AbstractSystem) -> float:
-    """What a reading multiplies a channel by."""
-    joint = channel.removesuffix(".velocity")
-    base = next(c.unit for c in system.physical_states if c.name == joint)
-    reading = readings.get(joint, PLAIN)
-    return reading.sign * factor(reading.unit, base, joint)
-
-
-def _read(log: Log, readings: Readings, system: AbstractSystem) -> Log:
-    """The log in another reading than the plain one that it was read in."""
-    channels = {
-        name: _scale(name, readings, system) * x
-        + (readings[name].offset if name in readings else 0.0)
-        for name, x in log.channels.items()
-    }
-    inputs = {
-        name: readings.get(name, PLAIN).sign * u for name, u in log.inputs.items()
-    }
-    return replace(log, channels=channels, inputs=inputs)
+def _read(windows: Windows, readings: Readings, system: AbstractSystem) -> Windows:
+    """The windows in another reading than the plain one that they were cut in."""
+    names = [c.name for c in system.physical_states]
+    of = [readings.get(name.removesuffix(".velocity"), PLAIN) for name in names]
+    sign = np.asarray([float(r.sign) for r in of])
+    zero = np.asarray(
+        [
+            0.0 if n.endswith(".velocity") else r.offset
+            for n, r in zip(names, of, strict=True)
+        ]
+    )
+    seen = np.asarray(windows.outputs)
+    inputs = np.asarray(
+        [float(readings.get(c.name, PLAIN).sign) for c in system.actions]
+    )
+    found: Windows = eqx.tree_at(
+        lambda w: (w.y, w.start, w.area),
+        windows,
+        (
+            windows.y * sign[seen] + zero[seen],
+            windows.start * sign + zero,
+            windows.area * inputs,
+        ),
+    )
+    return jax.tree.map(jnp.asarray, found)

@@ -140,6 +140,21 @@ def check_target(path: Path) -> None:
     )
 
 
+def check_absent(path: Path) -> None:
+    """Refuse to write a file where there is something, or no folder for it (E132)."""
+    there = path.exists() or path.is_symlink()
+    if path.parent.is_dir() and not there:
+        return
+    raise InputError(
+        "E132",
+        "file exists" if there else "no folder for the file",
+        where=str(path if there else path.parent),
+        got="something of that name" if there else "nothing there",
+        expected="a new file" if there else "a folder",
+        fix="choose another --out" + (", or remove it" if there else ""),
+    )
+
+
 def load_run(path: Path | str) -> Run:
     """Read a run's summary and arrays, checked by its manifest (E130, E183, E185).
 

@@ -1,0 +1,36 @@
+"""A project file takes its place whole or not at all, once it has been read back."""
+
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+from sim2gp.project.project import Project, load_project
+
+
+def replace_project(path: Path, text: str, check: Callable[[Project], object]) -> None:
+    """Write ``text`` beside ``path``, load and check it there, then put it in place.
+
+    Raises whatever the loading or ``check`` raises; the old file is then untouched.
+    """
+    handle, aside = tempfile.mkstemp(
+        dir=path.parent, prefix=f".{path.stem}-", suffix=".toml"
+    )
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8", newline="") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        check(load_project(aside))
+        mode = path.stat().st_mode & 0o777 if path.exists() else 0o666 & ~_umask()
+        os.chmod(aside, mode)
+        os.replace(aside, path)
+    finally:
+        if os.path.exists(aside):
+            os.unlink(aside)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
