@@ -1,7 +1,6 @@
 """Logs against closed forms: what is written to a file is what comes back."""
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -9,19 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from recordings import Channel
 from sim2gp.errors import InputError
 from sim2gp.logs import Column, Log, period_matches, read_log, shared_rows
 from sim2gp.logs.units import UNITS, factor
-
-
-@dataclass(frozen=True)
-class Channel:
-    name: str
-    unit: str
-    angle: bool = False
-    low: float = -math.inf
-    high: float = math.inf
-
 
 STATES = (
     Channel("q", "rad", angle=True),

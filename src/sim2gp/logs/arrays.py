@@ -32,7 +32,7 @@ class Entry:
 
     def names(self, name: str) -> list[str]:
         """What the columns of the array are called."""
-        if len(self.shape) < 2:
+        if len(self.shape) != 2:
             return [name]
         if self.labels:
             return [f"{name}/{label}" for label in self.labels]

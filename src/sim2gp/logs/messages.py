@@ -74,8 +74,9 @@ def collected(
         if size > MAX_BYTES // 4:  # Python's numbers take four times as much
             check_declared(4 * size, 4 * size, where)
     if asked is not None:
-        _check_steady_fields(list(streams.values()), where)
-    return list(streams.values()), tuple(seen)
+        _check_steady_fields([*streams.values()], where)
+    found = sorted(streams.values(), key=lambda stream: stream.topic)
+    return found, tuple(seen)
 
 
 def _check_steady_fields(streams: Sequence[Stream], where: str) -> None:

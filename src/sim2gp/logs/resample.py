@@ -4,7 +4,8 @@ Each stream is a `Track`: converted, unwrapped and masked on its own stamps firs
 an angle must not be interpolated across its wrap. A state is taken at a time t between
 the samples at t_i <= t < t_{i+1} as ``x_i + (t - t_i) / (t_{i+1} - t_i) (x_{i+1} -
 x_i)`` and counts if both count; an input keeps its last value. Nothing is taken across
-a gap: the log is cut there.
+a gap: the log is cut there. Where rows are denser than samples, a sample counts at the
+row next to it alone: interpolated values are not further measurements.
 """
 
 from collections.abc import Sequence
@@ -21,7 +22,8 @@ from sim2gp.logs.table import Rows
 
 Values = Float[np.ndarray, " N"]
 Mask = Bool[np.ndarray, " N"]
-LOST = 0.05  # share of commands between two rows that is worth stating
+LOST = 0.05  # share of samples that is worth stating
+ALIKE = 1.1  # ratio of periods of streams that count as equally fast
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,7 @@ class Resample:
     """How several clocks become one: ``method`` "linear" or "hold" for states.
 
     At a ``period`` in s, or at the ``stamps`` of a named stream; with neither, at the
-    stamps of the stream that measures most.
+    stamps of the slowest stream that measures, so that none is interpolated densely.
     """
 
     method: Literal["linear", "hold"] = "linear"
@@ -79,6 +81,8 @@ def joined(
     notes: list[Note] = []
     valid = np.ones(len(at), dtype=bool)
     lost: list[str] = []
+    counted: dict[str, Mask] = {}
+    between = rule.method == "linear"
     for track in tracks:
         if track.time is at:
             channels |= track.channels
@@ -87,9 +91,9 @@ def joined(
             continue
         notes += _gaps(track)
         before = _before(track, at)
+        once = _once(track.time, at, before, between)
         piece = track.segment[np.maximum(before.row, 0)]
         cuts = cuts | np.concatenate([[False], np.diff(piece) != 0])
-        between = rule.method == "linear"
         if track.channels:
             valid &= before.inside if between else before.held
         if track.inputs:
@@ -98,6 +102,8 @@ def joined(
             channels[name], mask[name] = _state(
                 values, track.mask[name], before, between
             )
+            mask[name] &= once
+            counted[name] = once
         for name, values in track.inputs.items():
             inputs[name] = values[np.maximum(before.row, 0)]
             skipped = 1 - len(np.unique(before.row)) / max(_during(track, at), 1)
@@ -105,7 +111,8 @@ def joined(
                 lost.append(f"{100 * skipped:.0f} % of the samples of {name}")
     if valid.sum() < 2:
         raise _apart(tracks, source)
-    notes.append(_said(rule, place, lost, source))
+    spread = [name for name, once in counted.items() if (~once[valid]).mean() > LOST]
+    notes.append(_said(rule, place, lost, spread, source))
     rows = Rows(source, np.arange(len(at)), "row")
     whole = Track("", rows, at, cuts, channels, mask, inputs, ())
     return _only(whole, valid), notes
@@ -134,6 +141,21 @@ def _before(track: Track, at: Values) -> _Before:
     return _Before(row, share, on | linked, held)
 
 
+def _once(
+    time: Values, at: Float[np.ndarray, " M"], before: _Before, between: bool
+) -> Bool[np.ndarray, " M"]:
+    """The row next to each sample, where several have it as their nearest (or last)."""
+    near = np.maximum(before.row, 0)
+    if between:
+        near = np.minimum(near + (before.share >= 0.5), len(time) - 1)
+    away = np.where(before.inside, np.abs(at - time[near]), np.inf)
+    order = np.lexsort((away, near))
+    first = np.flatnonzero(np.diff(near[order], prepend=-1))
+    once = np.zeros(len(at), dtype=bool)
+    once[order[first]] = True
+    return once
+
+
 def _state(
     values: Values, mask: Mask, before: _Before, between: bool
 ) -> tuple[Float[np.ndarray, " M"], Bool[np.ndarray, " M"]]:
@@ -160,7 +182,10 @@ def _clock(
         at = start + rule.period * np.arange(count)
         return at, np.zeros(count, dtype=bool), f"every {rule.period:g} s"
     if rule.stamps is None:
-        chosen = max(tracks, key=lambda t: (len(t.channels), len(t.time)))
+        measuring = [track for track in tracks if track.channels]
+        slowest = max(track.period for track in measuring)
+        among = [t for t in measuring if t.period * ALIKE > slowest]
+        chosen = max(among, key=lambda track: len(track.channels))
     else:
         named = {track.stream: track for track in tracks}
         if rule.stamps not in named:
@@ -191,11 +216,20 @@ def _gaps(track: Track) -> list[Note]:
     return notes
 
 
-def _said(rule: Resample, place: str, lost: Sequence[str], source: str) -> Note:
+def _said(
+    rule: Resample,
+    place: str,
+    lost: Sequence[str],
+    spread: Sequence[str],
+    source: str,
+) -> Note:
     how = "linear between their samples" if rule.method == "linear" else "held"
     text = f"{source} is resampled {place}: states {how}, inputs held"
     if lost:
         text += "; " + ", ".join(lost) + " fall between two rows and are not used"
+    if spread:
+        text += "; samples of " + ", ".join(spread) + " are fewer than the rows: each"
+        text += " counts once"
     return Note("W153", text)
 
 

@@ -75,7 +75,7 @@ class ColumnSpec(Section):
 class ResampleSpec(Section):
     """How streams with clocks of their own become one: every period, or as one has it.
 
-    With neither, at the stamps of the stream that measures most.
+    With neither, at the stamps of the slowest stream that measures.
     """
 
     method: Literal["linear", "hold"] = "linear"
