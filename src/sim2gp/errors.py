@@ -66,6 +66,12 @@ class Sim2GPWarning(UserWarning):
     """A typed warning; its text starts with its code (W110 and so on)."""
 
 
+def missing_extra(what: str, error: ImportError, extra: str) -> InputError:
+    """E135: something needs a package that an extra of ours installs."""
+    fix = f"pip install 'sim2gp[{extra}]'"
+    return InputError("E135", what, got=str(error), expected=error.name or "", fix=fix)
+
+
 def warn(code: str, text: str) -> None:
     """Emit a `Sim2GPWarning` once at the caller's line."""
     warnings.warn(f"{code} {text}", Sim2GPWarning, stacklevel=3)

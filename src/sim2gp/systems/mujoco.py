@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sim2gp.errors import InputError
+from sim2gp.errors import InputError, missing_extra
 from sim2gp.parameters import Parameter, Parameters
 from sim2gp.systems.actuator import LONGEST_MEAN
 from sim2gp.systems.base import AbstractPlant, Channel
@@ -264,13 +264,7 @@ def loaded(model: Any, root: Path | None = None) -> Any:
     try:
         import mujoco
     except ImportError as error:
-        raise InputError(
-            "E135",
-            "a MuJoCo model cannot be read",
-            got=str(error),
-            expected="mujoco",
-            fix="pip install 'sim2gp[mujoco]'",
-        ) from error
+        raise missing_extra("a MuJoCo model cannot be read", error, "mujoco") from error
 
     if isinstance(model, mujoco.MjModel):
         found = copy.copy(model)
