@@ -167,6 +167,7 @@ def test_an_episode_ends_where_the_tasks_states_end() -> None:
     env.reset(seed=0)
     seen, _, ended, over, info = env.step(np.ones(1, np.float32))
     while not (ended or over):
+        assert (np.abs(seen) < furuta_swingup().state_bound).all()
         seen, _, ended, over, info = env.step(np.ones(1, np.float32))
     assert ended
     assert not over

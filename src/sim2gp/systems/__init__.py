@@ -11,6 +11,7 @@ from sim2gp.systems.base import (
     delayed_means,
     rk4,
 )
+from sim2gp.systems.black_box import BlackBox
 from sim2gp.systems.cartpole import CartPole, CartPoleParams
 from sim2gp.systems.effects import (
     AbstractEffect,
@@ -25,6 +26,7 @@ from sim2gp.systems.effects import (
     Spring,
     Stribeck,
 )
+from sim2gp.systems.functions import ODE
 from sim2gp.systems.furuta import Furuta, FurutaParams
 from sim2gp.systems.lag import Lagged, LaggedParams, lagged_means
 from sim2gp.systems.library import Candidate, InputLag, library
@@ -47,6 +49,7 @@ from sim2gp.systems.two_link import (
 )
 
 __all__ = [
+    "ODE",
     "STRENGTHS",
     "AbstractEffect",
     "AbstractMechanism",
@@ -58,6 +61,7 @@ __all__ = [
     "BackEmf",
     "BaseTilt",
     "BaseTiltSide",
+    "BlackBox",
     "Bound",
     "Candidate",
     "CartPole",

@@ -25,7 +25,7 @@ from sim2gp.errors import InputError, missing_extra
 from sim2gp.parameters import Parameter, Parameters
 from sim2gp.systems.actuator import LONGEST_MEAN
 from sim2gp.systems.base import AbstractPlant, Channel
-from sim2gp.systems.external import AbstractSimulator, flow
+from sim2gp.systems.external import AbstractSimulator, Differences, flow
 from sim2gp.systems.mjcf import (
     DERIVED,
     SIGNED,
@@ -55,11 +55,8 @@ class Engine(AbstractSimulator):
 
         self.model = model
         self.constants = tuple(tuple(group) for group in constants)
-        free = {p.name: p for p in table.free}
-        given = [free.get(group[0].path) for group in self.constants]
-        self.low = np.asarray([p.low if p else -np.inf for p in given])
-        self.high = np.asarray([p.high if p else np.inf for p in given])
-        self.scale = np.asarray([_spread(p) if p else 1.0 for p in given])
+        names = [group[0].path for group in self.constants]
+        self.differences = Differences.of(table, names)
         self._derive = any(c.quantity in DERIVED for g in self.constants for c in g)
         self._copies: list[Any] = []
         self._held: list[bytes] = []
@@ -143,11 +140,6 @@ class Engine(AbstractSimulator):
         # Where a state runs away MuJoCo stops, or begins again.
         stopped = time < span * (1.0 - 1e-6)
         return np.where(stopped[:, None], np.nan, state)
-
-
-def _spread(p: Parameter) -> float:
-    """Half the distance between the prior's quantiles of an sd, in physical units."""
-    return 0.5 * abs(p.constrain(p.mean + p.sd) - p.constrain(p.mean - p.sd))
 
 
 def _cores() -> int:
