@@ -141,7 +141,8 @@ def test_nan_is_an_answer(rows: Any) -> None:
     """Of one row alone; the function is not asked about what is not finite."""
 
     def lost(params: Any, s: Any, a: Any, h: float) -> Any:
-        assert np.isfinite([*params.values(), *s, *a, h]).all()
+        assert np.isfinite([*params.values(), *s, *a]).all()
+        assert h > 0.0
         return step(params, s, a, h) if s[0] < 9.0 else [np.nan, 0.0]
 
     x = rows[0].copy()
@@ -215,6 +216,13 @@ def test_names_are_given_once() -> None:
     for make, f in ((BlackBox, step), (ODE, ode)):
         with pytest.raises(InputError, match=r"E145.*got q\.velocity"):
             make(f, TABLE, STATES, (*ACTIONS, STATES[1]))
+
+
+def test_long_steps_are_divided() -> None:
+    """Over a period by what the function can do, between rows of logs by 10 ms."""
+    for longest, expected in ((np.inf, 0.01), (1e-3, 1e-3)):
+        box = BlackBox(step, TABLE, STATES, ACTIONS, max_substep=longest)
+        assert (box.max_substep, box.window_substep) == (longest, expected)
 
 
 def test_a_fixed_constant_is_passed_on() -> None:

@@ -11,8 +11,9 @@ NAMES = """
 AbstractBelief AbstractModel AbstractPlanner AbstractSystem Auto Box Channel
 FunctionSpace Gaussian ICEM InputError MPC MPPI NLM Parameter Parameters PointEstimate
 PriorMean Residual ResidualFunctionSpace SAC Sim2GP Sim2GPError Task Transitions Windows
-World __version__ bounded cut diagnose episode fit_windows load_project log_bounded
-optimism positive posterior_sampling psal psrl rollout signed systems tasks
+World __version__ bounded cut diagnose episode fit_windows load_project load_run
+log_bounded optimism positive posterior_sampling psal psrl rollout show signed sinks
+systems tasks
 """
 #: Of `sim2gp.systems`, what a system of one's own is made with.
 SYSTEMS = """

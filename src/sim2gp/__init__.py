@@ -16,6 +16,7 @@ _CONTENTS = {
     "tasks": "",
     "diagnose": "",
     "load_project": "project",
+    "sinks": "runs",
     "Box": "types",
     "Gaussian": "gaussian",
     "Parameter": "parameters",
@@ -53,6 +54,8 @@ _CONTENTS = {
     "psrl": "loops",
     "psal": "loops",
     "optimism": "loops",
+    "load_run": "runs",
+    "show": "report",
     "InputError": "errors",
     "Sim2GPError": "errors",
 }
