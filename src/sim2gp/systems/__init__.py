@@ -41,6 +41,7 @@ from sim2gp.systems.perturbed import (
     perturb,
 )
 from sim2gp.systems.placement import BaseTilt, BaseTiltSide, EncoderOffset, Payload
+from sim2gp.systems.sysid import read_sysid, write_sysid
 from sim2gp.systems.two_link import (
     TwoLink,
     TwoLinkParams,
@@ -98,5 +99,7 @@ __all__ = [
     "lagged_means",
     "library",
     "perturb",
+    "read_sysid",
     "rk4",
+    "write_sysid",
 ]

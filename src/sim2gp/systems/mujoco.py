@@ -8,6 +8,7 @@ every value that they take.
 """
 
 import copy
+import dataclasses
 import math
 import os
 import threading
@@ -201,7 +202,7 @@ class MuJoCo(AbstractPlant):
         groups = _groups(model, known, constants)
         priors = dict(priors or {})
         table = Parameters(tuple(_prior(g[0], model, priors) for g in groups))
-        self.parameters = table.replace(**priors)
+        self.parameters = table.replace(**_described(table, priors))
         self.names = tuple(group[0].path for group in groups)
         self.channels = _states(model)
         self.inputs = _inputs(model)
@@ -323,6 +324,19 @@ def _prior(
         expected="a positive number to start from",
         fix="give its prior: mean and sd, or low and high",
     )
+
+
+def _described(
+    table: Parameters, priors: Mapping[str, Parameter | float]
+) -> dict[str, Parameter | float]:
+    """The priors; one that names no unit has the constant's, and its meaning."""
+    known = {p.name: p for p in table.free}
+    return {
+        name: dataclasses.replace(p, unit=known[name].unit, meaning=known[name].meaning)
+        if isinstance(p, Parameter) and not p.unit and name in known
+        else p
+        for name, p in priors.items()
+    }
 
 
 def _states(model: Any) -> tuple[Channel, ...]:
