@@ -30,6 +30,7 @@ SIBLINGS: frozenset[tuple[str, str]] = frozenset(
         ("randomised", "flight"),
         ("robot", "runs"),
         ("ahead", "types"),
+        ("types", "errors"),
         ("descent", "types"),
         ("gaussian", "linalg"),
         ("gaussian", "types"),

@@ -16,7 +16,7 @@ ON_THE_HOST = (
     Mutant(
         "external: differences cross bounds",
         EXTERNAL,
-        "np.clip(points[..., :p], self.low, self.high)",
+        "np.clip(points[..., :p], by.low, by.high)",
         "points[..., :p]",
         ("test_external.py", "cross_a_bound"),
     ),

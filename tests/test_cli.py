@@ -48,10 +48,11 @@ def demo(action: Callable[[Path, Progress], Any]) -> Callable[..., dict[str, Any
         episodes: int,
         truth: str,
         progress: Progress,
+        log_to: str | None,
     ) -> dict[str, Any]:
         assert truth == "prior"
         action(out, progress)
-        asked = {"seed": seed, "seeds": seeds, "machine": machine}
+        asked = {"seed": seed, "seeds": seeds, "machine": machine, "log_to": log_to}
         return SUMMARY | asked | {"episodes": episodes}
 
     return run
@@ -76,10 +77,12 @@ def test_json_is_alone_on_stdout(
         progress.say("working")
 
     stub_experiments.install(monkeypatch, demo=demo(chatty))
-    assert main(["demo", "--json", "--seed", "7", "--machine=cartpole"]) == 0
+    asked = ["--seed", "7", "--machine=cartpole", "--log-to=jsonl"]
+    assert main(["demo", "--json", *asked]) == 0
     said = capsys.readouterr()
     summary = json.loads(said.out)
     assert (summary["seed"], summary["machine"]) == (7, "cartpole")
+    assert summary["log_to"] == "jsonl"
     assert summary["parameters"] == SUMMARY["parameters"]
     assert "a library talks\nworking\nW110" in said.err
 
@@ -168,6 +171,7 @@ ARGUMENTS = {
     "demo --seed": ("E160", "--seed VALUE"),
     "demo --episodes 0": ("E148", "from 1"),
     "demo --machine furutta": ("E160", "did you mean furuta"),
+    "demo --log-to tensorbord": ("E160", "did you mean tensorboard"),
     "demo now": ("E160", "unexpected argument"),
     "identify": ("E160", "missing PROJECT"),
     "identify a.toml b.toml": ("E160", "got b.toml"),

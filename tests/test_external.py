@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim2gp.systems.external import AbstractSimulator, flow
+from sim2gp.systems.external import AbstractSimulator, Differences, flow
 from sim2gp.types import in_float64
 
 THETA = np.array([1.3, 0.2])
@@ -16,13 +16,12 @@ class Pendulum(AbstractSimulator):
     """``w' = w + h (a - g sin q - c w), q' = q + h w'``; counts its calls."""
 
     def __init__(self) -> None:
-        self.scale = np.ones(2)
-        self.low, self.high = np.array([0.0, 0.0]), np.full(2, np.inf)
+        self.differences = Differences(np.ones(2), np.zeros(2), np.full(2, np.inf))
         self.rows: list[int] = []
 
     def flow(self, theta, s, a, h):
         assert theta.dtype == s.dtype == a.dtype == h.dtype == np.float64
-        assert (theta >= self.low).all()
+        assert (theta >= self.differences.low).all()
         self.rows.append(len(s))
         return np.stack(formula(np, theta.T, s.T, a.T, h), axis=1)
 

@@ -5,8 +5,12 @@ A code is never reused for another meaning.
 """
 
 import difflib
+import re
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+
+_OF_CALLBACK = re.compile(r"^(?:\S+\.)?InputError: (E\d{3}) (.*)$", re.MULTILINE)
 
 
 class Sim2GPError(Exception):
@@ -64,6 +68,28 @@ class NotFinite(Sim2GPError):
 
 class Sim2GPWarning(UserWarning):
     """A typed warning; its text starts with its code (W110 and so on)."""
+
+
+def missing_extra(what: str, error: ImportError, extra: str) -> InputError:
+    """E135: something needs a package that an extra of ours installs."""
+    fix = f"pip install 'sim2gp[{extra}]'"
+    return InputError("E135", what, got=str(error), expected=error.name or "", fix=fix)
+
+
+@contextmanager
+def of_callbacks() -> Iterator[None]:
+    """Raise anew an `InputError` that compiled code met when it called back.
+
+    JAX passes on the text of what a callback raises, and nothing else.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        found = _OF_CALLBACK.findall(str(error))
+        if not found:
+            raise
+        code, what = found[-1]
+        raise InputError(code, what) from error
 
 
 def warn(code: str, text: str) -> None:

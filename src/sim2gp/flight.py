@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from sim2gp.errors import NotFinite, warn
+from sim2gp.errors import NotFinite, of_callbacks, warn
 from sim2gp.planning import (
     AbstractObjective,
     AbstractPlanner,
@@ -189,6 +189,7 @@ def fly(
 _fly_steps = eqx.filter_jit(fly_steps)
 
 
+@of_callbacks()
 def episode(
     task: Task,
     planner: AbstractPlanner,

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from sim2gp.errors import of_callbacks
 from sim2gp.exploration import InformationGain, Optimistic, Restrained
 from sim2gp.flight import (
     Purpose,
@@ -77,6 +78,7 @@ def expected(belief: AbstractBelief, key: Key) -> Dynamics:
     return belief.point()
 
 
+@of_callbacks()
 def posterior_sampling(
     task: Task,
     model: AbstractModel,

@@ -110,10 +110,19 @@ class FurutaReward(eqx.Module):
     Smooth in the angle, in (0, 1]; ``e^-2`` for a pendulum left hanging.
     """
 
-    def __call__(self, s: State, a: Action, s2: State) -> Scalar:
+    def terms(self, s: State, a: Action, s2: State) -> dict[str, Scalar]:
+        """What stands in the exponent, each at most zero; their sum is the log."""
         theta, alpha, arm_speed, pole_speed = s2[0], s2[1], s2[2], s2[3]
-        cost = 1.0 + jnp.cos(alpha) + 0.1 * theta**2 + 3e-3 * a[0] ** 2
-        return jnp.exp(-(cost + 5e-3 * arm_speed**2 + 1e-3 * pole_speed**2))
+        return {
+            "height": -(1.0 + jnp.cos(alpha)),
+            "arm": -0.1 * theta**2,
+            "input": -3e-3 * a[0] ** 2,
+            "arm_speed": -5e-3 * arm_speed**2,
+            "pole_speed": -1e-3 * pole_speed**2,
+        }
+
+    def __call__(self, s: State, a: Action, s2: State) -> Scalar:
+        return jnp.exp(_total(self.terms(s, a, s2)))
 
 
 class CartPoleReward(eqx.Module):
@@ -122,11 +131,25 @@ class CartPoleReward(eqx.Module):
     At most 1; 0 for a pole left hanging in the middle of the rail.
     """
 
-    def __call__(self, s: State, a: Action, s2: State) -> Scalar:
+    def terms(self, s: State, a: Action, s2: State) -> dict[str, Scalar]:
+        """What the reward is the sum of."""
         x, theta, pole_speed = s2[0], s2[1], s2[3]
-        height = 0.5 * (1.0 - jnp.cos(theta))
         rail = 0.1 * x**2 + 10.0 * jnp.maximum(jnp.abs(x) - 0.3, 0.0)
-        return height - rail - 1e-4 * pole_speed**2 - 1e-3 * (a[0] / 3.0) ** 2
+        return {
+            "height": 0.5 * (1.0 - jnp.cos(theta)),
+            "rail": -rail,
+            "pole_speed": -1e-4 * pole_speed**2,
+            "input": -1e-3 * (a[0] / 3.0) ** 2,
+        }
+
+    def __call__(self, s: State, a: Action, s2: State) -> Scalar:
+        return _total(self.terms(s, a, s2))
+
+
+def _total(terms: Mapping[str, Scalar]) -> Scalar:
+    """The terms added up, in their order."""
+    first, *rest = terms.values()
+    return sum(rest, first)
 
 
 def furuta_swingup(

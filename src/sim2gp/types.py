@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from sim2gp.errors import of_callbacks
+
 State = Float[Array, " n"]
 Action = Float[Array, " m"]
 Scalar = Float[Array, ""]
@@ -46,12 +48,13 @@ class Box(eqx.Module):
 def in_float64(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """Run a host-side function with float64 switched on, and only inside it.
 
-    JAX's switch is global; scoping it keeps the user's own float32 code as it was.
+    JAX's switch is global; scoping it keeps the user's own float32 code as it was. What
+    a simulator on the host finds wrong comes out as its own `InputError`.
     """
 
     @wraps(function)
     def scoped(*args: _P.args, **kwargs: _P.kwargs) -> _R:
-        with jax.enable_x64(True):
+        with jax.enable_x64(True), of_callbacks():
             return function(*args, **kwargs)
 
     return scoped

@@ -4,7 +4,7 @@ import dataclasses
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from types import UnionType
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from sim2gp.errors import InputError, nearest
 
@@ -138,7 +138,7 @@ def _check_loose(words: list[str], wanted: dict[str, tuple[Any, str]]) -> None:
 
 
 def _check_value(name: str, value: str, kind: Any) -> None:
-    if get_origin(kind) is UnionType:  # of something and None
+    if get_origin(kind) in (UnionType, Union):  # of something and None
         kind = get_args(kind)[0]
     if get_origin(kind) is Literal:
         choices = get_args(kind)

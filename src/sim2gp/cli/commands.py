@@ -61,6 +61,8 @@ class Demo(Writes):
     """Real episodes of each run, 5 s each."""
     truth: Literal["prior", "2sd", "3sd", "outside"] = "prior"
     """Hidden constants: as believed, each so far off, or beyond its bounds."""
+    log_to: Literal["jsonl", "tensorboard", "wandb"] | None = None
+    """Write each episode's numbers, as they come, beside the run directory."""
 
     def run(self, progress: Progress) -> dict[str, Any]:
         return _experiment("demo")(
@@ -71,6 +73,7 @@ class Demo(Writes):
             episodes=self.episodes,
             truth=self.truth,
             progress=progress,
+            log_to=self.log_to,
         )
 
 

@@ -8,6 +8,7 @@ learns. Every real interaction counts; scores are those of `sim2gp.tasks`.
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from sim2gp.loops import Episode, History, psrl
 from sim2gp.models import AbstractModel, PointEstimate, PriorMean, Sim2GP, Sim2GPBelief
 from sim2gp.oracle import AcceptedTruth, accept_truth
 from sim2gp.planning import MPC
-from sim2gp.runs import Progress, new_run
+from sim2gp.runs import Progress, new_run, sinks
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.tasks import MACHINES, Task, episodes_to_95, hanging_return, score
 from sim2gp.types import Key
@@ -56,8 +57,12 @@ def run(
     episodes: int,
     truth: str,
     progress: Progress,
+    log_to: str | None = None,
 ) -> dict[str, Any]:
-    """Fly ``seeds`` machines and write the run; returns its summary."""
+    """Fly ``seeds`` machines and write the run; returns its summary.
+
+    ``log_to`` is one of `sinks.KINDS`: where every episode's numbers go at once.
+    """
     started = time.perf_counter()
     make, preset = MACHINES[machine]
     system = make()
@@ -69,13 +74,20 @@ def run(
     }
     parts = 1 + len(learners) * episodes
     runs = []
-    with new_run(out, "demo") as writer:
+    asked = {"machine": machine, "seed": seed, "seeds": seeds, "episodes": episodes}
+    with (
+        new_run(out, "demo") as writer,
+        sinks.opened(log_to, out, asked | {"truth": truth}) as sink,
+    ):
         with progress.task("demo", seeds * parts) as task:
             for s in range(seed, seed + seeds):
                 key = jax.random.key(s)
                 accepted = accept_truth(preset, system, MPC(), key=key, truth=truth)
-                task.advance(f"seed {s}: oracle {accepted.oracle.oracle_return:.0f}")
-                histories = _race(accepted.task, learners, episodes, key, task.advance)
+                oracle = accepted.oracle.oracle_return
+                task.advance(f"seed {s}: oracle {oracle:.0f}")
+                sink.scalars(0, {f"seed {s}/oracle/return": oracle})
+                told = partial(_told, task.advance, sink, s)
+                histories = _race(accepted.task, learners, episodes, key, told)
                 runs.append(SeedRun(accepted, hanging_return(accepted.task), histories))
         summary, arrays = _summarise(system, machine, runs, seed, episodes)
         summary["truth"] = truth
@@ -97,23 +109,29 @@ def _race(
     learners: dict[str, AbstractModel],
     episodes: int,
     key: Key,
-    advance: Callable[[str], None],
+    told: Callable[[str], Callable[[Episode], None]],
 ) -> dict[str, History]:
     """Every learner on the same machine, under the same noise."""
-
-    def told(name: str) -> Callable[[Episode], None]:
-        def tell(episode: Episode) -> None:
-            total = float(episode.trajectory.total)
-            advance(f"{name}, episode {episode.index}: return {total:.0f}")
-
-        return tell
-
     return {
         name: psrl(
             task, learner, MPC(), episodes=episodes, key=key, on_episode=told(name)
         )
         for name, learner in learners.items()
     }
+
+
+def _told(
+    advance: Callable[[str], None], sink: sinks.Sink, seed: int, name: str
+) -> Callable[[Episode], None]:
+    """Who hears of a learner's episodes: the bar, and wherever numbers go."""
+    write = sinks.each_episode(sink, f"seed {seed}/{name}")
+
+    def tell(episode: Episode) -> None:
+        total = float(episode.trajectory.total)
+        advance(f"{name}, episode {episode.index}: return {total:.0f}")
+        write(episode)
+
+    return tell
 
 
 def _summarise(

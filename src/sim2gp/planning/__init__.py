@@ -7,6 +7,7 @@ from sim2gp.planning.base import (
     Observation,
     Resumed,
     World,
+    rollout,
 )
 from sim2gp.planning.icem import ICEM
 from sim2gp.planning.mpc import MPC
@@ -33,4 +34,5 @@ __all__ = [
     "RandomInput",
     "Resumed",
     "World",
+    "rollout",
 ]

@@ -9,6 +9,7 @@ from sim2gp.report.document import write_report
 from sim2gp.report.figure1 import arm_drawing, figure1, figure_bytes
 from sim2gp.report.figure2 import figure2
 from sim2gp.report.figure3 import figure3
+from sim2gp.report.notebook import show
 from sim2gp.report.redraw import load_run, redraw
 
 __all__ = [
@@ -21,5 +22,6 @@ __all__ = [
     "figure_bytes",
     "load_run",
     "redraw",
+    "show",
     "write_report",
 ]

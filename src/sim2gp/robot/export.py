@@ -15,7 +15,7 @@ from sim2gp.models import AbstractBelief
 from sim2gp.planning import Policy
 from sim2gp.robot.policy import FORMAT
 from sim2gp.runs import new_run
-from sim2gp.systems import AbstractSystem, MuJoCo
+from sim2gp.systems import AbstractSystem, BlackBox, MuJoCo
 from sim2gp.systems.actuator import AbstractInputPath
 from sim2gp.types import Key, in_float64, single
 
@@ -145,7 +145,7 @@ def _bare(system: AbstractSystem) -> AbstractSystem:
 def _compiled(belief: AbstractBelief, system: AbstractSystem) -> bytes:
     from jax import export
 
-    if isinstance(_bare(system), MuJoCo):
+    if isinstance(_bare(system), MuJoCo | BlackBox):
         raise InputError(
             "E135",
             "compiled code cannot be written",

@@ -1,5 +1,6 @@
 """Runs on disk: one commit protocol for results, progress and tables for people."""
 
+from sim2gp.runs import sinks as sinks
 from sim2gp.runs.progress import Progress as Progress
 from sim2gp.runs.store import DiskError as DiskError
 from sim2gp.runs.store import Run as Run

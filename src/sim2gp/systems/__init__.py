@@ -11,6 +11,7 @@ from sim2gp.systems.base import (
     delayed_means,
     rk4,
 )
+from sim2gp.systems.black_box import BlackBox
 from sim2gp.systems.cartpole import CartPole, CartPoleParams
 from sim2gp.systems.effects import (
     AbstractEffect,
@@ -25,6 +26,7 @@ from sim2gp.systems.effects import (
     Spring,
     Stribeck,
 )
+from sim2gp.systems.functions import ODE
 from sim2gp.systems.furuta import Furuta, FurutaParams
 from sim2gp.systems.lag import Lagged, LaggedParams, lagged_means
 from sim2gp.systems.library import Candidate, InputLag, library
@@ -39,6 +41,7 @@ from sim2gp.systems.perturbed import (
     perturb,
 )
 from sim2gp.systems.placement import BaseTilt, BaseTiltSide, EncoderOffset, Payload
+from sim2gp.systems.sysid import read_sysid, write_sysid
 from sim2gp.systems.two_link import (
     TwoLink,
     TwoLinkParams,
@@ -47,6 +50,7 @@ from sim2gp.systems.two_link import (
 )
 
 __all__ = [
+    "ODE",
     "STRENGTHS",
     "AbstractEffect",
     "AbstractMechanism",
@@ -58,6 +62,7 @@ __all__ = [
     "BackEmf",
     "BaseTilt",
     "BaseTiltSide",
+    "BlackBox",
     "Bound",
     "Candidate",
     "CartPole",
@@ -94,5 +99,7 @@ __all__ = [
     "lagged_means",
     "library",
     "perturb",
+    "read_sysid",
     "rk4",
+    "write_sysid",
 ]

@@ -24,7 +24,7 @@ from equinox import AbstractVar
 from jaxtyping import Array, Float
 
 from sim2gp.errors import InputError, nearest
-from sim2gp.parameters import Parameters, parameters_of, unknown_parameter
+from sim2gp.parameters import Parameter, Parameters, parameters_of, unknown_parameter
 from sim2gp.types import Action, Scalar, State
 
 #: Of RK4 inside the windows that logs are cut into, s.
@@ -306,7 +306,7 @@ def table_for(record: type, parameters: Parameters | None) -> Parameters:
     own = parameters_of(record)
     if parameters is None:
         return own
-    given = {*parameters.names, *(name for name, _ in parameters.fixed)}
+    given = set(names_of(parameters))
     for name in sorted(given - set(own.names)):
         raise unknown_parameter(name, own.names)
     for name in own.names:
@@ -315,6 +315,27 @@ def table_for(record: type, parameters: Parameters | None) -> Parameters:
                 "E145", "missing parameter", where=record.__name__, expected=name
             )
     return parameters
+
+
+def table_of(parameters: Parameters | Sequence[Parameter]) -> Parameters:
+    """Constants as a table, all of them free."""
+    if isinstance(parameters, Parameters):
+        return parameters
+    return Parameters(tuple(parameters))
+
+
+def names_of(table: Parameters) -> tuple[str, ...]:
+    """Names of all constants, those that are learned and then those that are fixed."""
+    return *table.names, *(name for name, _ in table.fixed)
+
+
+def named_once(table: Parameters, *channels: Sequence[Channel]) -> None:
+    """Every constant, state and input has a name of its own (E145)."""
+    names = [*names_of(table), *(c.name for group in channels for c in group)]
+    for name in names:
+        if names.count(name) > 1:
+            fix = "give each constant, state and input a name of its own"
+            raise InputError("E145", "a name given twice", got=name, fix=fix)
 
 
 def index_of(name: str, channels: Sequence[Channel], *, where: str = "") -> int:

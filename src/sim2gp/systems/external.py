@@ -7,10 +7,14 @@ The derivative is a matrix times its tangent, so it is forward and reverse mode 
 What crosses between JAX and the host are pairs of 32-bit words: JAX puts a callback's
 arguments on a device first, in whatever thread it runs in, and a thread that does not
 know of `in_float64` would round them.
+
+An `InputError` that a simulator raises ends the program that asked; the host raises it
+again (`sim2gp.types.in_float64`).
 """
 
 import abc
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -19,23 +23,47 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sim2gp.parameters import Parameter, Parameters
 from sim2gp.types import Action, Scalar, State
 
-#: Steps of central differences, in scales: of constants, which act weakly within one
-#: period (rounding rules) and smoothly, and of states and inputs.
-OF_CONSTANTS, OF_STATES = 1e-4, 1e-6
 
-
-class AbstractSimulator(abc.ABC):
-    """A simulator on the host; two of them are equal only if they are the same object.
+@dataclass(frozen=True)
+class Differences:
+    """How far apart the points are that a simulator is differenced at.
 
     scale: of each constant, what a difference is small against; ``low`` and ``high``
         are never crossed.
+    constants, states: steps in scales: of constants, which act weakly within one period
+        (rounding rules) and smoothly, and of states and inputs.
     """
 
     scale: Float[np.ndarray, " p"]
     low: Float[np.ndarray, " p"]
     high: Float[np.ndarray, " p"]
+    constants: float = 1e-4
+    states: float = 1e-6
+
+    @classmethod
+    def of(cls, table: Parameters, names: Sequence[str]) -> "Differences":
+        """Of constants in this order; one that a table does not free is never moved."""
+        free = {p.name: p for p in table.free}
+        given = [free.get(name) for name in names]
+        return cls(
+            np.asarray([_spread(p) if p else 1.0 for p in given]),
+            np.asarray([p.low if p else -np.inf for p in given]),
+            np.asarray([p.high if p else np.inf for p in given]),
+        )
+
+
+def _spread(p: Parameter) -> float:
+    """Half the distance between the prior's quantiles of an sd, in physical units."""
+    return 0.5 * abs(p.constrain(p.mean + p.sd) - p.constrain(p.mean - p.sd))
+
+
+class AbstractSimulator(abc.ABC):
+    """A simulator on the host; two are equal only if they are the same object."""
+
+    differences: Differences
 
     @abc.abstractmethod
     def flow(
@@ -57,13 +85,14 @@ class AbstractSimulator(abc.ABC):
         """`flow` and its Jacobian in constants, state and input, in one call."""
         x = np.concatenate([theta, s, a], axis=1)
         p, n, m = theta.shape[1], s.shape[1], a.shape[1]
-        of_theta = OF_CONSTANTS * np.broadcast_to(self.scale, theta.shape)
-        of_rest = OF_STATES * np.maximum(1.0, np.abs(x[:, p:]))
+        by = self.differences
+        of_theta = by.constants * np.broadcast_to(by.scale, theta.shape)
+        of_rest = by.states * np.maximum(1.0, np.abs(x[:, p:]))
         step = np.concatenate([of_theta, of_rest], axis=1)
         K = p + n + m
         sides = np.eye(K)[:, None, :] * step[None]  # (K, B, K)
         points = np.concatenate([x[None], x + sides, x - sides])  # (1 + 2 K, B, K)
-        points[..., :p] = np.clip(points[..., :p], self.low, self.high)
+        points[..., :p] = np.clip(points[..., :p], by.low, by.high)
         rows = points.reshape(-1, K)
         times = np.tile(h, len(points))
         out = self.flow(rows[:, :p], rows[:, p : p + n], rows[:, p + n :], times)

@@ -8,6 +8,7 @@ every value that they take.
 """
 
 import copy
+import dataclasses
 import math
 import os
 import threading
@@ -21,11 +22,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sim2gp.errors import InputError
+from sim2gp.errors import InputError, missing_extra
 from sim2gp.parameters import Parameter, Parameters
 from sim2gp.systems.actuator import LONGEST_MEAN
 from sim2gp.systems.base import AbstractPlant, Channel
-from sim2gp.systems.external import AbstractSimulator, flow
+from sim2gp.systems.external import AbstractSimulator, Differences, flow
 from sim2gp.systems.mjcf import (
     DERIVED,
     SIGNED,
@@ -55,11 +56,8 @@ class Engine(AbstractSimulator):
 
         self.model = model
         self.constants = tuple(tuple(group) for group in constants)
-        free = {p.name: p for p in table.free}
-        given = [free.get(group[0].path) for group in self.constants]
-        self.low = np.asarray([p.low if p else -np.inf for p in given])
-        self.high = np.asarray([p.high if p else np.inf for p in given])
-        self.scale = np.asarray([_spread(p) if p else 1.0 for p in given])
+        names = [group[0].path for group in self.constants]
+        self.differences = Differences.of(table, names)
         self._derive = any(c.quantity in DERIVED for g in self.constants for c in g)
         self._copies: list[Any] = []
         self._held: list[bytes] = []
@@ -145,11 +143,6 @@ class Engine(AbstractSimulator):
         return np.where(stopped[:, None], np.nan, state)
 
 
-def _spread(p: Parameter) -> float:
-    """Half the distance between the prior's quantiles of an sd, in physical units."""
-    return 0.5 * abs(p.constrain(p.mean + p.sd) - p.constrain(p.mean - p.sd))
-
-
 def _cores() -> int:
     """That this process may use."""
     if hasattr(os, "sched_getaffinity"):
@@ -209,7 +202,7 @@ class MuJoCo(AbstractPlant):
         groups = _groups(model, known, constants)
         priors = dict(priors or {})
         table = Parameters(tuple(_prior(g[0], model, priors) for g in groups))
-        self.parameters = table.replace(**priors)
+        self.parameters = table.replace(**_described(table, priors))
         self.names = tuple(group[0].path for group in groups)
         self.channels = _states(model)
         self.inputs = _inputs(model)
@@ -264,13 +257,7 @@ def loaded(model: Any, root: Path | None = None) -> Any:
     try:
         import mujoco
     except ImportError as error:
-        raise InputError(
-            "E135",
-            "a MuJoCo model cannot be read",
-            got=str(error),
-            expected="mujoco",
-            fix="pip install 'sim2gp[mujoco]'",
-        ) from error
+        raise missing_extra("a MuJoCo model cannot be read", error, "mujoco") from error
 
     if isinstance(model, mujoco.MjModel):
         found = copy.copy(model)
@@ -337,6 +324,19 @@ def _prior(
         expected="a positive number to start from",
         fix="give its prior: mean and sd, or low and high",
     )
+
+
+def _described(
+    table: Parameters, priors: Mapping[str, Parameter | float]
+) -> dict[str, Parameter | float]:
+    """The priors; one that names no unit has the constant's, and its meaning."""
+    known = {p.name: p for p in table.free}
+    return {
+        name: dataclasses.replace(p, unit=known[name].unit, meaning=known[name].meaning)
+        if isinstance(p, Parameter) and not p.unit and name in known
+        else p
+        for name, p in priors.items()
+    }
 
 
 def _states(model: Any) -> tuple[Channel, ...]:

@@ -1,0 +1,224 @@
+"""Gymnasium environments: the task to the last bit, one program, Gymnasium's checks."""
+
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import equinox as eqx
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from jaxtyping import Array, Bool
+
+from sim2gp.errors import InputError, NotFinite
+from sim2gp.flight import Purpose, fly, key_for, oracle_world
+from sim2gp.planning import AbstractPlanner, World
+from sim2gp.planning.mpc import from_unit
+from sim2gp.robot.gymnasium import NAMES, _kind, after, environment, register
+from sim2gp.systems import Furuta, InputDelay
+from sim2gp.tasks import MACHINES, Task, draw_truth, furuta_swingup
+from sim2gp.types import Key, State
+
+SEED = 7
+WRONG = {"effects": ["coulomb mild", InputDelay("voltage", 0.01)]}
+
+
+class Played(AbstractPlanner):
+    """Plays a recording, whatever it sees."""
+
+    shares: Array
+
+    def init(self, world: World, *, key: Key) -> Array:
+        return jnp.zeros((), int)
+
+    def prepare(self, state: Any, world: World, data: Any, *, key: Key) -> Any:
+        return state
+
+    def act(self, state: Any, world: World, s: State, *, key: Key) -> Any:
+        return from_unit(self.shares[state][None], world.actions)[0], state + 1
+
+    def failed(self, state: Any) -> Bool[Array, ""]:
+        return jnp.asarray(False)
+
+
+def flown(env: Any, shares: np.ndarray) -> tuple[np.ndarray, list[Any]]:
+    """Observations of one episode, its start first, and what each step told."""
+    seen, steps = [env.reset()[0]], []
+    for u in shares:
+        steps.append(env.step(u))
+        seen.append(steps[-1][0])
+    return np.stack(seen), steps
+
+
+@pytest.fixture(scope="module")
+def env() -> Iterator[Any]:
+    with gymnasium.make("sim2gp/Furuta-v0", truth="prior", **WRONG) as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def shares() -> np.ndarray:
+    rng = np.random.default_rng(0)
+    return rng.uniform(-0.4, 0.4, (Task.horizon, 1)).astype(np.float32)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_gymnasium_finds_no_fault(name: str) -> None:
+    """Its warnings are errors here; `make` by the module's name registers it too."""
+    check_env(gymnasium.make(f"sim2gp.robot.gymnasium:sim2gp/{name}-v0").unwrapped)
+    register()
+    spec = gymnasium.spec(f"sim2gp/{name}-v0")
+    assert spec.max_episode_steps == MACHINES[NAMES[name]][1]().horizon
+
+
+def test_an_episode_is_the_flights_to_the_last_bit(
+    env: Any, shares: np.ndarray
+) -> None:
+    """The second of a seed: constants, start, noise, delay, effect, reward, clock."""
+    key = jax.random.key(SEED)
+    env.reset(seed=SEED)
+    found, steps = flown(env, shares)
+    truth = draw_truth(Furuta(), key_for(key, 0, Purpose.TRUTH))
+    task = furuta_swingup(truth, env.unwrapped.made.effects)
+    assert eqx.tree_equal(task, env.unwrapped.task)
+    world = oracle_world(task)
+    planner = Played(jnp.asarray(shares))
+    state = planner.init(world, key=key)
+    flying = key_for(key, 2, Purpose.EPISODE)
+    expected, _ = jax.jit(fly)(task, planner, state, world, key=flying)
+    np.testing.assert_array_equal(found, expected.state)
+    rewards = np.asarray([reward for _, reward, *_ in steps], np.float32)
+    np.testing.assert_array_equal(rewards, expected.reward)
+    inputs = np.stack([info["input"] for *_, info in steps])
+    np.testing.assert_array_equal(inputs, expected.action)
+    assert not any(ended for *_, ended, _, _ in steps)
+    over = [over for *_, over, _ in steps]
+    assert over == [False] * (Task.horizon - 1) + [True]
+    status = [info["status"] for *_, info in steps]
+    assert status == ["running"] * (Task.horizon - 1) + ["horizon"]
+
+
+def test_the_terms_make_the_reward(env: Any, shares: np.ndarray) -> None:
+    _, reward, _, _, info = flown(env, shares[:3])[1][-1]
+    assert reward == pytest.approx(np.exp(sum(info["reward_terms"].values())), rel=1e-6)
+    cart = gymnasium.make("sim2gp/CartPole-v0")
+    _, reward, _, _, info = flown(cart, shares[:3])[1][-1]
+    assert reward == pytest.approx(sum(info["reward_terms"].values()), rel=1e-6)
+
+
+def test_a_seed_says_everything(env: Any, shares: np.ndarray) -> None:
+    """Same bits for the same seed; episodes of one seed share their machine."""
+    env.reset(seed=SEED)
+    first, machine = flown(env, shares[:5])[0], env.unwrapped.task
+    again = gymnasium.make("sim2gp/Furuta-v0", truth="prior", **WRONG)
+    again.reset(seed=SEED)
+    np.testing.assert_array_equal(flown(again, shares[:5])[0], first)
+    assert not np.array_equal(flown(env, shares[:5])[0], first)
+    assert env.unwrapped.task is machine
+    env.reset(seed=SEED + 1)
+    assert not eqx.tree_equal(env.unwrapped.task, machine)
+    one, two = (gymnasium.make("sim2gp/Furuta-v0") for _ in range(2))
+    assert not np.array_equal(one.reset()[0], two.reset()[0])
+
+
+def test_a_vector_is_its_environments(shares: np.ndarray) -> None:
+    """Each has the next seed, and its own machine."""
+    options = {"truth": "prior", **WRONG}
+    both = gymnasium.make_vec("sim2gp/Furuta-v0", num_envs=2, **options)
+    seen, _ = both.reset(seed=SEED)
+    met = both.step(np.stack([shares[0], shares[1]]))
+    for i in range(2):
+        alone = gymnasium.make("sim2gp/Furuta-v0", **options)
+        np.testing.assert_array_equal(alone.reset(seed=SEED + i)[0], seen[i])
+        step = alone.step(shares[i])
+        np.testing.assert_array_equal(step[0], met[0][i])
+        assert step[1] == met[1][i]
+
+
+def test_one_program_steps_every_machine_of_a_kind(
+    env: Any, shares: np.ndarray
+) -> None:
+    """Other constants, seeds and times are other data."""
+    env.reset(seed=1)
+    env.step(shares[0])
+    before = after._cached._cache_size()
+    other = gymnasium.make(
+        "sim2gp/Furuta-v0", params={"arm_mass": 0.1}, truth="2sd", **WRONG
+    )
+    for each in (env, other):
+        each.reset(seed=2)
+        flown(each, shares[:3])
+    assert before > 0
+    assert after._cached._cache_size() == before
+
+
+def test_constants_can_be_set() -> None:
+    made = gymnasium.make("sim2gp/Furuta-v0", params={"arm_mass": 0.123}).unwrapped
+    expected = Furuta().parameters.nominal() | {"arm_mass": 0.123}
+    assert made.task.truth == {k: np.float32(v) for k, v in expected.items()}
+
+
+def test_an_episode_ends_where_the_tasks_states_end() -> None:
+    """A full voltage turns the arm by more than the six radians of the task."""
+    env = gymnasium.make("sim2gp/Furuta-v0")
+    env.reset(seed=0)
+    seen, _, ended, over, info = env.step(np.ones(1, np.float32))
+    while not (ended or over):
+        assert (np.abs(seen) < furuta_swingup().state_bound).all()
+        seen, _, ended, over, info = env.step(np.ones(1, np.float32))
+    assert ended
+    assert not over
+    assert info["status"] == "limits"
+    bound = furuta_swingup().state_bound
+    assert np.argmax(np.abs(seen) / bound) == 0
+    assert seen[0] == bound[0]
+    assert abs(env.unwrapped.state[0]) > bound[0]
+    assert seen in env.observation_space
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "said"),
+    [
+        ({"truth": "pror"}, "E145", "unknown truth"),
+        ({"params": {"arm_mas": 0.1}}, "E145", "did you mean arm_mass"),
+        ({"params": {"arm_mass": float("nan")}}, "E101", "arm_mass"),
+        ({"effects": ["coulom mild"]}, "E145", "did you mean coulomb"),
+        ({"effects": ["coulomb"]}, "E145", "mild, middle, strong"),
+    ],
+)
+def test_a_mistake_is_one_line(options: Any, code: str, said: str) -> None:
+    with pytest.raises(InputError, match=said) as caught:
+        gymnasium.make("sim2gp/Furuta-v0", **options)
+    assert caught.value.code == code
+
+
+def test_wrong_calls_are_refused() -> None:
+    env = gymnasium.make("sim2gp/Furuta-v0").unwrapped
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(np.zeros(1, np.float32))
+    with pytest.raises(InputError, match="E149"):
+        env.reset(seed=2**32)
+    with pytest.raises(InputError, match="E145"):
+        env.reset(seed=0, options={"start": 0})
+    env.reset(seed=0)
+    with pytest.raises(InputError, match="E140"):
+        env.step(np.zeros(2, np.float32))
+    with pytest.raises(InputError, match="E101"):
+        env.step(np.full(1, np.nan, np.float32))
+
+
+def test_a_machine_that_cannot_be_followed_is_an_error() -> None:
+    env = gymnasium.make("sim2gp/Furuta-v0", params={"arm_damping": 1e30})
+    env.reset(seed=0)
+    with pytest.raises(NotFinite, match="E203"):
+        flown(env, np.ones((5, 1), np.float32))
+
+
+def test_without_gymnasium_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    _kind.cache_clear()
+    monkeypatch.setitem(sys.modules, "gymnasium", None)
+    with pytest.raises(InputError, match=r"E135.*sim2gp\[gym\]"):
+        environment("furuta")

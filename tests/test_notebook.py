@@ -1,0 +1,42 @@
+"""A report in a notebook: the same page, in a frame of its own."""
+
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+import sim2gp as sg
+from sim2gp.runs import new_run
+
+
+class Frames(HTMLParser):
+    """Collects what each element says of itself."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[tuple[str, dict[str, str | None]]] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.found.append((tag, dict(attrs)))
+
+
+def test_a_notebook_gets_the_whole_report(tmp_path: Path) -> None:
+    summary = {"command": "identify", "headline": "a < b & \"c\" 'd'"}
+    with new_run(tmp_path / "run", "identify") as writer:
+        writer.write_summary(summary)
+        writer.write_arrays("arrays.npz", {})
+    shown = sg.show(tmp_path / "run")
+    frames = Frames()
+    frames.feed(shown._repr_html_())
+    ((tag, said),) = frames.found
+    assert tag == "iframe"
+    assert said["sandbox"] == "allow-scripts"
+    assert said["srcdoc"] == sg.show(sg.load_run(tmp_path / "run")).page
+    assert "</html>" in shown.page
+    assert "a &lt; b" in shown.page
+    assert len(repr(shown).splitlines()) == 1
+
+
+def test_what_is_no_run_is_said(tmp_path: Path) -> None:
+    with pytest.raises(sg.InputError, match="E13"):
+        sg.show(tmp_path / "nothing")

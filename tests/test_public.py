@@ -1,0 +1,38 @@
+"""The names that users build on; removing one is a change for all of them."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+import sim2gp as sg
+
+NAMES = """
+AbstractBelief AbstractModel AbstractPlanner AbstractSystem Auto Box Channel
+FunctionSpace Gaussian ICEM InputError MPC MPPI NLM Parameter Parameters PointEstimate
+PriorMean Residual ResidualFunctionSpace SAC Sim2GP Sim2GPError Task Transitions Windows
+World __version__ bounded cut diagnose episode fit_windows load_project load_run
+log_bounded optimism positive posterior_sampling psal psrl rollout show signed sinks
+systems tasks
+"""
+#: Of `sim2gp.systems`, what a system of one's own is made with.
+SYSTEMS = """
+AbstractMechanism AbstractODE AbstractPlant AbstractSystem Actuated BlackBox Bound
+CartPole Channel Furuta MuJoCo ODE TwoLink rk4
+"""
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "your_system.md"
+
+
+def test_public_names_stay() -> None:
+    assert set(dir(sg)) == set(NAMES.split())
+    for name in dir(sg):
+        assert getattr(sg, name) is not None
+    assert set(SYSTEMS.split()) <= set(sg.systems.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'Sim3GP'"):
+        _ = sg.Sim3GP
+
+
+def test_what_one_brings_needs_public_names_alone() -> None:
+    page = PAGE.read_text(encoding="utf-8")
+    assert not re.findall(r"sim2gp\.\w+ import|import sim2gp\.\w+", page)
+    assert set(re.findall(r"\bsg\.(\w+)", page)) <= set(NAMES.split())
