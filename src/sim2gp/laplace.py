@@ -35,7 +35,7 @@ from sim2gp.linalg import eigh, solve_triangular
 from sim2gp.types import Scalar
 
 CONVERGED, STALLED, NOT_FINITE = 0, 1, 2
-#: Of the gradient over ``1 + cost``: rounding keeps that of data without noise above it.
+#: Of the gradient over ``1 + cost``. Rounding keeps that of data without noise above.
 GRADIENT_TOLERANCE = 1e-8
 #: Of the way that is left in posterior sds (`Fit.left`), which also makes a MAP: what
 #: differences of a simulator on the host let one know.
