@@ -292,6 +292,7 @@ def test_zero_stamps_are_no_stamps(tmp_path: Path) -> None:
 def test_excluded_times_and_repeated_stamps(tmp_path: Path) -> None:
     arm = np.sort(np.concatenate([ARM, ARM[[20, 200]]]))
     q = np.sin(3 * arm)
+    q[21] += 0.1  # the second row of its stamp
     path = write(
         tmp_path / "a.mcap",
         {"/arm": (arm, numbers("q", q)), "/cmd": (CMD, numbers("u", np.cos(CMD)))},
@@ -302,6 +303,7 @@ def test_excluded_times_and_repeated_stamps(tmp_path: Path) -> None:
     np.testing.assert_allclose(
         np.concatenate([one.time, two.time]), ARM[(ARM < 1) | (ARM > 1.1)], atol=1e-15
     )
+    np.testing.assert_allclose(one.channels["q"], np.sin(3 * one.time), atol=1e-12)
     assert "W108" in codes(one)
 
 
