@@ -332,6 +332,23 @@ def test_topics_that_several_nodes_share(tmp_path: Path) -> None:
         read(path, columns)
 
 
+def test_the_order_of_joints_and_bare_numbers(tmp_path: Path) -> None:
+    names, values = ["left", "right"], [np.sin(ARM), np.cos(ARM)]
+    contents = [
+        {
+            "name": names[:: 1 - 2 * (i % 2)],
+            "position": [float(v[i]) for v in values[:: 1 - 2 * (i % 2)]],
+        }
+        for i in range(len(ARM))
+    ]
+    commands = [[float(v)] for v in np.cos(CMD)]
+    path = write(tmp_path / "a.mcap", {"/j": (ARM, contents), "/cmd": (CMD, commands)})
+    columns = {"q": Column("/j/left/position"), "x": Column("/j/right/position")}
+    (log,) = read(path, columns | {"u": Column("/cmd[0]")})
+    np.testing.assert_allclose(log.channels["q"], values[0], rtol=1e-15)
+    np.testing.assert_allclose(log.channels["x"], values[1], rtol=1e-15)
+
+
 def test_streams_that_never_meet(tmp_path: Path) -> None:
     q = numbers("q", np.sin(ARM))
     cmd = (CMD + 100.0, numbers("u", np.cos(CMD)))

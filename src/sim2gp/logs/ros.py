@@ -180,4 +180,5 @@ def _mcap(
 
 
 def _may_hold(topic: str, wanted: Sequence[str] | None) -> bool:
-    return wanted is None or any(name.startswith(f"{topic}/") for name in wanted)
+    inside = (f"{topic}/", f"{topic}[")
+    return wanted is None or any(n == topic or n.startswith(inside) for n in wanted)
