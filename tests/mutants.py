@@ -20,6 +20,7 @@ from mutant_design import DESIGN
 from mutant_exploring import EXPLORING
 from mutant_list import MUTANTS as PHYSICS
 from mutant_list import Hunt, Mutant
+from mutant_logs import LOGS
 from mutant_misfit import MISFIT
 from mutant_mujoco import ON_THE_HOST
 from mutant_networks import NETWORKS
@@ -36,6 +37,7 @@ MUTANTS = (
     *DESIGN,
     *OFF_POLICY,
     *ON_THE_HOST,
+    *LOGS,
 )
 
 ROOT = Path(__file__).resolve().parents[1]

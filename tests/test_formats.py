@@ -1,6 +1,9 @@
 """Every format, written by its own library: one motion is one log, bit by bit."""
 
+import contextlib
 import json
+import shutil
+import sqlite3
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -124,6 +127,23 @@ def test_a_single_file_of_a_rosbag2_is_read_too(folder: Path) -> None:
         assert_same(log, ONE)
 
 
+def test_a_bag_without_definitions(folder: Path, tmp_path: Path) -> None:
+    """As ROS 2 Humble writes them: the types of ROS itself are known."""
+    shutil.copytree(folder / "bag", tmp_path / "bag")
+    (database,) = (tmp_path / "bag").glob("*.db3")
+    with contextlib.closing(sqlite3.connect(database)) as connection:
+        connection.execute("DELETE FROM message_definitions")
+        connection.commit()
+    (log,) = read(tmp_path / "bag", JOINT)
+    assert_same(log, ONE)
+    for file in (database, tmp_path / "bag" / "metadata.yaml"):
+        content = file.read_bytes().replace(b"Float64MultiArray", b"Float64XxxxxXxxxx")
+        file.write_bytes(content)
+    assert "/cmd/data[0]" not in columns_of(tmp_path / "bag")
+    with pytest.raises(InputError, match=r"E136 .*/cmd: got std_msgs/msg/Float64Xxx"):
+        read(tmp_path / "bag", JOINT)
+
+
 def test_nanoseconds_keep_their_digits(tmp_path: Path) -> None:
     """Stamps since 1970 in float64 are 256 ns apart: the start goes first."""
     now = rec.START + rec.stamps()
@@ -139,6 +159,15 @@ def test_nanoseconds_keep_their_digits(tmp_path: Path) -> None:
     columns |= {"q": ONE[:, 1], "dq": ONE[:, 2], "u": ONE[:, 3]}
     pq.write_table(pa.table(columns), tmp_path / "a.parquet")
     (log,) = read(tmp_path / "a.parquet", ("q", "dq", "u"))
+    assert_same(log, ONE)
+
+
+def test_arrays_by_columns_and_of_other_byte_orders(tmp_path: Path) -> None:
+    path, names = tmp_path / "a.npz", ("q[0]", "q[1]", "u")
+    state = np.asfortranarray(ONE[:, 1:3])
+    assert state.flags.f_contiguous
+    np.savez(path, time=ONE[:, 0].astype(">f8"), q=state, u=ONE[:, 3])
+    (log,) = read(path, names)
     assert_same(log, ONE)
 
 
@@ -168,6 +197,7 @@ def test_datasets_side_by_side_are_no_episodes(tmp_path: Path) -> None:
         for arm, table in (("run_1", ONE), ("run_2", TWO[:300])):
             for i, name in enumerate(("t", "q", "dq", "u")):
                 file[f"{arm}/{name}"] = table[:, i]
+                file[f"raw/{arm}/{name}"] = 2 * table[:, i]
     names = ("run_2/q", "run_2/dq", "run_2/u")
     (log,) = read(tmp_path / "a.hdf5", names, time="run_2/t")
     assert_same(log, TWO)

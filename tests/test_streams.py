@@ -292,6 +292,7 @@ def test_zero_stamps_are_no_stamps(tmp_path: Path) -> None:
 def test_excluded_times_and_repeated_stamps(tmp_path: Path) -> None:
     arm = np.sort(np.concatenate([ARM, ARM[[20, 200]]]))
     q = np.sin(3 * arm)
+    q[21] += 0.1  # the second row of its stamp
     path = write(
         tmp_path / "a.mcap",
         {"/arm": (arm, numbers("q", q)), "/cmd": (CMD, numbers("u", np.cos(CMD)))},
@@ -302,6 +303,7 @@ def test_excluded_times_and_repeated_stamps(tmp_path: Path) -> None:
     np.testing.assert_allclose(
         np.concatenate([one.time, two.time]), ARM[(ARM < 1) | (ARM > 1.1)], atol=1e-15
     )
+    np.testing.assert_allclose(one.channels["q"], np.sin(3 * one.time), atol=1e-12)
     assert "W108" in codes(one)
 
 
@@ -328,6 +330,23 @@ def test_topics_that_several_nodes_share(tmp_path: Path) -> None:
     path = write(tmp_path / "b.mcap", {"/joints": (times, contents), "/cmd": cmd})
     with pytest.raises(InputError, match=r"E140 field that comes and goes.*message 7"):
         read(path, columns)
+
+
+def test_the_order_of_joints_and_bare_numbers(tmp_path: Path) -> None:
+    names, values = ["left", "right"], [np.sin(ARM), np.cos(ARM)]
+    contents = [
+        {
+            "name": names[:: 1 - 2 * (i % 2)],
+            "position": [float(v[i]) for v in values[:: 1 - 2 * (i % 2)]],
+        }
+        for i in range(len(ARM))
+    ]
+    commands = [[float(v)] for v in np.cos(CMD)]
+    path = write(tmp_path / "a.mcap", {"/j": (ARM, contents), "/cmd": (CMD, commands)})
+    columns = {"q": Column("/j/left/position"), "x": Column("/j/right/position")}
+    (log,) = read(path, columns | {"u": Column("/cmd[0]")})
+    np.testing.assert_allclose(log.channels["q"], values[0], rtol=1e-15)
+    np.testing.assert_allclose(log.channels["x"], values[1], rtol=1e-15)
 
 
 def test_streams_that_never_meet(tmp_path: Path) -> None:

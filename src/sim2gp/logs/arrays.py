@@ -234,8 +234,6 @@ def split(table: Table, episode: str) -> list[tuple[int, Table]]:
         )
     edges = [0, *(np.flatnonzero(np.diff(ids)) + 1).tolist(), len(ids)]
     pieces: dict[int, Table] = {}
-    rest = {name: v for name, v in table.columns.items() if name != episode}
-    table = replace(table, columns=rest)
     for start, end in pairwise(edges):
         number = int(ids[start])
         if number in pieces:

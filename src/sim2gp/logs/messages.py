@@ -62,7 +62,8 @@ def collected(
         fields = _fields(message.content, topic, f"{where} {topic}:message {number}")
         if asked is None or number == 0:
             seen |= dict.fromkeys(fields)
-        names = tuple(n for n in fields if asked is None or n in asked)
+        # In one order, whatever that of the joints in this message.
+        names = tuple(sorted(fields if asked is None else asked & fields.keys()))
         if not names:
             continue
         stream = streams.setdefault((topic, names), Stream(topic, names))

@@ -6,6 +6,7 @@ of a joint state by its joint: ``/joint_states/elbow/position``.
 
 import json
 import re
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -16,6 +17,20 @@ from sim2gp.logs.file import check_declared, library, readable, shown, steady
 from sim2gp.logs.messages import Message, clocked, collected
 from sim2gp.logs.table import Table
 
+#: Module -> its error; which of them are there depends on the release of rosbags.
+_ERRORS = {
+    "apsw": "Error",
+    "backports.zstd": "ZstdError",
+    "compression.zstd": "ZstdError",
+    "mcap.exceptions": "McapError",
+    "rosbags.highlevel": "AnyReaderError",
+    "rosbags.rosbag1": "ReaderError",
+    "rosbags.rosbag2": "ReaderError",
+    "rosbags.serde": "SerdeError",
+    "rosbags.typesys": "TypesysError",
+    "sqlite3": "Error",
+    "zstandard": "ZstdError",
+}
 _COMPRESSED = re.compile(r"^\s*compression_mode:\s*['\"]?file", re.I | re.M)
 
 
@@ -71,15 +86,28 @@ def _opened(
                 expected="a recording that is not compressed as a whole",
                 fix="ros2 bag convert, with compression_mode message or none",
             )
-    else:
-        stack.enter_context(steady(path))
-    if kind == "mcap" and _profile(path, stack, where) != "ros2":
+    for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+        if file.is_file():
+            stack.enter_context(steady(file))
+    if kind == "mcap" and _profile(path, where) != "ros2":
         return _mcap(path, wanted, where, stack)
     highlevel = library("rosbags.highlevel", "ros", "a rosbag")
-    faults = (highlevel.AnyReaderError, *_faults())
-    stack.enter_context(readable(where, *faults))
-    reader = stack.enter_context(highlevel.AnyReader([path]))
+    types = library("rosbags.typesys", "ros", "a rosbag")
+    stack.enter_context(readable(where, *_faults()))
+    # Bags of ROS 2 before Iron hold no definitions: those of ROS itself are known.
+    common = types.get_typestore(types.Stores.LATEST)
+    reader = highlevel.AnyReader([path], default_typestore=common)
+    stack.enter_context(reader)
     chosen = [c for c in reader.connections if _may_hold(c.topic, wanted)]
+    known = reader.typestore.fielddefs
+    for connection in chosen if wanted is not None else ():
+        if connection.msgtype not in known:
+            raise _unknown(
+                f"{where} {connection.topic}",
+                connection.msgtype,
+                "a message type of ROS, or one whose definition is in the bag",
+            )
+    chosen = [c for c in chosen if c.msgtype in known]
 
     def messages() -> Iterator[Message]:
         if not chosen:
@@ -91,27 +119,24 @@ def _opened(
     return int(reader.start_time), messages()
 
 
-def _faults() -> tuple[type[Exception], ...]:
-    """Errors of the libraries below rosbags and mcap that nothing else is based on."""
-    apsw = library("apsw", "ros", "a rosbag")
-    mcap = library("mcap.exceptions", "ros", "an MCAP file")
-    zstandard = library("zstandard", "ros", "an MCAP file")
-    bag1 = library("rosbags.rosbag1", "ros", "a rosbag")
-    bag2 = library("rosbags.rosbag2", "ros", "a rosbag")
-    serde = library("rosbags.serde", "ros", "a rosbag")
-    types = library("rosbags.typesys", "ros", "a rosbag")
-    return (
-        apsw.Error,
-        mcap.McapError,
-        zstandard.ZstdError,
-        bag1.ReaderError,
-        bag2.ReaderError,
-        serde.SerdeError,
-        types.TypesysError,
+def _unknown(where: str, got: str, expected: str) -> InputError:
+    return InputError(
+        "E136",
+        "messages that cannot be decoded",
+        where=where,
+        got=got,
+        expected=expected,
+        fix="record as rosbag2 with MCAP storage, or convert the topic to JSON",
     )
 
 
-def _profile(path: Path, stack: ExitStack, where: str) -> str:
+def _faults() -> tuple[type[Exception], ...]:
+    """Errors of rosbags, mcap and what they use that are based on nothing else."""
+    loaded = [(sys.modules.get(module), name) for module, name in _ERRORS.items()]
+    return tuple(getattr(module, name) for module, name in loaded if module)
+
+
+def _profile(path: Path, where: str) -> str:
     """What an MCAP file says it holds; what its chunks unpack to is checked (E126)."""
     reading = library("mcap.reader", "ros", "an MCAP file")
     with steady(path) as size, readable(where, *_faults()), path.open("rb") as file:
@@ -143,13 +168,10 @@ def _mcap(
             if channel.message_encoding != "json":
                 if wanted is None:
                     continue
-                raise InputError(
-                    "E136",
-                    "messages in another encoding",
-                    where=f"{where} {channel.topic}",
-                    got=repr(channel.message_encoding),
-                    expected="'json', or 'cdr' in a file of ROS 2",
-                    fix="record as rosbag2, or convert the topic to JSON",
+                raise _unknown(
+                    f"{where} {channel.topic}",
+                    repr(channel.message_encoding),
+                    "'json', or 'cdr' in a file of ROS 2",
                 )
             content = json.loads(message.data)
             yield Message(channel.topic, int(message.log_time), content)
@@ -158,4 +180,5 @@ def _mcap(
 
 
 def _may_hold(topic: str, wanted: Sequence[str] | None) -> bool:
-    return wanted is None or any(name.startswith(f"{topic}/") for name in wanted)
+    inside = (f"{topic}/", f"{topic}[")
+    return wanted is None or any(n == topic or n.startswith(inside) for n in wanted)

@@ -83,7 +83,7 @@ def decode(content: bytes, where: str) -> str:
         where=f"{where}:byte {offset}",
         got=f"byte 0x{content[offset]:02x}",
         expected="text in UTF-8",
-        fix="save the file as UTF-8 text",
+        fix="save the file as UTF-8 text, or give it the suffix of its format",
     )
 
 
