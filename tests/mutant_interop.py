@@ -2,7 +2,8 @@
 
 from mutant_list import Mutant
 
-GYM, BOX = "robot/gymnasium.py", "systems/black_box.py"
+GYM, VECTOR = "robot/gymnasium.py", "robot/gymnasium_vector.py"
+BOX = "systems/black_box.py"
 SINKS, SYSID = "runs/sinks.py", "systems/sysid.py"
 
 INTEROP = (
@@ -33,6 +34,34 @@ INTEROP = (
         "jnp.any(jnp.abs(seen) > bound)",
         "jnp.any(jnp.abs(seen) > 2.0 * bound)",
         ("test_gymnasium.py", "states_end"),
+    ),
+    Mutant(
+        "gymnasium: a vector begins the same episode again",
+        VECTOR,
+        "np.asarray(now.episode) + again",
+        "np.asarray(now.episode)",
+        ("test_gymnasium.py", "vector"),
+    ),
+    Mutant(
+        "gymnasium: a vector rewards what began anew",
+        VECTOR,
+        "np.where(again, np.float32(0.0), met.reward)",
+        "met.reward",
+        ("test_gymnasium.py", "vector"),
+    ),
+    Mutant(
+        "gymnasium: a vector's machines are the first",
+        VECTOR,
+        "[eqx.filter(task, eqx.is_array) for task in tasks]",
+        "[eqx.filter(tasks[0], eqx.is_array) for task in tasks]",
+        ("test_gymnasium.py", "vector"),
+    ),
+    Mutant(
+        "gymnasium: a vector clocks what began anew",
+        VECTOR,
+        "np.where(again, 0, np.asarray(now.step) + 1)",
+        "np.asarray(now.step) + 1",
+        ("test_gymnasium.py", "vector"),
     ),
     Mutant(
         "black box: its writes are kept",
