@@ -18,6 +18,7 @@ from pathlib import Path
 from mutant_descent import DESCENTS
 from mutant_design import DESIGN
 from mutant_exploring import EXPLORING
+from mutant_interop import INTEROP
 from mutant_list import MUTANTS as PHYSICS
 from mutant_list import Hunt, Mutant
 from mutant_logs import LOGS
@@ -38,6 +39,7 @@ MUTANTS = (
     *OFF_POLICY,
     *ON_THE_HOST,
     *LOGS,
+    *INTEROP,
 )
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -124,18 +124,66 @@ def test_a_seed_says_everything(env: Any, shares: np.ndarray) -> None:
     assert not np.array_equal(one.reset()[0], two.reset()[0])
 
 
+def alone(i: int, **options: Any) -> Any:
+    made = gymnasium.make("sim2gp/Furuta-v0", max_episode_steps=4, **options)
+    return made, [made.reset(seed=SEED + i)[0]]
+
+
 def test_a_vector_is_its_environments(shares: np.ndarray) -> None:
-    """Each has the next seed, and its own machine."""
+    """Each has the next seed and its own machine; the fifth step begins anew."""
     options = {"truth": "prior", **WRONG}
-    both = gymnasium.make_vec("sim2gp/Furuta-v0", num_envs=2, **options)
-    seen, _ = both.reset(seed=SEED)
-    met = both.step(np.stack([shares[0], shares[1]]))
-    for i in range(2):
-        alone = gymnasium.make("sim2gp/Furuta-v0", **options)
-        np.testing.assert_array_equal(alone.reset(seed=SEED + i)[0], seen[i])
-        step = alone.step(shares[i])
-        np.testing.assert_array_equal(step[0], met[0][i])
-        assert step[1] == met[1][i]
+    name, mode = "sim2gp/Furuta-v0", gymnasium.VectorizeMode.VECTOR_ENTRY_POINT
+    both = gymnasium.make_vec(name, 2, mode, max_episode_steps=4, **options)
+    singles = [alone(i, **options) for i in range(2)]
+    seen, info = both.reset(seed=SEED)
+    assert list(info["status"]) == ["running"] * 2
+    for t in range(7):
+        for i, (_, known) in enumerate(singles):
+            np.testing.assert_allclose(seen[i], known[-1], rtol=2e-5, atol=1e-6)
+        actions = np.stack([shares[t], shares[t + 1]])
+        seen, reward, ended, late, info = both.step(actions)
+        assert seen in both.observation_space
+        assert not ended.any()
+        assert late.tolist() == [t == 3] * 2
+        for i, (single, known) in enumerate(singles):
+            if t == 4:
+                known.append(single.reset()[0])
+                assert reward[i] == 0.0
+                continue
+            step = single.step(actions[i])
+            known.append(step[0])
+            assert reward[i] == pytest.approx(step[1], rel=1e-5)
+            np.testing.assert_allclose(info["input"][i], step[4]["input"], rtol=1e-6)
+            for name, term in step[4]["reward_terms"].items():
+                found = info["reward_terms"][name][i]
+                assert found == pytest.approx(term, rel=1e-4, abs=1e-7)
+
+
+def test_one_vectors_end_is_not_the_others(shares: np.ndarray) -> None:
+    """Who goes in circles leaves the task's states; who rests does not."""
+    both = gymnasium.make_vec("sim2gp/Furuta-v0", num_envs=2, **WRONG)
+    both.reset(seed=[3, 4])
+    actions = np.asarray([[1.0], [0.0]], np.float32)
+    ended, t = np.zeros(2, bool), 0
+    while not ended[0] and t < Task.horizon:
+        (seen, _, ended, late, info), t = both.step(actions), t + 1
+    assert (ended.tolist(), late.tolist()) == ([True, False], [False, False])
+    assert list(info["status"]) == ["limits", "running"]
+    before = seen
+    seen, reward, ended, _, info = both.step(actions)
+    assert np.abs(seen[0]).max() < 0.2
+    np.testing.assert_allclose(seen[1], before[1], atol=0.2)
+    assert (reward[0], ended.tolist()) == (0.0, [False, False])
+    assert info["_input"].tolist() == [False, True]
+    now = both.unwrapped.now
+    assert (now.episode.tolist(), now.step.tolist()) == ([2, 1], [0, t + 1])
+    seen, _ = both.reset()
+    assert both.unwrapped.now.episode.tolist() == [3, 2]
+    assert seen in both.observation_space
+    with pytest.raises(InputError, match="E140"):
+        both.reset(seed=[1, 2, 3])
+    with pytest.raises(InputError, match="E140"):
+        both.step(actions[0])
 
 
 def test_one_program_steps_every_machine_of_a_kind(

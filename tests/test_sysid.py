@@ -131,6 +131,12 @@ def test_without_names_all_are_read_or_refused(theirs: Path) -> None:
     assert set(read_sysid(theirs)) == names
 
 
+def test_quotes_are_taken_off(tmp_path: Path) -> None:
+    path = tmp_path / "a.yaml"
+    path.write_text(GOOD.replace("a:\n", "'it''s: a':\n", 1))
+    assert list(read_sysid(path)) == ["it's: a"]
+
+
 TABLE = Parameters(
     (
         Parameter("gain", "N", "", "log_box", 1e-7, 2.5, nominal=1e-5),

@@ -44,7 +44,7 @@ class Purpose(enum.IntEnum):
     TEST = 10
 
 
-def key_for(key: Key, episode: int, purpose: Purpose) -> Key:
+def key_for(key: Key, episode: int | Int[Array, ""], purpose: Purpose) -> Key:
     """The key of one purpose in one episode of one run."""
     return jax.random.fold_in(jax.random.fold_in(key, episode), purpose)
 

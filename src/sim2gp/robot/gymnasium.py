@@ -47,6 +47,7 @@ def register() -> None:
             gymnasium.register(
                 known,
                 entry_point=f"{__name__}:environment",
+                vector_entry_point=f"{__name__}_vector:environments",
                 max_episode_steps=Task.horizon,
                 kwargs={"machine": machine},
             )
@@ -230,20 +231,25 @@ def after(
 def told(met: Seen, over: bool) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
     """A step as Gymnasium tells it (`NotFinite` E203 where it is not finite)."""
     met = jax.device_get(met)
-    if not (np.isfinite(met.state).all() and np.isfinite(met.reward)):
-        raise NotFinite(
-            "E203",
-            "a state or a reward of an episode",
-            where="an environment",
-            got=f"{met.state.tolist()}, {float(met.reward)}",
-            expected="finite numbers",
-            fix="check the constants that were given",
-        )
+    check_met(met.state, met.reward)
     ended = bool(met.outside)
     status = "limits" if ended else "horizon" if over else "running"
     terms = {name: float(value) for name, value in met.terms.items()}
     info = {"status": status, "reward_terms": terms, "input": np.array(met.action)}
     return np.array(met.observation), float(met.reward), ended, over, info
+
+
+def check_met(state: AnyArray, reward: AnyArray) -> None:
+    """Raise `NotFinite` E203 where a state or a reward is no number."""
+    if not (np.isfinite(state).all() and np.isfinite(reward).all()):
+        raise NotFinite(
+            "E203",
+            "a state or a reward of an episode",
+            where="an environment",
+            got=f"{state.tolist()}, {reward.tolist()}",
+            expected="finite numbers",
+            fix="check the constants that were given",
+        )
 
 
 def checked(action: Any, shape: tuple[int, ...]) -> np.ndarray:

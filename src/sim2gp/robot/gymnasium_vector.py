@@ -1,0 +1,218 @@
+"""Many environments of one machine as one compiled program, for `gymnasium.make_vec`.
+
+Each is what it is alone (`sim2gp.robot.gymnasium`), with the next seed, but for the
+last bits of its numbers. After its last step it is begun anew in the next one, whose
+action and reward do not count (Gymnasium's ``NEXT_STEP``).
+"""
+
+import functools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from sim2gp.errors import InputError, missing_extra
+from sim2gp.flight import Purpose, key_for
+from sim2gp.robot.gymnasium import (
+    PUBLISHED,
+    SEEDS,
+    Hidden,
+    Seen,
+    after,
+    bound_of,
+    check_met,
+    checked,
+    first,
+    hidden,
+    key_of,
+)
+from sim2gp.systems import AbstractEffect, InputDelay
+from sim2gp.tasks import Task
+from sim2gp.types import AnyArray, Key
+
+
+def environments(
+    machine: str,
+    num_envs: int = 1,
+    *,
+    truth: str = PUBLISHED,
+    params: Mapping[str, float] | None = None,
+    effects: Sequence[AbstractEffect | InputDelay | str] = (),
+    max_episode_steps: int = Task.horizon,
+    render_mode: None = None,
+) -> Any:
+    """So many swing-ups of a machine as a `gymnasium.vector.VectorEnv`.
+
+    Options and errors are those of `sim2gp.robot.gymnasium.environment`.
+    """
+    made = hidden(machine, truth, params or {}, effects)
+    try:
+        return _kind()(made, num_envs, max_episode_steps)
+    except ImportError as error:
+        what = "environments cannot be made"
+        raise missing_extra(what, error, "gym") from error
+
+
+class Batch(eqx.Module):
+    """Where each environment is: its state, the number of its episode and step."""
+
+    state: Float[Array, "N k"]
+    episode: Int[AnyArray, " N"]
+    step: Int[AnyArray, " N"]
+
+
+@eqx.filter_jit
+def begun(
+    tasks: Task, bound: AnyArray, keys: Array, episode: Int[AnyArray, " N"]
+) -> tuple[Array, Array]:
+    """The starts of these episodes, and what is seen of them."""
+    arrays, rest = eqx.partition(tasks, eqx.is_array)
+
+    def one(arrays: Task, key: Key, e: Array) -> tuple[Array, Array]:
+        flying = key_for(key, e, Purpose.EPISODE)
+        return first(eqx.combine(arrays, rest), bound, flying)
+
+    return jax.vmap(one)(arrays, keys, episode)
+
+
+@eqx.filter_jit
+def stepped(tasks: Task, bound: AnyArray, keys: Array, now: Batch, U: AnyArray) -> Seen:
+    """One step of each."""
+    arrays, rest = eqx.partition(tasks, eqx.is_array)
+
+    def one(arrays: Task, key: Key, s: Array, e: Array, t: Array, u: Array) -> Seen:
+        flying = key_for(key, e, Purpose.EPISODE)
+        return after(eqx.combine(arrays, rest), bound, s, u, t, flying)
+
+    return jax.vmap(one)(arrays, keys, now.state, now.episode, now.step, U)
+
+
+@functools.cache
+def _kind() -> Any:
+    """The one class of vectors of environments."""
+    import gymnasium
+    from gymnasium.spaces import Box
+    from gymnasium.vector import AutoresetMode, VectorEnv
+    from gymnasium.vector.utils import batch_space
+
+    class TaskVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+        """Tasks of one kind, a step of all at a time."""
+
+        metadata = {  # noqa: RUF012
+            "render_modes": [],
+            "render_fps": round(1.0 / Task.dt),
+            "autoreset_mode": AutoresetMode.NEXT_STEP,
+        }
+        render_mode = None
+
+        def __init__(self, made: Hidden, count: int, longest: int) -> None:
+            self.made, self.num_envs = made, count
+            task = made.task(jax.random.key(0))
+            self.longest = min(longest, task.horizon)
+            self.bound = bound_of(task, made.machine)
+            self.each: list[Task] = [task] * count
+            self.keys: list[Key | None] = [None] * count
+            self.now: Batch | None = None
+            self.over: Bool[np.ndarray, " N"] = np.zeros(count, bool)
+            box = Box(-1.0, 1.0, task.actions.low.shape, np.float32)
+            self.single_action_space = box
+            seen = Box(-self.bound, self.bound, dtype=np.float32)
+            self.single_observation_space = seen
+            self.action_space = batch_space(box, count)
+            self.observation_space = batch_space(seen, count)
+
+        def reset(
+            self,
+            *,
+            seed: int | Sequence[int | None] | None = None,
+            options: dict[str, Any] | None = None,
+        ) -> tuple[np.ndarray, dict[str, Any]]:
+            """The next episodes; of one seed, each environment has the next one."""
+            super().reset(seed=seed if isinstance(seed, int) else None)
+            if options:
+                got = ", ".join(map(str, options))
+                raise InputError("E145", "unknown option of reset", got=got)
+            before = np.zeros(self.num_envs, np.int32)
+            if self.now is not None:
+                before = np.array(self.now.episode)
+            for i, given in enumerate(self.seeds(seed)):
+                if given is None and self.keys[i] is not None:
+                    continue
+                if given is None:
+                    given = int(self.np_random.integers(SEEDS))
+                key = key_of(given)
+                self.keys[i], self.each[i], before[i] = key, self.made.task(key), 0
+            self.tasks = stacked(self.each)
+            self.key = jnp.stack([key for key in self.keys if key is not None])
+            state, seen = begun(self.tasks, self.bound, self.key, before + 1)
+            self.now = Batch(state, before + 1, np.zeros_like(before))
+            self.over = np.zeros(self.num_envs, bool)
+            return np.array(seen), {"status": np.full(self.num_envs, "running", object)}
+
+        def seeds(self, seed: Any) -> list[int | None]:
+            """One for each environment (E140 for another number of them)."""
+            if seed is None or isinstance(seed, int):
+                count = range(self.num_envs)
+                return [None if seed is None else seed + i for i in count]
+            if len(seed) != self.num_envs:
+                got, expected = f"{len(seed)} seeds", f"{self.num_envs}"
+                raise InputError("E140", "a reset", got=got, expected=expected)
+            return list(seed)
+
+        def step(self, actions: np.ndarray) -> Any:
+            """One period of each, or its start anew. Raises E140, E101, E203."""
+            if self.now is None:
+                raise gymnasium.error.ResetNeeded("call reset before step")
+            assert self.action_space.shape is not None
+            U = checked(actions, self.action_space.shape)
+            again, now = self.over, self.now
+            met = stepped(self.tasks, self.bound, self.key, now, U)
+            state, episode = met.state, np.asarray(now.episode) + again
+            seen, step = met.observation, np.where(again, 0, np.asarray(now.step) + 1)
+            if again.any():
+                fresh = begun(self.tasks, self.bound, self.key, episode)
+                state, seen = (
+                    jnp.where(again[:, None], new, old)
+                    for new, old in zip(fresh, (state, seen), strict=True)
+                )
+            self.now = Batch(state, episode.astype(np.int32), step.astype(np.int32))
+            ended = np.asarray(met.outside) & ~again
+            late = (step == self.longest) & ~again
+            self.over = ended | late
+            return told(met, np.array(seen), again, ended, late)
+
+    return TaskVectorEnv
+
+
+def stacked(tasks: Sequence[Task]) -> Task:
+    """Tasks of one kind as one, whose arrays have another axis in front."""
+    rest = eqx.filter(tasks[0], eqx.is_array, inverse=True)
+    arrays = [eqx.filter(task, eqx.is_array) for task in tasks]
+    return eqx.combine(jax.tree.map(lambda *x: jnp.stack(x), *arrays), rest)
+
+
+def told(
+    met: Seen,
+    seen: np.ndarray,
+    again: Bool[np.ndarray, " N"],
+    ended: Bool[np.ndarray, " N"],
+    late: Bool[np.ndarray, " N"],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    """A step as Gymnasium tells it; what began anew has no reward, and no terms."""
+    met = jax.device_get(met)
+    check_met(met.state[~again], met.reward[~again])
+    status = np.full(len(again), "running", object)
+    status[late], status[ended] = "horizon", "limits"
+    info = {
+        "status": status,
+        "reward_terms": {name: np.array(x) for name, x in met.terms.items()},
+        "_reward_terms": ~again,
+        "input": np.array(met.action),
+        "_input": ~again,
+    }
+    reward = np.where(again, np.float32(0.0), met.reward).astype(np.float64)
+    return seen, reward, ended, late, info
