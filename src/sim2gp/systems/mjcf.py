@@ -18,7 +18,7 @@
 `NAME` may be a pattern (`joint/*/damping`).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any
@@ -59,6 +59,8 @@ _MEANING = {
 }
 #: Quantities that may be negative.
 SIGNED = frozenset({"com_x", "com_y", "com_z"})
+#: All ten numbers of a body's inertia at once (`sim2gp.systems.inertia`).
+INERTIA: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -109,6 +111,12 @@ def matching(known: dict[str, Constant], pattern: str) -> list[Constant]:
             fix=f"did you mean {close}?" if close else "",
         )
     return found
+
+
+def set_constants(model: Any, pairs: Iterable[tuple[Constant, float]]) -> None:
+    """Give constants values, as they stand; `mujoco.mj_setConst` derives the rest."""
+    for constant, value in pairs:
+        constant.put(model, value)
 
 
 def name_of(model: Any, kind: str, index: int) -> str:

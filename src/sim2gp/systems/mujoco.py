@@ -33,8 +33,9 @@ from sim2gp.systems.mjcf import (
     constants_of,
     matching,
     name_of,
+    set_constants,
 )
-from sim2gp.systems.mjcf_file import rewritten
+from sim2gp.systems.mjcf_file import ModelFile
 from sim2gp.systems.mjcf_load import compiled
 from sim2gp.types import Action, Scalar, State
 
@@ -81,9 +82,8 @@ class Engine(AbstractSimulator):
         """All open constants, and what MuJoCo derives of them; ``data`` is scratch."""
         import mujoco
 
-        for group, value in zip(self.constants, theta, strict=True):
-            for constant in group:
-                constant.put(model, float(value))
+        both = zip(self.constants, theta, strict=True)
+        set_constants(model, ((c, float(v)) for group, v in both for c in group))
         if self._derive:
             mujoco.mj_setConst(model, data)
 
@@ -223,18 +223,21 @@ class MuJoCo(AbstractPlant):
     def actions(self) -> tuple[Channel, ...]:
         return self.inputs
 
-    def mjcf(self, values: Mapping[str, float], folder: Path) -> str:
-        """The model's file with these constants, to be kept in ``folder``.
+    def by_path(self, values: Mapping[str, float]) -> dict[str, float]:
+        """Values by name as those of every constant: what is tied has the same."""
+        groups = zip(self.names, self.engine.constants, strict=True)
+        known = ((values[n], group) for n, group in groups if n in values)
+        return {c.path: float(value) for value, group in known for c in group}
 
-        Raises `InputError` E170 where there is no file, or it cannot say them.
+    def file(self, *, mjcf: bool = False) -> ModelFile:
+        """The model's file, to be written with other constants (``mjcf``: as MJCF).
+
+        Raises `InputError` E170 where there is no file.
         """
         if self.source is None:
             fix = "give the path of its file instead of a compiled model"
             raise InputError("E170", "a model without a file", fix=fix)
-        theta = np.asarray([values[name] for name in self.names], float)
-        constants = [c for group in self.engine.constants for c in group]
-        made = self.engine.with_values(theta)
-        return rewritten(self.source, made, constants, folder)
+        return ModelFile(self.source, self.engine.model, mjcf=mjcf)
 
     @property
     def max_substep(self) -> float:
