@@ -2,7 +2,7 @@
 
 from mutant_list import Mutant
 
-EXTERNAL, ENGINE = "systems/external.py", "systems/mujoco.py"
+EXTERNAL, ENGINE = "systems/external.py", "systems/mujoco_engine.py"
 MJCF, FILE = "systems/mjcf.py", "systems/mjcf_file.py"
 
 ON_THE_HOST = (

@@ -102,10 +102,15 @@ def _values(
             raise InputError("E170", "a constant that is not open", got=name)
     apart = {
         name: "no constant of the model's file"
-        for name in values
-        if name not in system.names
+        for name, value in values.items()
+        if name not in system.names and (name in found or value != _neutral(name))
     }
-    return {k: v for k, v in values.items() if k not in apart}, apart
+    return {k: v for k, v in values.items() if k in system.names}, apart
+
+
+def _neutral(name: str) -> float:
+    """Of an input that arrives as it was sent."""
+    return 1.0 if name.endswith(".gain") else 0.0
 
 
 def _keep(

@@ -25,6 +25,19 @@ def spec_of(path: str) -> Any:
     return spec
 
 
+def general(spec: Any) -> Any:
+    """The model, no body that turns simplified: a centre of mass could not move.
+
+    Those that only slide stay: MuJoCo gives their contacts another softness.
+    """
+    model = spec.compile()
+    turning = [body for body in spec.bodies if model.body_simple[body.id] == 1]
+    changed = [body for body in turning if body.id and hasattr(body, "simple")]
+    for body in changed:  # MuJoCo 4 or newer
+        body.simple = 0
+    return spec.compile() if changed else model
+
+
 def limit(seconds: int) -> None:
     """Of memory and processor time, where the system has such limits."""
     try:
@@ -45,10 +58,10 @@ def main(seconds: str, folder: str, form: str, *paths: str) -> int:
         out = os.path.join(folder, f"{i}.{form}")
         try:
             spec = spec_of(path)
-            model = spec.compile()
             if form == "mjb":
-                mujoco.mj_saveModel(model, out)
+                mujoco.mj_saveModel(general(spec), out)
             else:
+                spec.compile()
                 with open(out, "w", encoding="utf-8") as file:
                     file.write(spec.to_xml())
         except (ValueError, mujoco.FatalError) as error:

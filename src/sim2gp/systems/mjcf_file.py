@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 
 from sim2gp.errors import InputError
+from sim2gp.systems.inertia import inertia_matrix
 from sim2gp.systems.mjcf import Constant, constants_of, set_constants
 from sim2gp.systems.mjcf_load import as_mjcf
-from sim2gp.systems.mjcf_say import MJCF, inertia_matrix
+from sim2gp.systems.mjcf_say import MJCF
 from sim2gp.systems.mjcf_text import Document, Edits, Element, read_files
 from sim2gp.systems.urdf_say import URDF
 
@@ -161,11 +162,14 @@ class ModelFile:
 
         Raises `InputError` E170 with the first constant, or array, that is another.
         """
-        found = constants_of(made)
-        for path, constant in constants_of(edited.wanted).items():
-            wanted = constant.get(edited.wanted)
-            got = found[path].get(made) if path in found else np.nan
-            if not np.isclose(got, wanted, rtol=self.same, atol=1e-12):
+        for name in ("nbody", "njnt", "ngeom", "nu"):
+            pair = [int(getattr(m, name)) for m in (made, edited.wanted)]
+            if pair[0] != pair[1]:
+                raise self._unwritten(name, str(pair[0]), str(pair[1]))
+        for path, constant in self.constants.items():
+            wanted, got = (constant.get(m) for m in (edited.wanted, made))
+            near = self.same if constant.block else 1e-12  # of numbers that are zero
+            if not np.isclose(got, wanted, rtol=self.same, atol=near):
                 raise self._unwritten(path, f"{got:.9g}", f"{wanted:.9g}")
         self._check_arrays(edited.wanted, made)
 

@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 
 from sim2gp.errors import InputError
-from sim2gp.systems.mjcf import INERTIA, Constant
+from sim2gp.systems.inertia import NAMES as INERTIA
+from sim2gp.systems.inertia import inertia_matrix
+from sim2gp.systems.mjcf import Constant
 from sim2gp.systems.mjcf_text import Edits, Element, number
 
 _AXES = ("com_x", "com_y", "com_z")
@@ -239,16 +241,6 @@ def full(model: Any, b: int) -> dict[str, str]:
     upper = [values[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
     said = diagonal(model, b)
     return {"pos": said["pos"], "mass": said["mass"], "fullinertia": words(upper)}
-
-
-def inertia_matrix(model: Any, b: int) -> np.ndarray:
-    """About the centre of mass, in the body's axes."""
-    import mujoco
-
-    turn = np.empty(9)
-    mujoco.mju_quat2Mat(turn, model.body_iquat[b])
-    R = turn.reshape(3, 3)
-    return np.asarray((R * model.body_inertia[b]) @ R.T)
 
 
 def _inertial(said: dict[str, str]) -> str:

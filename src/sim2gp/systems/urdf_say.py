@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 
 from sim2gp.errors import InputError
-from sim2gp.systems.mjcf import INERTIA, Constant
-from sim2gp.systems.mjcf_say import inertia_matrix, say_gravity, scale, words
+from sim2gp.systems.inertia import NAMES as INERTIA
+from sim2gp.systems.inertia import inertia_matrix
+from sim2gp.systems.mjcf import Constant
+from sim2gp.systems.mjcf_say import say_gravity, scale, words
 from sim2gp.systems.mjcf_text import Edits, Element, number
 
 _DYNAMICS = {"damping": "damping", "frictionloss": "friction"}
