@@ -22,7 +22,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import scipy.linalg
 from jaxtyping import Float
 
 Four = Float[np.ndarray, "4 4"]
@@ -99,9 +98,7 @@ class BodyInertia:
     def get(self, model: Any) -> Float[np.ndarray, "10"]:
         """How the body differs from the model's own."""
         now, own = upper_factor(of_body(model, self.body)), upper_factor(self.own)
-        # U V0 = V, all of them upper triangular.
-        U = scipy.linalg.solve_triangular(own.T, now.T, lower=True).T
-        return numbers(U)
+        return numbers(np.linalg.solve(own.T, now.T).T)  # of U, where U V0 = V
 
     def put(self, model: Any, values: Mapping[str, float]) -> None:
         """Give the body these numbers; those that are not named are zero."""
