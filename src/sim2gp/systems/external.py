@@ -24,6 +24,7 @@ from sim2gp.types import Action, Scalar, State
 #: Steps of central differences, in scales: of constants, which act weakly within one
 #: period (rounding rules) and smoothly, and of states and inputs.
 OF_CONSTANTS, OF_STATES = 1e-4, 1e-6
+ROUNDING = 16.0 * float(np.finfo(float).eps)
 
 
 class AbstractSimulator(abc.ABC):
@@ -70,7 +71,11 @@ class AbstractSimulator(abc.ABC):
         out = out.reshape(len(points), len(x), n)
         up, down = out[1 : K + 1], out[K + 1 :]
         apart = np.einsum("kbk->kb", points[1 : K + 1] - points[K + 1 :])
-        J = (up - down) / apart[..., None]
+        moved = up - down
+        # What a constant changes within rounding it does not change at all.
+        nothing = ROUNDING * np.maximum(1.0, np.abs(out[0]).max(axis=1, initial=0.0))
+        moved[:p][np.abs(moved[:p]) <= nothing[:, None]] = 0.0
+        J = moved / apart[..., None]
         return out[0], np.moveaxis(J, 0, -1)
 
 

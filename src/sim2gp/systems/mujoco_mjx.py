@@ -54,8 +54,9 @@ class MJXEngine:
         shapes = [len(constants), model.nq + model.nv + model.na, model.nu]
         with _lenient():
             try:
-                args = [jax.ShapeDtypeStruct((n,), jnp.float32) for n in shapes]
-                scalar = jax.ShapeDtypeStruct((), jnp.float32)
+                dtype = jnp.result_type(float)
+                args = [jax.ShapeDtypeStruct((n,), dtype) for n in shapes]
+                scalar = jax.ShapeDtypeStruct((), dtype)
                 jax.eval_shape(self.flow, *args, scalar)
             except NotImplementedError as error:
                 raise _unsupported(str(error), "other features") from error
