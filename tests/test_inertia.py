@@ -44,6 +44,10 @@ def test_ten_numbers_are_a_deformation_of_matter() -> None:
     weights, places = points(pseudo_inertia(mass, com, about))
     values = 0.3 * RNG.standard_normal(10)
     U = deformation(values)
+    alpha, d1, d2, d3, s12, s23, s13, *t = values
+    upper = [[np.exp(d1), s12, s13, t[0]], [0.0, np.exp(d2), s23, t[1]]]
+    upper += [[0.0, 0.0, np.exp(d3), t[2]], [0.0, 0.0, 0.0, 1.0]]
+    np.testing.assert_allclose(U, np.exp(alpha) * np.asarray(upper), rtol=1e-12)
     density, A, t = U[3, 3] ** 2, U[:3, :3] / U[3, 3], U[:3, 3] / U[3, 3]
     weights, places = density * weights, places @ A.T + t
     found = rigid_body(U @ pseudo_inertia(mass, com, about) @ U.T)

@@ -116,6 +116,8 @@ def test_one_constant_changes_alone(tmp_path: Path, path: str) -> None:
     if path == "joint/swing/damping":
         line = """               axis="0 1 0" damping="0.123456789012345"/>"""
         assert changed == {line}
+    if path == "body/upper/mass":
+        assert """size=".02" mass='0.6'/>""" in text.decode()
     if path == "body/body4/com_y":
         assert (
             """pos="0 0.12 0" mass="2" diaginertia=".1 .2	.25\"""" in text.decode()
