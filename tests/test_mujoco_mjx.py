@@ -161,20 +161,17 @@ def test_what_mjx_does_not_support_is_refused(parts, constant, got) -> None:
 
 
 @pytest.mark.nightly
-def test_every_integrator_and_solver_agrees(lenient_promotion) -> None:
-    """Implicitfast, RK4, elliptic cones, CG; a step of uneven length, of none."""
-    with jax.enable_x64(True):
-        for old, new in (
-            ("<option ", '<option integrator="implicitfast" '),
-            ("<option ", '<option integrator="RK4" '),
-            ("<option ", '<option cone="elliptic" '),
-            ("<option ", '<option solver="CG" '),
-        ):
-            c, x = systems(MODEL.replace(old, new), ["body/cart/mass", FRICTION])
-            theta = jnp.asarray([0.6, 0.5])
-            s, a = jnp.asarray(STATE), jnp.asarray(ACTION)
-            step = jax.jit(lambda h, x=x, t=theta, s=s, a=a: x.flow(t, s, a, h))
-            for h in (0.012, 0.0):
-                expected = c.flow(theta, s, a, h)
-                found = step(jnp.asarray(h))
-                np.testing.assert_allclose(found, expected, atol=1e-8)
+@pytest.mark.parametrize(
+    "option",
+    ['integrator="implicitfast"', 'integrator="RK4"', 'cone="elliptic"', 'solver="CG"'],
+)
+@in_float64
+def test_every_integrator_and_solver_agrees(option) -> None:
+    """In steps of uneven length, and of none."""
+    text = MODEL.replace("<option ", f"<option {option} ")
+    c, x = systems(text, ["body/cart/mass", FRICTION])
+    theta, s, a = (jnp.asarray(v) for v in ([0.6, 0.5], STATE, ACTION))
+    step = jax.jit(lambda h: x.flow(theta, s, a, h))
+    for h in (0.012, 0.0):
+        expected = c.flow(theta, s, a, h)
+        np.testing.assert_allclose(step(jnp.asarray(h)), expected, atol=1e-8)

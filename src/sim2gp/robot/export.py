@@ -21,6 +21,9 @@ from sim2gp.systems.actuator import bare
 from sim2gp.systems.mjcf_load import compiled_all
 from sim2gp.types import Key, in_float64, single
 
+#: Files that one child process compiles, and models that are in memory at once.
+TOGETHER = 32
+
 
 def export_policy(policy: Policy, out: Path | str, system: AbstractSystem) -> None:
     """Write a trained policy for `load_policy`; ``system`` names its channels.
@@ -133,17 +136,18 @@ def _write_variants(
     if not isinstance(model, MuJoCo) or model.source is None:
         return
     file, draws = model.file(mjcf=True), len(next(iter(rows.values())))
-    made = []
-    for i in range(draws):
-        values = model.by_path({name: float(x[i]) for name, x in rows.items()})
-        main, edited = f"variant_{i:03d}{file.suffix}", file.edited(values)
-        made.append((main, edited))
-        # From where the run will stand, everything is as far away as from here.
-        for _, name, text in file.texts(edited, main, writer.folder):
-            writer.write_bytes(name, text)
-    found = compiled_all([writer.folder / name for name, _ in made])
-    for (_, edited), each in zip(made, found, strict=True):
-        file.check(edited, each)
+    for start in range(0, draws, TOGETHER):
+        made = []
+        for i in range(start, min(start + TOGETHER, draws)):
+            values = model.by_path({name: float(x[i]) for name, x in rows.items()})
+            main, edited = f"variant_{i:03d}{file.suffix}", file.edited(values)
+            made.append((main, edited))
+            # From where the run will stand, everything is as far away as from here.
+            for _, name, text in file.texts(edited, main, writer.folder):
+                writer.write_bytes(name, text)
+        found = compiled_all([writer.folder / name for name, _ in made])
+        for (_, edited), each in zip(made, found, strict=True):
+            file.check(edited, each)
 
 
 def _compiled(belief: AbstractBelief, system: AbstractSystem) -> bytes:

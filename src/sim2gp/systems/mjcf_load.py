@@ -52,7 +52,8 @@ def as_mjcf(path: Path) -> str:
 
 def _made(paths: Sequence[Path], folder: str, form: str) -> list[Path]:
     """What the child makes of each file."""
-    command = [sys.executable, "-I", _CHILD, str(SECONDS), folder, form]
+    seconds = SECONDS * len(paths)
+    command = [sys.executable, "-I", _CHILD, str(seconds), folder, form]
     where = str(paths[0])
     try:
         done = subprocess.run(
@@ -60,11 +61,11 @@ def _made(paths: Sequence[Path], folder: str, form: str) -> list[Path]:
             cwd=folder,  # where MuJoCo leaves its log
             capture_output=True,
             text=True,
-            timeout=2 * SECONDS,
+            timeout=2 * seconds,
             check=False,
         )
     except subprocess.TimeoutExpired:
-        raise _died(where, f"no answer in {2 * SECONDS} s") from None
+        raise _died(where, f"no answer in {2 * seconds} s") from None
     if done.returncode == 3:
         said = " ".join(done.stderr.split("REFUSED ", 1)[-1].split())
         raise InputError("E170", "no model", where=where, got=said)
