@@ -2,8 +2,9 @@
 
 from mutant_list import Mutant
 
-EXTERNAL, ENGINE = "systems/external.py", "systems/mujoco.py"
+EXTERNAL, ENGINE = "systems/external.py", "systems/mujoco_engine.py"
 MJCF, FILE = "systems/mjcf.py", "systems/mjcf_file.py"
+SAY = "systems/mjcf_say.py"
 
 ON_THE_HOST = (
     Mutant(
@@ -84,18 +85,144 @@ ON_THE_HOST = (
         ("test_mujoco_system.py", "step_is or batch"),
     ),
     Mutant(
-        "mjcf file: a body keeps its inertia",
-        FILE,
-        '    "inertia": "body_inertia",\n',
-        "",
-        ("test_mujoco_file.py", "makes_that_model"),
+        "mjcf say: a body keeps its inertia",
+        SAY,
+        "scale(edits, own, name, ratio)",
+        "scale(edits, own, name, 1.0)",
+        ("test_mujoco_text.py", "one_constant"),
     ),
     Mutant(
-        "mjcf file: what cannot be said is not checked",
+        "mjcf say: a motor stays one",
+        SAY,
+        'edits.rename(element, "general")',
+        "pass",
+        ("test_mujoco_text.py", "one_constant"),
+    ),
+    Mutant(
+        "mjcf say: frames are not looked into",
+        SAY,
+        'elif child.tag == "frame":',
+        "elif False:",
+        ("test_mujoco_text.py", "one_constant"),
+    ),
+    Mutant(
+        "mjcf say: a servo's gain is forgotten",
+        SAY,
+        '("gainprm", wanted.actuator_gainprm[i]),',
+        "",
+        ("test_mujoco_text.py", "one_constant"),
+    ),
+    Mutant(
+        "urdf say: welded links keep their mass",
+        "systems/urdf_say.py",
+        'yield from self._welded(self._named("link", child))',
+        "pass",
+        ("test_mujoco_text.py", "own_words"),
+    ),
+    Mutant(
+        "mjcf text: every quote is double",
+        "systems/mjcf_text.py",
+        "quote = found.group(2)[:1]",
+        "quote = b'\"'",
+        ("test_mujoco_text.py", "one_constant"),
+    ),
+    Mutant(
+        "mjcf text: white space between numbers is lost",
+        "systems/mjcf_text.py",
+        "between = gaps[1:-1] +",
+        "between =",
+        ("test_mujoco_text.py", "one_constant"),
+    ),
+    Mutant(
+        "mjcf file: parts are where the file is",
         FILE,
-        "not np.isclose(found, wanted, rtol=1e-9, atol=1e-12)",
-        "not np.isclose(found, wanted, rtol=1e9, atol=1e-12)",
-        ("test_mujoco_file.py", "cannot_say"),
+        'edits.set(include, "file", _relative(part.path, folder))',
+        "pass",
+        ("test_mujoco_text.py", "untouched_part"),
+    ),
+    Mutant(
+        "mjcf file: constants are not compared",
+        FILE,
+        "if not np.isclose(got, wanted, rtol=self.same, atol=near):",
+        "if False:",
+        ("test_mujoco_text.py", "compared"),
+    ),
+    Mutant(
+        "mjcf file: arrays are not compared",
+        FILE,
+        "if x.shape != y.shape or not _near(y, x, self.all_same * size):",
+        "if False:",
+        ("test_mujoco_text.py", "compared"),
+    ),
+    Mutant(
+        "mjcf file: inertias are not compared",
+        FILE,
+        "if not _near(y, x, self.all_same * float(np.abs(x).max())):",
+        "if False:",
+        ("test_mujoco_text.py", "compared"),
+    ),
+    Mutant(
+        "mjcf child: bodies stay simplified",
+        "systems/mjcf_child.py",
+        "body.simple = 0",
+        "pass",
+        ("test_inertia.py", "centre_moves"),
+    ),
+    Mutant(
+        "inertia: about another point",
+        "systems/inertia.py",
+        "P[:3, :3] += mass * np.outer(com, com)",
+        "P[:3, :3] += 0.9 * mass * np.outer(com, com)",
+        ("test_inertia.py", "deformation"),
+    ),
+    Mutant(
+        "inertia: shears are mixed up",
+        "systems/inertia.py",
+        "    (1, 2),\n    (0, 2),\n",
+        "    (0, 2),\n    (1, 2),\n",
+        ("test_inertia.py", "deformation"),
+    ),
+    Mutant(
+        "inertia: open beside its mass",
+        "systems/mujoco.py",
+        "if c.index in own and c.quantity in OF_INERTIA:",
+        "if False:",
+        ("test_inertia.py", "priors"),
+    ),
+    Mutant(
+        "external: rounding is an effect",
+        EXTERNAL,
+        "moved[:p][np.abs(moved[:p]) <= nothing[:, None]] = 0.0",
+        "pass",
+        ("test_mujoco_system.py", "rests"),
+    ),
+    Mutant(
+        "mjx: derived constants are those of the file",
+        "systems/mujoco_mjx.py",
+        "return _derived(model) if self.derive else model",
+        "return model",
+        ("test_mujoco_mjx.py", "rollouts"),
+    ),
+    Mutant(
+        "mjx: constants stay at one",
+        "systems/mujoco_mjx.py",
+        "one + jnp.tensordot(theta - 1.0, by, 1)",
+        "one + 0.0 * jnp.tensordot(theta - 1.0, by, 1)",
+        ("test_mujoco_mjx.py", "rollouts"),
+    ),
+    Mutant(
+        "apply: what failed is left behind",
+        "experiments/apply.py",
+        "path.unlink()",
+        "pass",
+        ("test_project_model.py", "leaves_nothing"),
+    ),
+    Mutant(
+        "apply: the file may be another one",
+        "experiments/identify.py",
+        "    _check_fitted(project, x)\n",
+        "",
+        ("test_project_model.py", "changed_in_place"),
     ),
     Mutant(
         "mjcf load: parts may lie anywhere",

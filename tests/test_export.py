@@ -194,8 +194,8 @@ def test_draws_of_a_mujoco_model_are_its_files(tmp_path: Path) -> None:
         model = mujoco.MjModel.from_xml_path(str(text))
         mass = run.arrays["draws/body/pole/mass"][i]
         damping = run.arrays["draws/joint/x/damping"][i]
-        assert model.body("pole").mass[0] == pytest.approx(mass, rel=1e-5)
-        assert model.joint("x").damping[0] == pytest.approx(damping, rel=1e-5)
+        assert model.body("pole").mass[0] == pytest.approx(mass, rel=1e-12)
+        assert model.joint("x").damping[0] == pytest.approx(damping, rel=1e-12)
     with pytest.raises(InputError, match="E135"):
         export_model(
             belief, tmp_path / "m", system, dt=0.02, draws=1, key=KEY, compiled=True

@@ -1,57 +1,15 @@
-"""MuJoCo models as files: read in a child process, written with other constants."""
+"""MuJoCo models as files: read in a child process, and refused."""
 
 import numpy as np
 import pytest
 
 from sim2gp import systems as sy
 from sim2gp.errors import InputError
-from sim2gp.parameters import Parameter
 from sim2gp.systems import mjcf_load
 
 mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is not installed")
 
 from test_mujoco_system import CRAWLER, USUAL, crawler, written  # noqa: E402
-
-
-def test_a_file_with_other_constants_makes_that_model(tmp_path):
-    """Of every kind of constant; six digits."""
-    system = crawler(tmp_path)
-    extra = ["body/leg/com_x", "body/shin/length", "actuator/*/gear", "option/gravity"]
-    paths = [*system.names, *extra, "geom/*/friction", "joint/knee/stiffness"]
-    place = Parameter("", "m", "place", "identity", mean=0.025, sd=0.01)
-    system = crawler(tmp_path, constants=paths, priors={"body/leg/com_x": place})
-    rng = np.random.default_rng(0)
-    own = [g[0].get(system.engine.model) for g in system.engine.constants]
-    values = dict(zip(system.names, own * rng.uniform(0.6, 1.6, len(own)), strict=True))
-    text = system.mjcf(values, tmp_path)
-    found = mujoco.MjModel.from_xml_string(text)
-    theta = np.asarray(list(values.values()))
-    expected = system.engine.with_values(theta)
-    for group in system.engine.constants:
-        got, wanted = (group[0].get(m) for m in (found, expected))
-        assert got == pytest.approx(wanted, rel=1e-5), group[0].path
-    for field in ("body_inertia", "dof_invweight0", "actuator_acc0"):
-        pair = (getattr(m, field) for m in (found, expected))
-        np.testing.assert_allclose(*pair, rtol=1e-4)
-
-
-def test_a_file_that_cannot_say_it_is_refused(tmp_path):
-    """An inertial that the file overrules by its geoms would be read."""
-    text = CRAWLER.format(**USUAL)
-    text = text.replace('autolimits="true"', 'autolimits="true" inertiafromgeom="true"')
-    path = written(tmp_path, text)
-    name = "body/torso/mass"
-    found = sy.MuJoCo(path, [name]).mjcf({name: 1.3}, tmp_path)
-    assert mujoco.MjModel.from_xml_string(found).body("torso").mass[0] == 1.3
-    heavy = '<inertial pos="0 0 0" mass="3" diaginertia="1 1 1"/>'
-    shin = '<body name="shin" pos=".05 0 -.08">'
-    path = written(tmp_path, text.replace(shin, shin + heavy))
-    with pytest.raises(InputError, match=r"E170 body/shin/mass cannot be written"):
-        sy.MuJoCo(path, [name]).mjcf({name: 1.3}, tmp_path)
-    compiled = sy.MuJoCo(mujoco.MjModel.from_xml_path(str(path)), ["body/torso/mass"])
-    with pytest.raises(InputError, match="E170 a model without a file"):
-        compiled.mjcf({"body/torso/mass": 1.3}, tmp_path)
-
 
 FLOATING = """
 <mujoco><worldbody>
@@ -147,7 +105,9 @@ def test_a_parser_that_dies_is_an_error_of_the_file(tmp_path, monkeypatch):
         ("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)", "exit -11"),
         ("import time; time.sleep(30)", "no answer"),
     ):
-        monkeypatch.setattr(mjcf_load, "_CHILD", code)
+        child = tmp_path / "child.py"
+        child.write_text(code)
+        monkeypatch.setattr(mjcf_load, "_CHILD", str(child))
         monkeypatch.setattr(mjcf_load, "SECONDS", 1)
         with pytest.raises(InputError, match=f"E171 MuJoCo's parser.*{got}"):
             sy.MuJoCo(path)

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 import mjcf
+from sim2gp import diagnose
 from sim2gp import systems as sy
 from sim2gp.errors import InputError
+from sim2gp.gaussian import Gaussian
 from sim2gp.models import Sim2GP
 from sim2gp.parameters import Parameter
 from sim2gp.transitions import Transitions
@@ -273,3 +275,39 @@ def test_what_ran_away_is_not_the_start_again(tmp_path, monkeypatch, capfd, spee
     np.testing.assert_allclose(found[1], expected, atol=1e-8)
     assert os.listdir(tmp_path) == ["model.xml"]
     assert capfd.readouterr() == ("", "")
+
+
+RESTING = """
+<mujoco><worldbody>
+  <body name="cart"><joint name="x" type="slide" axis="1 0 0" damping="1"/>
+    <geom type="box" size=".1 .1 .02" mass=".5"/>
+    <body name="pole" pos="0 .03 .02"><joint name="q" axis="0 1 0"/>
+      <geom type="capsule" fromto="0 0 0 0 0 .3" size=".02" mass=".1"/></body></body>
+  <body name="other" pos="0 2 0"><joint name="y" type="slide" axis="0 1 0"/>
+    <geom size=".1" mass="1"/></body>
+</worldbody></mujoco>
+"""
+
+
+@in_float64
+def test_what_rests_is_dead_and_not_identified(tmp_path):
+    """Dry friction that is zero in the file, a mass, a length that nothing turns."""
+    dead = ["joint/y/frictionloss", "body/other/mass", "body/pole/length"]
+    dry = Parameter("", "N", "dry friction", "box", 0.0, 1.0)
+    path = written(tmp_path, RESTING)
+    system = sy.MuJoCo(path, ["joint/x/damping", *dead], {dead[0]: dry})
+    prior = system.parameters.prior()
+    theta = np.asarray(system.parameters.constrain(prior.mean))
+    rng = np.random.default_rng(0)
+    S = rng.normal(size=(20, 6))
+    S[:, [2, 5]] = 0.0  # y rests
+    rows = np.tile(theta, (20, 1)), S, np.zeros((20, 0)), np.full(20, DT)
+    _, J = system.engine.slopes(*rows)
+    slope = jax.jacfwd(system.parameters.constrain)(prior.mean) @ prior.scale
+    A = jnp.asarray(J[..., :4].reshape(-1, 4)) @ slope / 1e-3
+    scale = jnp.linalg.solve(jnp.linalg.cholesky(jnp.eye(4) + A.T @ A).T, jnp.eye(4))
+    found = diagnose.summary(
+        system.parameters, prior, Gaussian(prior.mean, prior.scale @ scale), A
+    )
+    words = {name: entry["verdict"] for name, entry in found["parameters"].items()}
+    assert words == {"joint/x/damping": "identified"} | dict.fromkeys(dead, "dead")

@@ -9,7 +9,10 @@ import pytest
 
 from sim2gp.cli import main
 from sim2gp.errors import InputError
+from sim2gp.experiments import apply
+from sim2gp.experiments.identify import restored
 from sim2gp.project import load_project
+from sim2gp.systems.mjcf_load import compiled_all
 
 mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is not installed")
 
@@ -125,8 +128,17 @@ def test_a_model_that_is_not_there_is_said_with_its_line(tmp_path: Path) -> None
         load_project(path)
 
 
-def test_identify_from_a_file_and_logs(tmp_path: Path, capsys) -> None:
-    """Two constants that were changed, behind a delay; positions alone are measured."""
+TRUTH = {
+    "joint/shoulder/damping": 0.08,
+    "actuator/push/gear": 1.7,
+    "push.delay": 0.01,
+}
+
+
+@pytest.fixture(scope="module")
+def identified(tmp_path_factory) -> Path:
+    """A run: two constants that were changed, behind a delay; positions measured."""
+    folder = tmp_path_factory.mktemp("arm")
     model = mujoco.MjModel.from_xml_string(MODEL)
     model.dof_damping[:] = 0.08
     model.actuator_gear[0, 0] = 1.7
@@ -137,27 +149,109 @@ def test_identify_from_a_file_and_logs(tmp_path: Path, capsys) -> None:
         data.ctrl[0] = u[i - 2] if i >= 2 else 0.0  # 10 ms late
         mujoco.mj_step(model, data)
     names = "time,q1,q2,u"
-    np.savetxt(tmp_path / "a.csv", rows, delimiter=",", header=names, comments="")
+    np.savetxt(folder / "a.csv", rows, delimiter=",", header=names, comments="")
     text = """
 [parameters."joint/*/damping"]
 tie = true
 relative_sd = 1.0
 [parameters."actuator/push/gear"]
-relative_sd = 0.3
+tie = true
+[parameters]
+"body/lower/mass" = 0.5
 [actuators.push]
 delay = {low = 0.0, high = 0.02}
 """
-    path = project(tmp_path, text)
-    assert main(["identify", str(path), "--out", str(tmp_path / "run"), "--json"]) == 0
-    summary = json.loads(capsys.readouterr().out)
-    truth = {
-        "joint/shoulder/damping": 0.08,
-        "actuator/push/gear": 1.7,
-        "push.delay": 0.01,
-    }
-    assert set(summary["parameters"]) == set(truth)
-    for name, value in truth.items():
-        found = summary["parameters"][name]
+    path = project(folder, text)
+    assert main(["identify", str(path), "--out", str(folder / "run"), "--quiet"]) == 0
+    return folder / "run"
+
+
+def test_identify_from_a_file_and_logs(identified: Path) -> None:
+    parameters = json.loads((identified / "summary.json").read_text())["parameters"]
+    assert set(parameters) == set(TRUTH)
+    for name, value in TRUTH.items():
+        found = parameters[name]
         assert abs(found["mean"] - value) < 4.0 * found["sd"], name
         assert found["verdict"] == "identified"
         assert found["sd"] < 0.1 * value
+
+
+def test_its_constants_go_into_the_file(identified: Path, capsys) -> None:
+    """Both of a tie; the delay and the source stay; the diff is what changed."""
+    run, out = str(identified), identified.parent / "learned.xml"
+    before = {p.name: p.read_bytes() for p in identified.parent.glob("*.*")}
+    assert main(["apply", run, "--quiet"]) == 0
+    shown = capsys.readouterr().out
+    assert {p.name: p.read_bytes() for p in identified.parent.glob("*.*")} == before
+    assert main(["apply", run, "--out", str(out), "--json", "--quiet"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["written"] == [str(out)]
+    assert summary["not_written"] == {"push.delay": "no constant of the model's file"}
+    model = mujoco.MjModel.from_xml_path(str(out))
+    damping, gear = model.dof_damping[0], model.actuator_gear[0, 0]
+    assert model.dof_damping.tolist() == [damping, damping]
+    parameters = json.loads((identified / "summary.json").read_text())["parameters"]
+    assert damping == pytest.approx(
+        parameters["joint/shoulder/damping"]["mean"], rel=0.02
+    )
+    assert gear == pytest.approx(parameters["actuator/push/gear"]["mean"], rel=0.02)
+    lines = out.read_text().split("\n")
+    changed = [(b, a) for b, a in zip(MODEL.split("\n"), lines, strict=True) if a != b]
+    assert len(changed) == 3
+    for old, new in changed:
+        assert f"-{old}\n" in shown
+        assert f"+{new}\n" in shown
+        assert f"+{new}\n" in summary["diff"]
+    assert main(["apply", run, "--out", str(out)]) == 2
+    assert "E132 output file" in capsys.readouterr().err
+
+
+def test_a_file_that_was_changed_in_place_is_no_longer_the_one_fitted(
+    identified: Path, tmp_path: Path, capsys
+) -> None:
+    """Its own numbers are what relative priors are about; `apply` keeps its values."""
+    other = tmp_path / "other.xml"
+    other.write_text(MODEL.replace('damping=".02"', 'damping=".7"'))
+    given = ["apply", str(identified), "--model", str(other), "--in-place", "--quiet"]
+    for count in (3, 0):
+        assert main([*given, "--json"]) == 0
+        found = json.loads(capsys.readouterr().out)
+        assert len(found["constants"]) == count
+    model = mujoco.MjModel.from_xml_path(str(other))
+    assert model.dof_damping[0] == model.dof_damping[1] < 0.1
+    machine = identified.parent / "arm.xml"
+    machine.write_bytes(other.read_bytes())
+    try:
+        with pytest.raises(InputError, match=r"E170 another machine than was fitted"):
+            restored(identified)
+    finally:
+        machine.write_text(MODEL)
+    assert restored(identified).project.system.states[0].name == "shoulder"
+    assert list(tmp_path.iterdir()) == [other]
+
+
+def test_a_file_that_cannot_say_it_leaves_nothing_behind(
+    identified: Path, tmp_path: Path, capsys, monkeypatch
+) -> None:
+    """Not the model's constants; or another model than was wanted, seen at the end."""
+    other, out = tmp_path / "other.xml", tmp_path / "out" / "new.xml"
+    out.parent.mkdir()
+    given = ["apply", str(identified), "--model", str(other), "--out", str(out)]
+    other.write_text(
+        MODEL.replace('name="shoulder"', 'name="hip"').replace(
+            'joint="shoulder"', 'joint="hip"'
+        )
+    )
+    assert main(given) == 2
+    assert "E170" in capsys.readouterr().err
+    other.write_text(MODEL)
+
+    def heavier(paths: list[Path]) -> list:
+        models = compiled_all(paths)
+        models[0].body_mass[1] *= 1.0 if paths[0].parent != out.parent else 1.001
+        return models
+
+    monkeypatch.setattr(apply, "compiled_all", heavier)
+    assert main(given) == 2
+    assert "E170 body/upper/mass cannot be written" in capsys.readouterr().err
+    assert not list(out.parent.iterdir())

@@ -259,6 +259,29 @@ class Design(Writes):
 
 
 @dataclass(kw_only=True)
+class Apply(Common):
+    """Write identified constants into the MuJoCo model's own file; shows the diff."""
+
+    path: Annotated[Positional[Path], arg(metavar="RUN")]
+    """The folder of identify."""
+    out: Annotated[Path | None, arg(metavar="FILE")] = None
+    """The new file; without it, and without --in-place, nothing is written."""
+    model: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Another copy of the model than the one that was fitted."""
+    in_place: bool = False
+    """Change the model's file itself."""
+
+    def run(self, progress: Progress) -> dict[str, Any]:
+        return _experiment("apply")(
+            self.path,
+            out=self.out,
+            model=self.model,
+            in_place=self.in_place,
+            progress=progress,
+        )
+
+
+@dataclass(kw_only=True)
 class Report(Common):
     """Draw the report of a run anew."""
 
@@ -336,6 +359,7 @@ COMMANDS: dict[str, type[Common]] = {
     "explain": Explain,
     "compare": Compare,
     "design": Design,
+    "apply": Apply,
     "report": Report,
     "selftest": Selftest,
     "reproduce": Reproduce,

@@ -6,7 +6,6 @@ answer is one of three: nothing, an effect, or none of these.
 """
 
 import dataclasses
-import os
 import time
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from sim2gp.diagnose.evidence import AbstractData, OneStepData, WindowData
 from sim2gp.diagnose.explain import explain
 from sim2gp.errors import InputError
 from sim2gp.experiments.explain_words import candidate_rows, headline, table
-from sim2gp.experiments.identify import PROJECT
+from sim2gp.experiments.identify import PROJECT, project_of, stood
 from sim2gp.experiments.prediction import cut_logs, load
 from sim2gp.experiments.record import provenance
 from sim2gp.project import Project, load_project
@@ -128,13 +127,7 @@ def _flown(stored: Run) -> OneStepData:
 
 def _project(run: Path, stored: Run) -> Project:
     """The run's own copy of the project, its logs where the file stood."""
-    return dataclasses.replace(load_project(run / PROJECT), path=_place(run, stored))
-
-
-def _place(run: Path, stored: Run) -> Path:
-    about = stored.summary.get("project", {})
-    place = run / about.get("folder", "") / about.get("file", PROJECT)
-    return Path(os.path.normpath(place))
+    return dataclasses.replace(project_of(run, stored), path=stood(run, stored))
 
 
 def _project_file(run: Path, stored: Run, add: bool) -> Path | None:
@@ -150,7 +143,7 @@ def _project_file(run: Path, stored: Run, add: bool) -> Path | None:
             expected="the folder of sim2gp identify",
             fix="leave --add out",
         )
-    place = _place(run, stored)
+    place = stood(run, stored)
     if load_project(place).source.text != load_project(run / PROJECT).source.text:
         raise InputError(
             "E160",

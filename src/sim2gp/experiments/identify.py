@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from sim2gp import diagnose
 from sim2gp.diagnose.residuals import misfit_of_windows
@@ -39,8 +40,10 @@ from sim2gp.models.windows import (
     fit_windows,
     information_at,
 )
+from sim2gp.parameters import Parameters
 from sim2gp.project import Project, load_project
 from sim2gp.runs import Progress, load_run, new_run
+from sim2gp.runs.store import Run
 from sim2gp.types import in_float64
 
 PROJECT = "project.toml"  # the file's name in a run
@@ -97,6 +100,7 @@ def _stored(belief: WindowsBelief, band: Band, seed: int) -> dict[str, np.ndarra
     key = jax.random.fold_in(jax.random.key(seed), 1)
     return {
         "belief/mean": np.asarray(belief.posterior.mean),
+        "belief/theta": np.asarray(_theta(table, belief.posterior.mean)),
         "belief/scale": np.asarray(belief.posterior.scale),
         "belief/prior_mean": np.asarray(belief.prior.mean),
         "belief/prior_scale": np.asarray(belief.prior.scale),
@@ -126,6 +130,24 @@ class Identified(NamedTuple):
 
 
 @in_float64
+def _theta(table: Parameters, tt: Array) -> Array:
+    """The constants at the posterior's mode, in physical units."""
+    return table.constrain(jnp.asarray(tt, float))
+
+
+def stood(run: Path, stored: Run) -> Path:
+    """Where the project file of an identification stood."""
+    about = stored.summary.get("project", {})
+    place = run / about.get("folder", "") / about.get("file", PROJECT)
+    return Path(os.path.normpath(place))
+
+
+def project_of(run: Path, stored: Run, model: Path | None = None) -> Project:
+    """The run's own copy of its project, its model's file where it was (or another)."""
+    return load_project(run / PROJECT, stood(run, stored).parent, model)
+
+
+@in_float64
 def restored(run: Path) -> Identified:
     """What `run` wrote; E130 for a folder that is not an identification."""
     stored = load_run(run)
@@ -139,8 +161,10 @@ def restored(run: Path) -> Identified:
             fix="run sim2gp identify first",
         )
     x, noise = stored.arrays, stored.summary["noise"]
+    project = project_of(run, stored)
+    _check_fitted(project, x)
     return Identified(
-        load_project(run / PROJECT),
+        project,
         stored.summary,
         Gaussian(jnp.asarray(x["belief/mean"]), jnp.asarray(x["belief/scale"])),
         list(noise),
@@ -155,6 +179,23 @@ def restored(run: Path) -> Identified:
             float(x["band/inflation"]),
         ),
     )
+
+
+def _check_fitted(project: Project, x: dict[str, np.ndarray]) -> None:
+    """A model's file still has the numbers that its default priors are about (E170)."""
+    table = project.system.parameters
+    now = _theta(table, jnp.asarray(x["belief/mean"]))
+    theta = x.get("belief/theta", now)
+    for name, is_, was in zip(table.names, np.asarray(now), theta, strict=True):
+        if not np.isclose(is_, was, rtol=1e-9, atol=1e-12):
+            raise InputError(
+                "E170",
+                f"another machine than was fitted: {name}",
+                where=project.spec.system,
+                got=f"{is_:.9g} at the posterior's mode",
+                expected=f"{was:.9g}",
+                fix="identify again, or take back the change of the model's file",
+            )
 
 
 def _summarise(

@@ -22,12 +22,17 @@ from sim2gp.systems.mjcf import Constant, constants_of, matching
 from sim2gp.systems.mujoco import default_prior, loaded
 
 
-def build_model(spec: ProjectSpec, source: Source, folder: Path) -> AbstractSystem:
-    """The machine of a model's file, behind its actuators (E130 to E172)."""
+def build_model(
+    spec: ProjectSpec, source: Source, folder: Path, other: Path | None = None
+) -> AbstractSystem:
+    """The machine of a model's file, or of another one, behind its actuators.
+
+    Raises `InputError` E130 to E172.
+    """
     if spec.effects:
         line = source.where("effects")
         raise unknown("table", "effects", (), line)
-    path = folder / spec.system
+    path = folder / spec.system if other is None else other
     root = _root(spec, source, folder)
     try:
         model = loaded(path, root)

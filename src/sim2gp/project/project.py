@@ -143,8 +143,14 @@ class Project:
         )
 
 
-def load_project(path: Path | str) -> Project:
-    """Read and check a project file; logs are not opened yet (E120 to E162)."""
+def load_project(
+    path: Path | str, folder: Path | None = None, model: Path | None = None
+) -> Project:
+    """Read and check a project file; logs are not opened yet (E120 to E162).
+
+    A model's file is named relative to ``folder``, the project's own if None; ``model``
+    is another file.
+    """
     path = Path(path)
     source, spec = read_spec(path)
     # Imported late: a misspelt key is reported before the simulators are loaded.
@@ -153,7 +159,8 @@ def load_project(path: Path | str) -> Project:
     if is_model(spec.system):
         from sim2gp.project.model import build_model
 
-        system = build_model(spec, source, path.parent)
+        folder = path.parent if folder is None else folder
+        system = build_model(spec, source, folder, model)
     else:
         system = build_system(spec, source, system_class(spec.system))
     check_names(spec, source, system)

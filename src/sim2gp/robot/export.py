@@ -15,9 +15,14 @@ from sim2gp.models import AbstractBelief
 from sim2gp.planning import Policy
 from sim2gp.robot.policy import FORMAT
 from sim2gp.runs import new_run
+from sim2gp.runs.store import Writer
 from sim2gp.systems import AbstractSystem, BlackBox, MuJoCo
-from sim2gp.systems.actuator import AbstractInputPath
+from sim2gp.systems.actuator import bare
+from sim2gp.systems.mjcf_load import compiled_all
 from sim2gp.types import Key, in_float64, single
+
+#: Files that one child process compiles, and models that are in memory at once.
+TOGETHER = 32
 
 
 def export_policy(policy: Policy, out: Path | str, system: AbstractSystem) -> None:
@@ -65,9 +70,10 @@ def export_model(
 
     ``arrays.npz`` holds ``draws/NAME``, in physical units: row ``i`` of all of them is
     one machine, for whatever trainer randomises its simulator; of a MuJoCo model with a
-    file, ``variant_000.xml`` and so on are those machines. ``compiled`` adds
-    ``step.jax``, the mean step ``(s, a) -> s'`` over ``dt`` seconds in float32, for
-    `jax.export.deserialize`; whether another version of JAX reads it is JAX's word.
+    file, ``variant_000.xml`` and so on are those machines (of a URDF, as MJCF).
+    ``compiled`` adds ``step.jax``, the mean step ``(s, a) -> s'`` over ``dt`` seconds
+    in float32, for `jax.export.deserialize`; whether another version of JAX reads it is
+    JAX's word.
     Raises `InputError` E134 where the belief has no constants, E135 where writing
     compiled code needs what is not installed.
     """
@@ -101,8 +107,7 @@ def export_model(
     with new_run(out, "export model") as writer:
         named = {f"draws/{name}": value for name, value in rows.items()}
         writer.write_arrays("arrays.npz", named)
-        for i, text in enumerate(_variants(system, rows, Path(out))):
-            writer.write_text(f"variant_{i:03d}.xml", text)
+        _write_variants(writer, system, rows)
         if code is not None:
             writer.write_bytes("step.jax", code)
         writer.write_summary({"title": "A learned simulator", "model": about})
@@ -123,29 +128,32 @@ def _constants(
     )
 
 
-def _variants(
-    system: AbstractSystem, rows: dict[str, np.ndarray], out: Path
-) -> list[str]:
-    """Of a MuJoCo model, its file with each draw's constants."""
-    bare = _bare(system)
-    if not isinstance(bare, MuJoCo) or bare.source is None:
-        return []
-    draws = len(next(iter(rows.values())))
-    each = [{name: float(x[i]) for name, x in rows.items()} for i in range(draws)]
-    return [bare.mjcf(values, out) for values in each]
-
-
-def _bare(system: AbstractSystem) -> AbstractSystem:
-    """Without what lies before its inputs."""
-    while isinstance(system, AbstractInputPath):
-        system = system.system
-    return system
+def _write_variants(
+    writer: Writer, system: AbstractSystem, rows: dict[str, np.ndarray]
+) -> None:
+    """Of a MuJoCo model, its file with each draw's constants (E170)."""
+    model = bare(system)
+    if not isinstance(model, MuJoCo) or model.source is None:
+        return
+    file, draws = model.file(mjcf=True), len(next(iter(rows.values())))
+    for start in range(0, draws, TOGETHER):
+        made = []
+        for i in range(start, min(start + TOGETHER, draws)):
+            values = model.by_path({name: float(x[i]) for name, x in rows.items()})
+            main, edited = f"variant_{i:03d}{file.suffix}", file.edited(values)
+            made.append((main, edited))
+            # From where the run will stand, everything is as far away as from here.
+            for _, name, text in file.texts(edited, main, writer.folder):
+                writer.write_bytes(name, text)
+        found = compiled_all([writer.folder / name for name, _ in made])
+        for (_, edited), each in zip(made, found, strict=True):
+            file.check(edited, each)
 
 
 def _compiled(belief: AbstractBelief, system: AbstractSystem) -> bytes:
     from jax import export
 
-    if isinstance(_bare(system), MuJoCo | BlackBox):
+    if isinstance(bare(system), MuJoCo | BlackBox):
         raise InputError(
             "E135",
             "compiled code cannot be written",

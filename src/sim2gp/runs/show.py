@@ -13,7 +13,7 @@ LONGEST = 12  # numbers of a list that are still printed
 # of its own says some of it better.
 _HIDDEN = (
     *("warnings", "versions", "animation", "figure1", "units", "tables", "command"),
-    *("candidates", "misfit_as_it_is"),
+    *("candidates", "misfit_as_it_is", "diff"),
 )
 _HIDDEN_COLUMNS = {
     "parameters": ("meaning", "note", "partners", "low", "high"),
@@ -28,6 +28,7 @@ def print_summary(summary: Mapping[str, Any], title: str) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    sys.stdout.write(summary.get("diff", ""))
     # Away from a terminal nothing may be folded: a pipe has no width.
     width = None if sys.stdout.isatty() else 160
     console = Console(file=sys.stdout, width=width, highlight=False)

@@ -74,6 +74,13 @@ class AbstractInputPath(AbstractSystem):
         return self.past
 
 
+def bare(system: AbstractSystem) -> AbstractSystem:
+    """A system without what lies before its inputs."""
+    while isinstance(system, AbstractInputPath):
+        system = system.system
+    return system
+
+
 class Actuated(AbstractInputPath):
     """A system behind its actuators.
 

@@ -26,6 +26,9 @@ from jaxtyping import Array, Float
 from sim2gp.parameters import Parameter, Parameters
 from sim2gp.types import Action, Scalar, State
 
+#: What a constant changes by less, of the largest number, it does not change.
+ROUNDING = 16.0 * float(np.finfo(float).eps)
+
 
 @dataclass(frozen=True)
 class Differences:
@@ -99,7 +102,11 @@ class AbstractSimulator(abc.ABC):
         out = out.reshape(len(points), len(x), n)
         up, down = out[1 : K + 1], out[K + 1 :]
         apart = np.einsum("kbk->kb", points[1 : K + 1] - points[K + 1 :])
-        J = (up - down) / apart[..., None]
+        moved = up - down
+        # What a constant changes within rounding it does not change at all.
+        nothing = ROUNDING * np.maximum(1.0, np.abs(out[0]).max(axis=1, initial=0.0))
+        moved[:p][np.abs(moved[:p]) <= nothing[:, None]] = 0.0
+        J = moved / apart[..., None]
         return out[0], np.moveaxis(J, 0, -1)
 
 

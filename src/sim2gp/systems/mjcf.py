@@ -8,6 +8,7 @@
 | `joint/NAME/stiffness`    | N m/rad, N/m | spring                                   |
 | `body/NAME/mass`          | kg           | mass, and the inertia in proportion      |
 | `body/NAME/com_x` (y, z)  | m            | centre of mass in the body's frame       |
+| `body/NAME/inertia`       | 1, m         | all of it: ten numbers, zero in the file |
 | `body/NAME/length`        | m            | distance from the parent's frame         |
 | `actuator/NAME/gain`      | its own      | force for an input of one, of a motor    |
 | `actuator/NAME/kp`, `kv`  | its own      | gains of a servo                         |
@@ -15,10 +16,11 @@
 | `geom/NAME/friction`      | 1            | sliding friction of a contact            |
 | `option/gravity`          | m/s^2        | strength, in the model's direction       |
 
-`NAME` may be a pattern (`joint/*/damping`).
+`NAME` may be a pattern (`joint/*/damping`). The ten numbers of `body/NAME/inertia`,
+`body/NAME/inertia/alpha` and so on, are those of `sim2gp.systems.inertia`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any
@@ -26,9 +28,12 @@ from typing import Any
 import numpy as np
 
 from sim2gp.errors import InputError, nearest
+from sim2gp.systems.inertia import NAMES as INERTIA
+from sim2gp.systems.inertia import BodyInertia, unframe
 
 #: Quantities that MuJoCo derives others from when it compiles a model.
 DERIVED = frozenset({"mass", "com_x", "com_y", "com_z", "length", "armature", "gear"})
+DERIVED |= frozenset(INERTIA)
 _HINGE = {
     "damping": "N m s/rad",
     "armature": "kg m^2",
@@ -59,6 +64,10 @@ _MEANING = {
 }
 #: Quantities that may be negative.
 SIGNED = frozenset({"com_x", "com_y", "com_z"})
+#: Other names of what the ten numbers of an inertia are.
+OF_INERTIA = SIGNED | {"mass"}
+#: Those that move a body's centre of mass, or turn its principal axes.
+CENTRED = SIGNED | frozenset(INERTIA)
 
 
 @dataclass(frozen=True)
@@ -71,6 +80,7 @@ class Constant:
     meaning: str
     get: Callable[[Any], float]
     put: Callable[[Any, float], None]
+    block: BodyInertia | None = None  # sets several of them at once
 
     @property
     def kind(self) -> str:
@@ -98,7 +108,12 @@ def constants_of(model: Any) -> dict[str, Constant]:
 
 def matching(known: dict[str, Constant], pattern: str) -> list[Constant]:
     """The constants that a path or pattern names; E170 where there is none."""
-    found = [c for path, c in known.items() if fnmatchcase(path, pattern)]
+    found = [
+        c
+        for path, c in known.items()
+        if fnmatchcase(path, pattern)
+        or (c.block is not None and fnmatchcase(path.rsplit("/", 1)[0], pattern))
+    ]
     if not found:
         close = nearest(pattern, known)
         raise InputError(
@@ -109,6 +124,18 @@ def matching(known: dict[str, Constant], pattern: str) -> list[Constant]:
             fix=f"did you mean {close}?" if close else "",
         )
     return found
+
+
+def set_constants(model: Any, pairs: Iterable[tuple[Constant, float]]) -> None:
+    """Give constants values, as they stand; `mujoco.mj_setConst` derives the rest."""
+    blocks: dict[BodyInertia, dict[str, float]] = {}
+    for constant, value in pairs:
+        if constant.block is None:
+            constant.put(model, value)
+        else:
+            blocks.setdefault(constant.block, {})[constant.quantity] = value
+    for block, values in blocks.items():
+        block.put(model, values)
 
 
 def name_of(model: Any, kind: str, index: int) -> str:
@@ -160,8 +187,9 @@ def _bodies(model: Any) -> list[Constant]:
         if model.body_mass[b] > 0.0:
             found.append(_constant(model, "body", b, "mass", "kg", _mass(model, b)))
             for axis, quantity in enumerate(("com_x", "com_y", "com_z")):
-                how = _cell("body_ipos", b, axis)
+                how = _centre(b, axis)
                 found.append(_constant(model, "body", b, quantity, "m", how))
+            found += _inertia(model, b)
         if np.any(model.body_pos[b]):
             found.append(_constant(model, "body", b, "length", "m", _length(model, b)))
     return found
@@ -215,6 +243,38 @@ def _mass(model: Any, b: int) -> dict[str, Callable[..., Any]]:
         model.body_inertia[b] = inertia * (value / mass)
 
     return {"get": get, "put": put}
+
+
+def _centre(b: int, axis: int) -> dict[str, Callable[..., Any]]:
+    cell = _cell("body_ipos", b, axis)
+
+    def put(model: Any, value: float) -> None:
+        cell["put"](model, value)
+        unframe(model, b)
+
+    return {"get": cell["get"], "put": put}
+
+
+def _inertia(model: Any, b: int) -> list[Constant]:
+    """The ten numbers, of a body whose inertia is that of matter."""
+    block, name = BodyInertia(model, b), name_of(model, "body", b)
+    if np.linalg.eigvalsh(block.own)[0] <= 0.0:
+        return []
+    found = []
+    for place, quantity in enumerate(INERTIA):
+
+        def get(model: Any, place: int = place) -> float:
+            return float(block.get(model)[place])
+
+        def put(model: Any, value: float, place: int = place) -> None:
+            values = block.get(model)
+            values[place] = value
+            block.put(model, dict(zip(INERTIA, values.tolist(), strict=True)))
+
+        path, unit = f"body/{name}/inertia/{quantity}", "m" if place > 6 else "1"
+        meaning = f"inertia of {name}, {quantity}"
+        found.append(Constant(path, b, unit, meaning, get, put, block))
+    return found
 
 
 def _length(model: Any, b: int) -> dict[str, Callable[..., Any]]:

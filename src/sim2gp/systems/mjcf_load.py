@@ -2,7 +2,8 @@
 
 A parser that crashes or runs away on somebody's file ends the child and not whoever
 asked. Files that a model names must lie in its own folder or below, or in ``root``.
-A URDF has no actuators: every hinge and slide gets a motor, ``<joint>.motor``.
+A URDF has no actuators: every hinge and slide gets a motor, ``<joint>.motor``
+(`sim2gp.systems.mjcf_child`).
 """
 
 import os
@@ -10,7 +11,7 @@ import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,28 +21,7 @@ SECONDS = 60  # that a model may take to compile
 _BYTES = 50_000_000  # of one file of text
 _NAMED = re.compile(r'<\s*(\w+)[^>]*?\b(?:file|filename)\s*=\s*["\']([^"\']*)["\']')
 _FOLDER = re.compile(r'\b(meshdir|texturedir|assetdir)\s*=\s*["\']([^"\']*)["\']')
-_CHILD = """
-import sys
-try:
-    import resource
-    resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30))
-    resource.setrlimit(resource.RLIMIT_CPU, ({seconds}, {seconds}))
-except ImportError:
-    pass
-import mujoco
-try:
-    spec = mujoco.MjSpec.from_file(sys.argv[1])
-    if sys.argv[1].lower().endswith(".urdf"):
-        for joint in spec.joints:
-            if joint.type in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
-                motor = spec.add_actuator(name=joint.name + ".motor")
-                motor.trntype, motor.target = mujoco.mjtTrn.mjTRN_JOINT, joint.name
-    model = spec.compile()
-except (ValueError, mujoco.FatalError) as error:
-    sys.stderr.write("REFUSED " + str(error))
-    sys.exit(3)
-mujoco.mj_saveModel(model, sys.argv[2])
-"""
+_CHILD = os.path.join(os.path.dirname(__file__), "mjcf_child.py")
 
 
 def compiled(path: Path, root: Path | None = None) -> Any:
@@ -51,31 +31,48 @@ def compiled(path: Path, root: Path | None = None) -> Any:
     it is no model, E171 where it names files outside ``root`` (its own folder) or
     the parser crashed or took more than a minute.
     """
+    check_paths(path, path.parent if root is None else root)
+    return compiled_all([path])[0]
+
+
+def compiled_all(paths: Sequence[Path]) -> list[Any]:
+    """The models of several files whose paths were checked, in one child process."""
     import mujoco
 
-    check_paths(path, path.parent if root is None else root)
     with tempfile.TemporaryDirectory() as folder:
-        binary = os.path.join(folder, "model.mjb")
-        code = _CHILD.format(seconds=SECONDS)
-        command = [sys.executable, "-I", "-c", code, str(path.resolve()), binary]
-        try:
-            done = subprocess.run(
-                command,
-                cwd=folder,  # where MuJoCo leaves its log
-                capture_output=True,
-                text=True,
-                timeout=2 * SECONDS,
-                check=False,
-            )
-        except subprocess.TimeoutExpired:
-            raise _died(path, f"no answer in {2 * SECONDS} s") from None
-        if done.returncode == 3:
-            said = " ".join(done.stderr.split("REFUSED ", 1)[-1].split())
-            raise InputError("E170", "no model", where=str(path), got=said)
-        if done.returncode != 0:
-            last = done.stderr.strip().splitlines()[-1:] or ["no words"]
-            raise _died(path, f"exit {done.returncode}, {last[0]}")
-        return mujoco.MjModel.from_binary_path(binary)
+        made = _made(paths, folder, "mjb")
+        return [mujoco.MjModel.from_binary_path(str(each)) for each in made]
+
+
+def as_mjcf(path: Path) -> str:
+    """A file whose paths were checked as MJCF, in MuJoCo's words and six digits."""
+    with tempfile.TemporaryDirectory() as folder:
+        return _made([path], folder, "xml")[0].read_text(encoding="utf-8")
+
+
+def _made(paths: Sequence[Path], folder: str, form: str) -> list[Path]:
+    """What the child makes of each file."""
+    seconds = SECONDS * len(paths)
+    command = [sys.executable, "-I", _CHILD, str(seconds), folder, form]
+    where = str(paths[0])
+    try:
+        done = subprocess.run(
+            [*command, *(str(path.resolve()) for path in paths)],
+            cwd=folder,  # where MuJoCo leaves its log
+            capture_output=True,
+            text=True,
+            timeout=2 * seconds,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        raise _died(where, f"no answer in {2 * seconds} s") from None
+    if done.returncode == 3:
+        said = " ".join(done.stderr.split("REFUSED ", 1)[-1].split())
+        raise InputError("E170", "no model", where=where, got=said)
+    if done.returncode != 0:
+        last = done.stderr.strip().splitlines()[-1:] or ["no words"]
+        raise _died(where, f"exit {done.returncode}, {last[0]}")
+    return [Path(folder, f"{i}.{form}") for i in range(len(paths))]
 
 
 def check_paths(path: Path, root: Path) -> None:
@@ -125,11 +122,11 @@ def _read(file: Path, model: Path) -> str:
         ) from None
 
 
-def _died(path: Path, got: str) -> InputError:
+def _died(where: str, got: str) -> InputError:
     return InputError(
         "E171",
         "MuJoCo's parser did not come back",
-        where=str(path),
+        where=where,
         got=got,
         expected="a model",
         fix="see whether MuJoCo's own viewer opens it",

@@ -11,11 +11,9 @@ import copy
 import dataclasses
 import math
 import os
-import threading
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -26,141 +24,25 @@ from sim2gp.errors import InputError, missing_extra
 from sim2gp.parameters import Parameter, Parameters
 from sim2gp.systems.actuator import LONGEST_MEAN
 from sim2gp.systems.base import AbstractPlant, Channel
-from sim2gp.systems.external import AbstractSimulator, Differences, flow
+from sim2gp.systems.external import flow
 from sim2gp.systems.mjcf import (
-    DERIVED,
+    OF_INERTIA,
     SIGNED,
     Constant,
     constants_of,
     matching,
     name_of,
 )
-from sim2gp.systems.mjcf_file import rewritten
+from sim2gp.systems.mjcf_file import ModelFile
 from sim2gp.systems.mjcf_load import compiled
+from sim2gp.systems.mujoco_engine import Engine
+from sim2gp.systems.mujoco_mjx import MJXEngine, mjx_flow
 from sim2gp.types import Action, Scalar, State
 
 #: Without a stated prior a constant is within this factor of the model's number.
 FACTOR = 3.0
-#: Fewer steps than these are not worth waking other threads for.
-FEW = 256
-
-
-class Engine(AbstractSimulator):
-    """C MuJoCo with some constants of a model open; the model itself stays as it is."""
-
-    def __init__(
-        self, model: Any, constants: Sequence[Sequence[Constant]], table: Parameters
-    ) -> None:
-        import mujoco
-        from mujoco import rollout
-
-        self.model = model
-        self.constants = tuple(tuple(group) for group in constants)
-        names = [group[0].path for group in self.constants]
-        self.differences = Differences.of(table, names)
-        self._derive = any(c.quantity in DERIVED for g in self.constants for c in g)
-        self._copies: list[Any] = []
-        self._held: list[bytes] = []
-        threads = _cores()
-        self._datas = [mujoco.MjData(model) for _ in range(threads)]
-        self._pool = rollout.Rollout(nthread=threads if threads > 1 else 0)
-        self._alone = rollout.Rollout(nthread=0)
-        self._lock = threading.Lock()  # JAX may call from several programs at once
-
-    def with_values(self, theta: Float[np.ndarray, " p"]) -> Any:
-        """A copy of the model in which the open constants have these values."""
-        import mujoco
-
-        model = copy.copy(self.model)
-        self._set(model, theta, mujoco.MjData(model))
-        return model
-
-    def _set(self, model: Any, theta: Float[np.ndarray, " p"], data: Any) -> None:
-        """All open constants, and what MuJoCo derives of them; ``data`` is scratch."""
-        import mujoco
-
-        for group, value in zip(self.constants, theta, strict=True):
-            for constant in group:
-                constant.put(model, float(value))
-        if self._derive:
-            mujoco.mj_setConst(model, data)
-
-    def flow(
-        self,
-        theta: Float[np.ndarray, "B p"],
-        s: Float[np.ndarray, "B n"],
-        a: Float[np.ndarray, "B m"],
-        h: Float[np.ndarray, " B"],
-    ) -> Float[np.ndarray, "B n"]:
-        out = s.copy()
-        good = np.isfinite(np.concatenate([theta, s, a, h[:, None]], axis=1)).all(1)
-        out[~good] = np.nan
-        values, which = np.unique(theta[good], axis=0, return_inverse=True)
-        index = np.flatnonzero(good)
-        with self._lock:
-            models = self._models(values)
-            for span in np.unique(h[good]):
-                mine = h[index] == span
-                if span > 0.0:
-                    at = index[mine]
-                    chosen = [models[k] for k in which.reshape(-1)[mine]]
-                    out[at] = self._rolled(chosen, models, s[at], a[at], float(span))
-        return out
-
-    def _models(self, values: Float[np.ndarray, "U p"]) -> list[Any]:
-        """A model for each vector of values; copies are used again."""
-        while len(self._copies) < len(values):
-            self._copies.append(copy.copy(self.model))
-            self._held.append(b"")
-        for k, theta in enumerate(values):
-            if self._held[k] == theta.tobytes():
-                continue
-            self._set(self._copies[k], theta, self._datas[0])
-            self._held[k] = theta.tobytes()
-        return self._copies[: len(values)]
-
-    def _rolled(
-        self,
-        chosen: list[Any],
-        models: list[Any],
-        s: Float[np.ndarray, "B n"],
-        a: Float[np.ndarray, "B m"],
-        span: float,
-    ) -> Float[np.ndarray, "B n"]:
-        count = max(1, math.ceil(span / self.model.opt.timestep - 1e-9))
-        for model in models:
-            model.opt.timestep = span / count
-        start = np.concatenate([np.zeros((len(s), 1)), s], axis=1)
-        few = len(s) * count < FEW
-        pool = self._alone if few else self._pool
-        datas = self._datas[:1] if few else self._datas
-        control = np.broadcast_to(a[:, None], (len(a), count, a.shape[1]))
-        with _quiet():
-            out, _ = pool.rollout(chosen, datas, start, np.ascontiguousarray(control))
-        time, state = out[:, -1, 0], out[:, -1, 1:]
-        # Where a state runs away MuJoCo stops, or begins again.
-        stopped = time < span * (1.0 - 1e-6)
-        return np.where(stopped[:, None], np.nan, state)
-
-
-def _cores() -> int:
-    """That this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Without warnings on the terminal and in a file: what ran away is NaN."""
-    import mujoco
-
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda _: None)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(before)
+#: Sd of the ten numbers of an inertia; of its shifts, in radii of gyration.
+SHARE = 0.2
 
 
 class MuJoCo(AbstractPlant):
@@ -180,6 +62,7 @@ class MuJoCo(AbstractPlant):
     """
 
     engine: Engine = eqx.field(static=True)
+    mjx: MJXEngine | None = eqx.field(static=True)
     parameters: Parameters = eqx.field(static=True)
     channels: tuple[Channel, ...] = eqx.field(static=True)
     inputs: tuple[Channel, ...] = eqx.field(static=True)
@@ -194,6 +77,7 @@ class MuJoCo(AbstractPlant):
         *,
         root: Path | None = None,
         source: Path | None = None,
+        engine: Literal["c", "mjx"] = "c",
     ) -> None:
         named = isinstance(model, str | os.PathLike)
         self.source = Path(model) if named else source
@@ -207,6 +91,7 @@ class MuJoCo(AbstractPlant):
         self.channels = _states(model)
         self.inputs = _inputs(model)
         self.engine = Engine(model, groups, self.parameters)
+        self.mjx = MJXEngine(model, groups) if engine == "mjx" else None
 
     @property
     def states(self) -> tuple[Channel, ...]:
@@ -216,18 +101,21 @@ class MuJoCo(AbstractPlant):
     def actions(self) -> tuple[Channel, ...]:
         return self.inputs
 
-    def mjcf(self, values: Mapping[str, float], folder: Path) -> str:
-        """The model's file with these constants, to be kept in ``folder``.
+    def by_path(self, values: Mapping[str, float]) -> dict[str, float]:
+        """Values by name as those of every constant: what is tied has the same."""
+        groups = zip(self.names, self.engine.constants, strict=True)
+        known = ((values[n], group) for n, group in groups if n in values)
+        return {c.path: float(value) for value, group in known for c in group}
 
-        Raises `InputError` E170 where there is no file, or it cannot say them.
+    def file(self, *, mjcf: bool = False) -> ModelFile:
+        """The model's file, to be written with other constants (``mjcf``: as MJCF).
+
+        Raises `InputError` E170 where there is no file.
         """
         if self.source is None:
             fix = "give the path of its file instead of a compiled model"
             raise InputError("E170", "a model without a file", fix=fix)
-        theta = np.asarray([values[name] for name in self.names], float)
-        constants = [c for group in self.engine.constants for c in group]
-        made = self.engine.with_values(theta)
-        return rewritten(self.source, made, constants, folder)
+        return ModelFile(self.source, self.engine.model, mjcf=mjcf)
 
     @property
     def max_substep(self) -> float:
@@ -246,6 +134,8 @@ class MuJoCo(AbstractPlant):
     ) -> State:
         theta = params.astype(s.dtype)
         span = jnp.asarray(h, s.dtype)
+        if self.mjx is not None:
+            return mjx_flow(self.mjx, theta, s, a.astype(s.dtype), span)
         return flow(self.engine, theta, s, a.astype(s.dtype), span)
 
 
@@ -296,12 +186,26 @@ def _groups(
         if paths.count(path) > 1:
             fix = "let one path or pattern name it"
             raise InputError("E145", "a constant named twice", got=path, fix=fix)
+    own = {c.index for group in groups for c in group if c.block is not None}
+    for c in (c for group in groups for c in group):
+        if c.index in own and c.quantity in OF_INERTIA:
+            fix = "open one of the two"
+            got = f"{c.path}, and the body's inertia"
+            raise InputError("E145", "a constant named twice", got=got, fix=fix)
     return groups
 
 
 def default_prior(constant: Constant, model: Any) -> Parameter | None:
-    """Within a factor of the model's own number; None where that is not positive."""
+    """Within a factor of the model's own number; None where that is not positive.
+
+    Of the ten numbers of an inertia, Gaussian about the model's own body.
+    """
     value = constant.get(model)
+    if constant.block is not None:
+        size = constant.block.radius if constant.unit == "m" else 1.0
+        sd = SHARE * size
+        about = constant.path, constant.unit, constant.meaning
+        return Parameter(*about, "identity", mean=0.0, sd=sd, nominal=0.0)
     if value <= 0.0 or constant.quantity in SIGNED:
         return None
     about = constant.path, constant.unit, constant.meaning

@@ -1,0 +1,181 @@
+"""Apply: what a run identified, written back into the model's own file.
+
+The file's text is edited where it says what was learned, and nowhere else; the edited
+text is compiled and compared before anything is kept. Values are the posterior's modes.
+"""
+
+import difflib
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from sim2gp.errors import InputError
+from sim2gp.experiments.identify import PROJECT, project_of
+from sim2gp.project import Project
+from sim2gp.project.project import is_model
+from sim2gp.runs import Progress, load_run
+from sim2gp.runs.store import Run
+from sim2gp.systems import MuJoCo
+from sim2gp.systems.actuator import bare
+from sim2gp.systems.mjcf import matching
+from sim2gp.systems.mjcf_file import Edited, ModelFile
+from sim2gp.systems.mjcf_load import compiled_all
+
+Written = list[tuple[str, bytes]]
+
+
+def run(
+    run: Path,
+    *,
+    out: Path | None,
+    model: Path | None,
+    in_place: bool,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Write the constants of a run into ``out``, or the source ``in_place``, or show.
+
+    ``model`` is another copy of the file than the one that was fitted. Raises
+    `InputError` E130 for a run without a model's constants, E132 where ``out`` exists,
+    E170 where the file cannot say them: then nothing is written.
+    """
+    if out is not None and (in_place or out.exists() or out.is_symlink()):
+        got = "--in-place as well" if in_place else "a file that exists"
+        fix = "name a new file, or leave one of the two out"
+        raise InputError("E132", "output file", where=str(out), got=got, fix=fix)
+    stored = load_run(run)
+    project = _project(run, stored, model)
+    system = bare(project.system)
+    assert isinstance(system, MuJoCo)
+    values, apart = _values(stored, project, system)
+    progress.say(f"editing {system.source}")
+    file = system.file()
+    edited = file.edited(system.by_path(values))
+    with tempfile.TemporaryDirectory() as folder:
+        _written(file, edited, Path(folder, f"model{file.suffix}"))
+    written = _keep(file, edited, out, in_place)
+    return {
+        "command": "apply",
+        "title": f"{run.name}: its constants in {file.source.name}",
+        "model": str(file.source),
+        "written": written,
+        "constants": _table(file, edited),
+        "not_written": apart | edited.unsaid,
+        "diff": _diff(file, edited, out),
+    }
+
+
+def _project(run: Path, stored: Run, model: Path | None) -> Project:
+    """The run's project with the model's file where it stands now."""
+    if "belief/theta" not in stored.arrays or not (run / PROJECT).exists():
+        raise InputError(
+            "E130",
+            "no constants to apply",
+            where=str(run),
+            got=str(stored.summary.get("command", "a run without constants")),
+            expected="the folder of sim2gp identify",
+            fix="run sim2gp identify (again, if an older version made the run)",
+        )
+    project = project_of(run, stored, model)
+    if not is_model(project.spec.system):
+        raise InputError(
+            "E130",
+            "no model's file",
+            where=str(run),
+            got=f"the bundled machine {project.spec.system}",
+            expected="a project whose system is an MJCF or URDF file",
+            fix="copy its constants from summary.json",
+        )
+    return project
+
+
+def _values(
+    stored: Run, project: Project, system: MuJoCo
+) -> tuple[dict[str, float], dict[str, str]]:
+    """The model's constants by name, and why the run's other ones are none."""
+    modes = stored.arrays["belief/theta"]
+    found = dict(zip(stored.summary["parameters"], modes.tolist(), strict=True))
+    values = dict(project.system.parameters.fixed) | found
+    for name in values:
+        if "/" in name and name not in system.names:
+            matching(system.file().constants, name)  # raises with the nearest name
+            raise InputError("E170", "a constant that is not open", got=name)
+    apart = {
+        name: "no constant of the model's file"
+        for name, value in values.items()
+        if name not in system.names and (name in found or value != _neutral(name))
+    }
+    return {k: v for k, v in values.items() if k in system.names}, apart
+
+
+def _neutral(name: str) -> float:
+    """Of an input that arrives as it was sent."""
+    return 1.0 if name.endswith(".gain") else 0.0
+
+
+def _keep(
+    file: ModelFile, edited: Edited, out: Path | None, in_place: bool
+) -> list[str]:
+    """Write what was asked for; names of the files."""
+    if out is not None:
+        return [str(path) for path in _written(file, edited, out)]
+    if not in_place:
+        return []
+    changed = file.replaced(edited)
+    for path, data in changed.items():
+        mode = path.stat().st_mode & 0o777
+        handle, aside = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-")
+        with os.fdopen(handle, "wb") as opened:
+            opened.write(data)
+            opened.flush()
+            os.fsync(opened.fileno())
+        os.chmod(aside, mode)
+        os.replace(aside, path)
+    return [str(path) for path in changed]
+
+
+def _written(file: ModelFile, edited: Edited, out: Path) -> list[Path]:
+    """New files, compiled and compared; none of them is left where that fails."""
+    made: list[Path] = []
+    try:
+        for _, name, data in file.texts(edited, out.name, out.parent):
+            with open(out.parent / name, "xb") as opened:
+                made.append(out.parent / name)
+                opened.write(data)
+        file.check(edited, compiled_all([out])[0])
+    except BaseException:
+        for path in made:
+            path.unlink()
+        raise
+    return made
+
+
+def _table(file: ModelFile, edited: Edited) -> dict[str, dict[str, Any]]:
+    """What each changed constant was and is."""
+    table = {}
+    for path, constant in file.constants.items():
+        was, now = (constant.get(m) for m in (file.model, edited.wanted))
+        if path in edited.said:
+            table[path] = {"was": was, "is": now, "unit": constant.unit}
+    return table
+
+
+def _diff(file: ModelFile, edited: Edited, out: Path | None) -> str:
+    """The changes of every file as a unified diff."""
+    if out is None:
+        changed = file.replaced(edited).items()
+        pairs = [
+            (d, str(d.path), x)
+            for d in file.files.documents
+            for p, x in changed
+            if p == d.path
+        ]
+    else:
+        texts = file.texts(edited, out.name, out.parent)
+        pairs = [(d, str(out.parent / name), x) for d, name, x in texts]
+    lines: list[str] = []
+    for document, name, data in pairs:
+        before, after = (x.decode().splitlines(True) for x in (document.data, data))
+        lines += difflib.unified_diff(before, after, str(document.path), name)
+    ended = (line if line.endswith("\n") else f"{line}\n" for line in lines)
+    return "".join(ended)
