@@ -1,15 +1,24 @@
 """Corrected intervals: closed forms of the linear-Gaussian case, and what must hold."""
 
+import dataclasses
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.signal
 
+from beliefs import believe, named, study
+from linear_system import linear
 from sim2gp.diagnose import intervals
+from sim2gp.diagnose.importance import DRAWS, check_windows
 from sim2gp.diagnose.intervals import Pulls, corrected
 from sim2gp.errors import NotFinite
 from sim2gp.gaussian import Gaussian
+from sim2gp.logs import Log
+from sim2gp.models.cutting import cut
+from sim2gp.models.windows import Windows, WindowsBelief, fit_windows, linearise
 
 W, L, P = 40, 10, 3
 ROWS = W * L
@@ -212,3 +221,87 @@ def test_what_is_not_a_number_is_refused() -> None:
         broken[what][3] = np.nan
         with pytest.raises(NotFinite, match="pulls of windows"):
             corrected(model.prior, plain, Pulls(**broken))
+
+
+def test_a_corrected_posterior_changes_spreads_and_not_the_structure() -> None:
+    """Wider and elsewhere: what is flat is told as before, what is left is not."""
+    table = named("a b c", low=-10.0)
+    visible = np.array([[1.0, 3.0, 0.0], [0.0, 0.0, 1.0]]) * 20.0
+    belief = believe(table, visible, [2.0, 5.0, 0.0])
+    plain = study(*belief)
+    with jax.enable_x64(True):
+        wide = belief[2].scale.at[2].multiply(5.0)
+        other = Gaussian(belief[2].mean + 0.1, wide)
+    found = study(*belief, corrected=other)
+    assert [d["flat"] for d in found["directions"]] == [True, False, False]
+    for key in ("text", "value", "unit"):
+        assert found["base_parameters"][0][key] == plain["base_parameters"][0][key]
+    assert found["directions"][0] == plain["directions"][0]
+    assert "25 % of the prior" in json.dumps(found["directions"])
+    assert "25 % of the prior" not in json.dumps(plain["directions"])
+    a, c = (found["parameters"][name] for name in "ac")
+    assert a["verdict"] == plain["parameters"]["a"]["verdict"] == "traded_off"
+    assert plain["parameters"]["c"]["verdict"] == "identified"
+    assert c["verdict"] == "weak"  # 25 % of the prior's sd is more than 20
+    assert c["widened"] == pytest.approx(5.0, rel=1e-6)
+    assert a["mean"] == pytest.approx(2.1)
+    assert "plain" not in plain["parameters"]["a"]
+    for key, value in c["plain"].items():
+        assert value == pytest.approx(plain["parameters"]["c"][key])
+
+
+@pytest.fixture(scope="module")
+def fitted() -> tuple[Windows, WindowsBelief]:
+    """A machine that is linear in constants and start states, three seconds of it."""
+    rng = np.random.default_rng(20)
+    time = 0.1 * np.arange(31)
+    a = np.repeat(rng.standard_normal((8, 2)), 4, axis=0)[:31]
+    x = np.cumsum(0.1 * a @ [0.7, -0.4]) + 0.02 * rng.standard_normal(31)
+    log = Log(
+        name="log",
+        source="log.csv",
+        time=time,
+        channels={"x0": x},
+        inputs={"a0": a[:, 0], "a1": a[:, 1]},
+        mask={"x0": np.ones(31, bool)},
+    )
+    system = linear(2, 1)
+    windows, _ = cut([log], system, window=0.6)
+    return windows, fit_windows(system, windows, key=jax.random.key(0))
+
+
+def test_pulls_are_those_of_the_dense_marginal(
+    fitted: tuple[Windows, WindowsBelief],
+) -> None:
+    """The start states integrated out: rows of covariance ``I + J_e J_e^T``."""
+    windows, belief = fitted
+    pulls = intervals.pulls_of_windows(belief, windows, np.zeros(len(windows), int))
+    found = linearise(belief, windows, belief.posterior.mean)
+    J = np.asarray(found.jacobian)[:, :, 0] / float(belief.noise[0])
+    r = np.asarray(found.residual)[..., 0] / float(belief.noise[0])
+    e = (np.asarray(belief.starts) - windows.start) / windows.start_sd
+    for w in range(len(windows)):
+        Jz, Je = J[w, :, :2], J[w, :, 2:]
+        weight = np.linalg.inv(np.eye(len(Jz)) + Je @ Je.T)
+        F = pulls.factors[w].T @ pulls.factors[w]
+        np.testing.assert_allclose(F, Jz.T @ weight @ Jz, rtol=1e-7, atol=1e-9)
+        score = Jz.T @ weight @ (r[w] - Je @ e[w])  # of the start at its prior mean
+        np.testing.assert_allclose(pulls.scores[w], score, rtol=1e-7, atol=1e-7)
+    A = np.asarray(belief.information)
+    total = np.einsum("wkp,wkq->pq", pulls.factors, pulls.factors)
+    np.testing.assert_allclose(total, A.T @ A, rtol=1e-9)
+    away = np.asarray(belief.posterior.mean - belief.prior.mean)
+    np.testing.assert_allclose(pulls.scores.sum(axis=0), -away, atol=1e-6)
+
+
+def test_the_exact_posterior_of_a_linear_machine_is_laplaces(
+    fitted: tuple[Windows, WindowsBelief],
+) -> None:
+    windows, belief = fitted
+    found = check_windows(belief, windows, key=jax.random.key(1))
+    assert found.draws == pytest.approx(DRAWS, rel=1e-6)
+    np.testing.assert_allclose(found.shift, 0.0, atol=1e-6)
+    plain = belief.posterior
+    narrow = gaussian(np.asarray(plain.mean), 0.4 * np.asarray(plain.scale))
+    wrong = dataclasses.replace(belief, posterior=narrow)
+    assert check_windows(wrong, windows, key=jax.random.key(1)).k > 0.7

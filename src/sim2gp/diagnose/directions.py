@@ -67,19 +67,20 @@ def _weakly_seen(spec: Spectrum, k: int) -> dict[str, Any]:
     size = np.abs(u)
     order = [j for j in falling(size) if size[j] > _MOSTLY * size.max()]
     move = np.sign(u[order[0]]) * u * spec.prior_sd * spec.slope
-    text = f"{_told(spec, move, order)}: the data hardly tell; {_left(l)}."
+    text = f"{_told(spec, move, order)}: the data hardly tell; {_left(spec, k)}."
     return _direction(text, _ratio(spec, move, order), l)
 
 
 def _fixed(spec: Spectrum, k: int) -> dict[str, Any]:
     l = float(spec.eigenvalues[k])
     what = weighted_sum(combination(spec, k), spec.names)
-    return _direction(f"The data fix {what}: {_left(l)}.", what, l)
+    return _direction(f"The data fix {what}: {_left(spec, k)}.", what, l)
 
 
-def _left(l: float) -> str:
+def _left(spec: Spectrum, k: int) -> str:
     """What the posterior keeps of the prior's sd along a direction."""
-    return f"{digits(100.0 / math.sqrt(1.0 + l), 2)} % of the prior's spread is left"
+    sd = float(np.linalg.norm(spec.directions[:, k] @ spec.whitened()[1]))
+    return f"{digits(100.0 * sd, 2)} % of the prior's spread is left"
 
 
 def _in_prior_sd(spec: Spectrum, move: Float[np.ndarray, " p"], j: int) -> float:

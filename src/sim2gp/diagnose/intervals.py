@@ -35,6 +35,7 @@ Davison 2012, arXiv 0911.5357; (I - P)^-1/2: Bell and McCaffrey 2002.)
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import jax.numpy as jnp
@@ -42,6 +43,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sim2gp.diagnose.misfit import must_be_finite
+from sim2gp.diagnose.words import digits
 from sim2gp.gaussian import Gaussian
 from sim2gp.least_squares import RANK_TOLERANCE
 from sim2gp.models.windows import Windows, WindowsBelief, linearise
@@ -51,6 +53,7 @@ from sim2gp.types import in_float64
 FEWEST = 4.0
 #: Of Bartlett's weights: ``1.5 W / b`` degrees of freedom (Priestley 1981).
 BARTLETT = 1.5
+LIKE_WHITE = 1.3  # times as wide: small samples alone make so much of white noise
 
 
 @dataclass(frozen=True)
@@ -143,6 +146,30 @@ def corrected(prior: Gaussian, plain: Gaussian, pulls: Pulls) -> Corrected:
     scale = np.linalg.solve(T.T, L0.T).T
     found = Gaussian(jnp.asarray(mu0 + L0 @ centre), jnp.asarray(scale))
     return Corrected(found, kappa2, b, nu, True)
+
+
+def words(found: Corrected, widened: Sequence[float], windows: int) -> str:
+    """Which intervals are told and why, in a sentence or two."""
+    if not found.enough:
+        return (
+            f"Intervals count every sample as new: {windows} windows are too few to "
+            "tell whether errors are coloured, and of a real machine they are."
+        )
+    scatter = digits(math.sqrt(found.inflation), 2)
+    if max(widened, default=1.0) < LIKE_WHITE:
+        return (
+            f"The errors of {windows} windows pull the constants {scatter} times as "
+            "far as white noise would: intervals are those of independent samples, "
+            f"times {digits(max(widened, default=1.0), 3)} at most."
+        )
+    few, most = (digits(x, 2) for x in (min(widened), max(widened)))
+    times = few if few == most else f"{few} to {most}"
+    return (
+        f"Intervals are {times} times as wide as if every sample were new: the errors "
+        f"of {windows} windows are coloured and pull the constants {scatter} times as "
+        "far as white noise would. This covers errors that come and go, not physics "
+        "that the model lacks (sim2gp explain)."
+    )
 
 
 def _whitened(
