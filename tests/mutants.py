@@ -18,6 +18,7 @@ from pathlib import Path
 from mutant_descent import DESCENTS
 from mutant_design import DESIGN
 from mutant_exploring import EXPLORING
+from mutant_intervals import INTERVALS
 from mutant_list import MUTANTS as PHYSICS
 from mutant_list import Hunt, Mutant
 from mutant_misfit import MISFIT
@@ -36,6 +37,7 @@ MUTANTS = (
     *DESIGN,
     *OFF_POLICY,
     *ON_THE_HOST,
+    *INTERVALS,
 )
 
 ROOT = Path(__file__).resolve().parents[1]

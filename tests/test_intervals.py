@@ -133,9 +133,14 @@ def test_between_the_plain_and_the_prior() -> None:
     for size in (0.01, 0.05, 0.3):
         model = Linear(smooth(rng, size))
         for rho in (0.0, 0.99):
-            plain, found = model.corrected(model.J @ np.ones(P) + 3.0 * ar1(rng, rho))
+            y = model.J @ np.ones(P) + 3.0 * ar1(rng, rho)
+            plain, found = model.corrected(y)
             assert np.linalg.eigvalsh(found.C - plain.C).min() > -1e-12
             assert np.linalg.eigvalsh(found.C).max() < 1.0 + 1e-12
+            # Data of any weight: the mean follows from the covariance.
+            data = np.linalg.lstsq(model.J.reshape(ROWS, P), y.ravel())[0]
+            want = (np.eye(P) - found.C) @ data
+            np.testing.assert_allclose(found.mean, want, rtol=1e-6, atol=1e-9)
 
 
 def test_what_the_data_do_not_see_stays_the_prior() -> None:
@@ -166,7 +171,7 @@ def test_units_of_the_constants_do_not_matter() -> None:
 
 
 def test_a_scatter_as_expected_is_the_plain_posterior() -> None:
-    """Pulls of independent windows whose variance is Fisher's, for many windows."""
+    """Pulls of independent windows whose variance is Fisher's, of many windows."""
     rng = np.random.default_rng(8)
     model = Linear(np.tile(rng.standard_normal((8, 1, 2)), (400, 1, 1)))
     y = rng.permutation(np.repeat([1.0, -1.0], 1600))[:, None]

@@ -18,6 +18,7 @@ from sim2gp.diagnose.spectrum import Spectrum
 from sim2gp.diagnose.words import digits, falling, quantity, weighted_sum
 
 _MOSTLY = 0.1  # smaller terms of a flat direction are left out of its words
+_FLAT = math.sqrt(0.5 + 1e-9)  # of the prior's sd: as much as data and prior know
 _FAR = 20.0  # times the first move
 
 
@@ -74,13 +75,18 @@ def _weakly_seen(spec: Spectrum, k: int) -> dict[str, Any]:
 def _fixed(spec: Spectrum, k: int) -> dict[str, Any]:
     l = float(spec.eigenvalues[k])
     what = weighted_sum(combination(spec, k), spec.names)
-    return _direction(f"The data fix {what}: {_left(spec, k)}.", what, l)
+    # With corrected spreads the data may know more than the prior and yet leave it open.
+    verb = "fix" if _spread(spec, k) <= _FLAT else "hardly tell"
+    return _direction(f"The data {verb} {what}: {_left(spec, k)}.", what, l)
 
 
 def _left(spec: Spectrum, k: int) -> str:
-    """What the posterior keeps of the prior's sd along a direction."""
-    sd = float(np.linalg.norm(spec.directions[:, k] @ spec.whitened()[1]))
-    return f"{digits(100.0 * sd, 2)} % of the prior's spread is left"
+    """What the posterior keeps of the prior's sd along a direction, in words."""
+    return f"{digits(100.0 * _spread(spec, k), 2)} % of the prior's spread is left"
+
+
+def _spread(spec: Spectrum, k: int) -> float:
+    return float(np.linalg.norm(spec.directions[:, k] @ spec.whitened()[1]))
 
 
 def _in_prior_sd(spec: Spectrum, move: Float[np.ndarray, " p"], j: int) -> float:
