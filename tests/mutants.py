@@ -19,6 +19,7 @@ from mutant_descent import DESCENTS
 from mutant_design import DESIGN
 from mutant_exploring import EXPLORING
 from mutant_interop import INTEROP
+from mutant_intervals import INTERVALS
 from mutant_list import MUTANTS as PHYSICS
 from mutant_list import Hunt, Mutant
 from mutant_logs import LOGS
@@ -40,6 +41,7 @@ MUTANTS = (
     *ON_THE_HOST,
     *LOGS,
     *INTEROP,
+    *INTERVALS,
 )
 
 ROOT = Path(__file__).resolve().parents[1]

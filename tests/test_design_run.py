@@ -76,7 +76,7 @@ def test_after_a_fit(run: Path, tmp_path: Path, capsys) -> None:
     assert "0.2 s ahead" in summary["headline"]
     fit = load_run(run).summary["parameters"]
     for name, entry in summary["expected_sd"].items():
-        assert entry["sd"] == pytest.approx(fit[name]["sd"], rel=1e-6)
+        assert entry["sd"] == pytest.approx(fit[name]["plain"]["sd"], rel=1e-6)
 
 
 def test_what_is_asked_about(tmp_path: Path) -> None:

@@ -61,7 +61,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def run(folder: Path) -> Path:
-    identify.run(project_in(folder), out=folder / "run", seed=0, progress=QUIET)
+    path, out = project_in(folder), folder / "run"
+    identify.run(path, out=out, seed=0, progress=QUIET, check=True)
     return folder / "run"
 
 
@@ -74,6 +75,12 @@ def test_identify_finds_the_constants(run: Path) -> None:
         assert abs(entry["mean"] - nominal[name]) < 4.0 * entry["sd"], name
         for key in ("unit", "prior_mean", "prior_sd", "q025", "q975", "verdict"):
             assert key in entry
+        plain = entry["plain"]
+        assert entry["widened"] == pytest.approx(entry["sd"] / plain["sd"])
+        assert 1.0 - 1e-9 < entry["widened"] < 2.0, name  # the logs' noise is white
+        assert entry["q025"] < plain["q025"] < plain["q975"] < entry["q975"]
+    assert summary["intervals"]["which"] == "corrected"
+    assert summary["intervals"]["freedom"] > 4.0
     for key in ("log_evidence", "directions", "misfit", "n_transitions", "n_rows"):
         assert key in summary
     assert summary["n_rows"] == 1300
@@ -87,9 +94,37 @@ def test_identify_finds_the_constants(run: Path) -> None:
     assert summary["project"] == {"file": "machine.toml", "folder": ".."}
 
 
+def test_identify_checks_laplace_against_the_exact_posterior(run: Path) -> None:
+    summary = load_run(run).summary
+    check = summary["check"]
+    assert check["verdict"] == "fine"
+    assert check["k"] < 0.5
+    assert check["draws"] > 100
+    for entry in check["constants"].values():
+        assert abs(entry["shift"]) < 0.2
+        assert entry["sd_ratio"] == pytest.approx(1.0, abs=0.15)
+    assert summary["command_line"].endswith("--check")
+
+
+def test_belief_and_intervals_are_both_kept(run: Path) -> None:
+    """Draws of the table are those of its intervals; the belief stays Laplace's."""
+    stored = load_run(run)
+    x, entries = stored.arrays, stored.summary["parameters"]
+    plain = np.linalg.norm(x["belief/scale"], axis=1)
+    wide = np.linalg.norm(x["intervals/scale"], axis=1)
+    assert np.all(wide > plain)
+    ratio = [entry["widened"] for entry in entries.values()]
+    np.testing.assert_allclose(wide / plain, ratio, rtol=0.02)
+    sd = [entry["sd"] for entry in entries.values()]
+    np.testing.assert_allclose(x["parameters/samples"].std(axis=0), sd, rtol=0.1)
+
+
 def test_identify_writes_a_report_with_traces(run: Path) -> None:
     text = (run / "report.html").read_text()
     assert 'id="traces"' in text
+    assert text.count('<span class="why">plain: ') == len(FREE)
+    assert "Gaussian is fine (Pareto k" in text
+    assert "white noise would" in text
     assert "nan" not in text.lower().replace("nanos", "")
     arrays = load_run(run).arrays
     assert np.isnan(arrays["trace/log1/time"]).any()  # gaps between windows

@@ -118,6 +118,8 @@ class Identify(Writes):
     """The project file (TOML)."""
     seed: int = 0
     """Draws the starts of the fit."""
+    check: bool = False
+    """Hold the posterior against the exact one (Pareto k); takes as long again."""
 
     def run(self, progress: Progress) -> dict[str, Any]:
         out = _out(self.out, self.project.stem)
@@ -126,6 +128,7 @@ class Identify(Writes):
             self.project,
             out=out,
             seed=self.seed,
+            check=self.check,
             progress=progress,
         )
 

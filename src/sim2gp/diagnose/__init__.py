@@ -23,7 +23,7 @@ from sim2gp.diagnose.conflicts import prior_conflicts
 from sim2gp.diagnose.directions import directions
 from sim2gp.diagnose.misfit import Misfit, misfit
 from sim2gp.diagnose.spectrum import FisherAt, Spectrum, constrained, spectrum
-from sim2gp.diagnose.table import parameter_table
+from sim2gp.diagnose.table import add_plain, parameter_table
 from sim2gp.gaussian import Gaussian
 from sim2gp.parameters import Parameters
 from sim2gp.types import Key, in_float64
@@ -51,16 +51,24 @@ def summary(
     information: Float[Array, "r p"],
     *,
     fisher_at: FisherAt | None = None,
+    corrected: Gaussian | None = None,
 ) -> dict[str, Any]:
     """What summary.json says about the parameters, in physical units and in words.
 
     ``information`` is the factor ``A`` at the MAP; ``fisher_at(tt)`` the same factor at
     another virtual vector, which tells combinations that hold everywhere from those
-    that hold at the MAP only ("locally").
+    that hold at the MAP only ("locally"). With a ``corrected`` posterior
+    (`diagnose.intervals`) all sd and intervals are its own, each constant has those of
+    the plain ``posterior`` under ``plain`` and is ``widened`` so many times; what is
+    flat or traded off follows from the Fisher information as ever.
     """
-    spec = spectrum(parameters, prior, posterior, information)
+    known = posterior if corrected is None else corrected
+    spec = spectrum(parameters, prior, known, information, at=posterior.mean)
+    table = parameter_table(spec)
+    if corrected is not None:
+        add_plain(table, parameters, posterior)
     return {
-        "parameters": parameter_table(spec),
+        "parameters": table,
         "rank": spec.rank,
         "directions": directions(spec),
         "base_parameters": base_parameters(spec, fisher_at),

@@ -18,6 +18,7 @@ from sim2gp.diagnose.spectrum import Spectrum
 from sim2gp.diagnose.words import digits, falling, quantity, weighted_sum
 
 _MOSTLY = 0.1  # smaller terms of a flat direction are left out of its words
+_FLAT = math.sqrt(0.5 + 1e-9)  # of the prior's sd: as much as data and prior know
 _FAR = 20.0  # times the first move
 
 
@@ -67,19 +68,25 @@ def _weakly_seen(spec: Spectrum, k: int) -> dict[str, Any]:
     size = np.abs(u)
     order = [j for j in falling(size) if size[j] > _MOSTLY * size.max()]
     move = np.sign(u[order[0]]) * u * spec.prior_sd * spec.slope
-    text = f"{_told(spec, move, order)}: the data hardly tell; {_left(l)}."
+    text = f"{_told(spec, move, order)}: the data hardly tell; {_left(spec, k)}."
     return _direction(text, _ratio(spec, move, order), l)
 
 
 def _fixed(spec: Spectrum, k: int) -> dict[str, Any]:
     l = float(spec.eigenvalues[k])
     what = weighted_sum(combination(spec, k), spec.names)
-    return _direction(f"The data fix {what}: {_left(l)}.", what, l)
+    # With corrected spreads the data may know more than the prior and yet leave it open.
+    verb = "fix" if _spread(spec, k) <= _FLAT else "hardly tell"
+    return _direction(f"The data {verb} {what}: {_left(spec, k)}.", what, l)
 
 
-def _left(l: float) -> str:
-    """What the posterior keeps of the prior's sd along a direction."""
-    return f"{digits(100.0 / math.sqrt(1.0 + l), 2)} % of the prior's spread is left"
+def _left(spec: Spectrum, k: int) -> str:
+    """What the posterior keeps of the prior's sd along a direction, in words."""
+    return f"{digits(100.0 * _spread(spec, k), 2)} % of the prior's spread is left"
+
+
+def _spread(spec: Spectrum, k: int) -> float:
+    return float(np.linalg.norm(spec.directions[:, k] @ spec.whitened()[1]))
 
 
 def _in_prior_sd(spec: Spectrum, move: Float[np.ndarray, " p"], j: int) -> float:

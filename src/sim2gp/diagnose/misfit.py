@@ -108,7 +108,7 @@ def misfit(
     named = {"residuals": (r,), "Jacobian": (J, own), "inputs": (x, extra)}
     for what, arrays in named.items():
         for A in arrays:
-            _must_be_finite(what, A)
+            must_be_finite(what, A, "the misfit tests")
     x, extra = _standardised(x, used), _standardised(extra, used)
     names = list(channels) or [f"channel {c + 1}" for c in range(d)]
 
@@ -374,13 +374,14 @@ def _grouped_basis(own: Columns, run: Int[np.ndarray, " N"]) -> tuple[Columns, i
     return basis, rank
 
 
-def _must_be_finite(what: str, A: np.ndarray) -> None:
+def must_be_finite(what: str, A: np.ndarray, where: str) -> None:
+    """Raise E203 where an entry is not a number."""
     bad = int(np.sum(~np.isfinite(A)))
     if bad:
         raise NotFinite(
             "E203",
             f"{what} that are not numbers",
-            where="the misfit tests",
+            where=where,
             got=f"{bad} of {A.size}",
             fix="mask the rows, or look for the state at which the simulation fails",
         )

@@ -89,7 +89,7 @@ def _ljung_box(Q: float, alarm: bool, about: Mapping[str, object]) -> str:
         return (
             f"The residuals of {about['channel']} are correlated from row to row "
             f"({about['first']:.2f} between neighbours): each row says less than it is "
-            f"counted for, and the intervals are {'too narrow' if alike else 'wrong'}"
+            f"counted for, and plain intervals are {'too narrow' if alike else 'wrong'}"
         )
     return f"The residuals are not correlated over {about['lags']} rows"
 
@@ -142,8 +142,8 @@ def verdict(tests: Mapping[str, Finding], count: int, rows: str) -> str:
         times = digits(math.sqrt(split.statistic / max(split.freedom, 1)), 2)
         halves = f", about {times} times going by two halves" if split.alarm else ""
         return (
-            f"{first}: something is missing from the model, and the intervals are too "
-            f"narrow{halves}; try `sim2gp explain`."
+            f"{first}: something is missing from the model, and plain intervals are "
+            f"too narrow{halves}; try `sim2gp explain`."
         )
     few = count < FEW
     return f"Nothing in {count} {rows} contradicts the model. " + (

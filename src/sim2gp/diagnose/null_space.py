@@ -94,7 +94,7 @@ class Reduced(eqx.Module):
 
 def blocks(spec: Spectrum, fisher_at: FisherAt | None = None) -> list[Block]:
     """The live parameters that structurally null directions touch, block by block."""
-    points = [_point(spec, spec.mean, spec.factor, spec.dead)]
+    points = [_point(spec, spec.at, spec.factor, spec.dead)]
     k = points[0].null.shape[1]
     if k == 0:
         return []
@@ -179,7 +179,7 @@ def _elsewhere(spec: Spectrum, fisher_at: FisherAt, k: int) -> list[Point]:
     normal = np.random.default_rng(0).standard_normal((_POINTS, len(spec.mean)))
     points = []
     for eps in normal:
-        tt = spec.mean + _SPREAD * spec.prior_scale @ eps
+        tt = spec.at + _SPREAD * spec.prior_scale @ eps
         A = np.asarray(fisher_at(jnp.asarray(tt, float)))
         if not np.all(np.isfinite(A)):
             continue

@@ -40,7 +40,8 @@ class Spectrum(eqx.Module):
     prior_mean: Float[np.ndarray, " p"]  # virtual, as all but `theta` and `slope`
     prior_scale: Float[np.ndarray, "p p"]
     prior_sd: Float[np.ndarray, " p"]
-    mean: Float[np.ndarray, " p"]  # the MAP
+    at: Float[np.ndarray, " p"]  # the MAP, where all is linearised
+    mean: Float[np.ndarray, " p"]  # of what is known, as `scale` and `sd`
     scale: Float[np.ndarray, "p k"]
     sd: Float[np.ndarray, " p"]
     theta: Float[np.ndarray, " p"]  # physical MAP
@@ -87,15 +88,20 @@ def spectrum(
     prior: Gaussian,
     posterior: Gaussian,
     information: Float[Array, "r p"],
+    *,
+    at: Float[Array, " p"] | None = None,
 ) -> Spectrum:
-    """Decompose the information factor; the prior's scale must be square."""
+    """Decompose the information factor; the prior's scale must be square.
+
+    ``at`` is the MAP, where it is not the posterior's mean.
+    """
     A, L0 = np.asarray(information), np.asarray(prior.scale)
     p = len(parameters)
     s, V = _right_singular(A)
     # A direction has no sign: let what it measures start with plus.
     weights = np.linalg.solve(L0.T, V) * np.sqrt(np.sum(L0**2, axis=1))[:, None]
     V = V * np.where(_largest(weights) < 0.0, -1.0, 1.0)
-    tt = np.asarray(posterior.mean)
+    tt = np.asarray(posterior.mean if at is None else at)
     theta, slope = physical(parameters, tt)
     return Spectrum(
         parameters,
@@ -103,6 +109,7 @@ def spectrum(
         L0,
         np.sqrt(np.sum(L0**2, axis=1)),
         tt,
+        np.asarray(posterior.mean),
         np.asarray(posterior.scale),
         np.asarray(posterior.sd()),
         theta,

@@ -23,6 +23,7 @@ from jaxtyping import Float
 from sim2gp.diagnose.conflicts import conflict_of
 from sim2gp.diagnose.spectrum import DOMINATED, IDENTIFIED, Spectrum, constrained
 from sim2gp.diagnose.words import digits, falling, finite_or_none, listed, quantity
+from sim2gp.gaussian import Gaussian
 from sim2gp.parameters import Parameters
 from sim2gp.types import in_float64
 
@@ -56,6 +57,18 @@ def parameter_table(spec: Spectrum) -> dict[str, dict[str, Any]]:
         if partners:
             entries[p.name]["partners"] = list(partners)
     return entries
+
+
+def add_plain(
+    entries: dict[str, dict[str, Any]], parameters: Parameters, posterior: Gaussian
+) -> None:
+    """Beside corrected intervals those of the posterior that counts every sample."""
+    mean, sd = np.asarray(posterior.mean), np.asarray(posterior.scale)
+    moments = physical_moments(parameters, mean, np.linalg.norm(sd, axis=1))
+    for j, entry in enumerate(entries.values()):
+        entry["plain"] = {key: float(values[j]) for key, values in moments.items()}
+        sd_before = entry["plain"]["sd"]
+        entry["widened"] = entry["sd"] / sd_before if sd_before > 0.0 else None
 
 
 @in_float64
@@ -93,7 +106,7 @@ def verdicts(spec: Spectrum) -> list[tuple[str, tuple[str, ...]]]:
         partners = _partners(spec, P, j)
         if spec.dead[j]:
             out.append(("dead", ()))
-        elif p.map in ("box", "log_box") and abs(spec.mean[j]) > BOUND:
+        elif p.map in ("box", "log_box") and abs(spec.at[j]) > BOUND:
             out.append(("at_bound", ()))
         elif P[j, j] > SHARE and partners:
             out.append(("traded_off", partners))
@@ -121,7 +134,7 @@ def _note(spec: Spectrum, j: int, verdict: str, partners: tuple[str, ...]) -> st
     if verdict == "dead":
         text = "the data do not depend on it: what is shown is the prior"
     elif verdict == "at_bound":
-        end, bound = ("upper", p.high) if spec.mean[j] > 0 else ("lower", p.low)
+        end, bound = ("upper", p.high) if spec.at[j] > 0 else ("lower", p.low)
         text = f"pressed against its {end} bound of {quantity(bound, p.unit)}"
         if abs(spec.prior_mean[j]) > BOUND:
             text += ", where its prior already put it"

@@ -4,6 +4,7 @@ The run keeps what a later command needs to predict with it: the project file, t
 posterior over virtual values, and what the band of its forecasts is made of.
 """
 
+import math
 import os
 import time
 from collections.abc import Sequence
@@ -16,6 +17,9 @@ import numpy as np
 from jaxtyping import Array
 
 from sim2gp import diagnose
+from sim2gp.diagnose import intervals
+from sim2gp.diagnose.importance import check_windows
+from sim2gp.diagnose.intervals import Corrected, corrected, pulls_of_windows
 from sim2gp.diagnose.residuals import misfit_of_windows
 from sim2gp.errors import InputError
 from sim2gp.experiments.prediction import (
@@ -49,13 +53,18 @@ from sim2gp.types import in_float64
 PROJECT = "project.toml"  # the file's name in a run
 
 
-def run(project: Path, *, out: Path, seed: int, progress: Progress) -> dict[str, Any]:
-    """Fit the logs of a project file and write the run; returns its summary."""
+def run(
+    project: Path, *, out: Path, seed: int, progress: Progress, check: bool = False
+) -> dict[str, Any]:
+    """Fit the logs of a project file and write the run; returns its summary.
+
+    ``check`` holds Laplace's posterior against the exact one by importance sampling.
+    """
     started = time.perf_counter()
     found = load_project(project)
     logs = load(found)
     with new_run(out, "identify") as writer, progress.task("identify", 4) as task:
-        windows, _ = cut_logs(found, logs)
+        windows, of = cut_logs(found, logs)
         task.advance(f"{len(windows)} windows")
         key = jax.random.key(seed)
         robust = found.spec.likelihood.robust
@@ -67,11 +76,19 @@ def run(project: Path, *, out: Path, seed: int, progress: Progress) -> dict[str,
         band = band_of(belief, grid, logs)
         names = channels(found.system, windows)
         picture = drawn(found.system, belief.posterior, band, grid)
-        arrays = _stored(belief, band, seed)
+        honest = corrected(
+            belief.prior, belief.posterior, pulls_of_windows(belief, windows, of)
+        )
+        arrays = _stored(belief, honest.posterior, band, seed)
         arrays |= trace_arrays(picture, grid, logs, names)
         task.advance("forecasts")
-        summary = _summarise(found, logs, windows, belief, band, seed)
+        summary = _summarise(found, logs, windows, belief, honest, band, seed)
         line = f"sim2gp identify {project} --seed {seed}"
+        if check:
+            key = jax.random.fold_in(jax.random.key(seed), 2)
+            exact = check_windows(belief, windows, key=key)
+            summary["check"] = exact.as_dict(found.system.parameters.names)
+            line += " --check"
         folder = Path(os.path.abspath(project)).parent
         summary["project"] = {
             "file": project.name,
@@ -95,7 +112,9 @@ def band_of(belief: WindowsBelief, grid: Grid, logs: Sequence[Log]) -> Band:
     return fit_band(found, grid, len(set(recordings(logs))))
 
 
-def _stored(belief: WindowsBelief, band: Band, seed: int) -> dict[str, np.ndarray]:
+def _stored(
+    belief: WindowsBelief, honest: Gaussian, band: Band, seed: int
+) -> dict[str, np.ndarray]:
     table = belief.system.parameters
     key = jax.random.fold_in(jax.random.key(seed), 1)
     return {
@@ -107,13 +126,15 @@ def _stored(belief: WindowsBelief, band: Band, seed: int) -> dict[str, np.ndarra
         "belief/information": np.asarray(belief.information),
         "belief/noise": np.asarray(belief.noise),
         "belief/weights": np.asarray(belief.weights),
+        "intervals/mean": np.asarray(honest.mean),
+        "intervals/scale": np.asarray(honest.scale),
         "band/start_sd": band.start_sd,
         "band/input_sd": band.input_sd,
         "band/resolution": band.resolution,
         "band/rows": band.rows,
         "band/shape": band.shape,
         "band/inflation": np.asarray(band.inflation),
-        **diagnose.arrays(table, belief.prior, belief.posterior, key=key),
+        **diagnose.arrays(table, belief.prior, honest, key=key),
     }
 
 
@@ -203,6 +224,7 @@ def _summarise(
     logs: Sequence[Log],
     windows: Windows,
     belief: WindowsBelief,
+    honest: Corrected,
     band: Band,
     seed: int,
 ) -> dict[str, Any]:
@@ -214,6 +236,7 @@ def _summarise(
         belief.posterior,
         belief.information,
         fisher_at=information_at(belief, windows),
+        corrected=honest.posterior,
     )
     noise = dict(zip(names, np.asarray(belief.noise).tolist(), strict=True))
     rows = sum(len(log) for log in logs)
@@ -225,6 +248,7 @@ def _summarise(
         "seed": seed,
         "converged": True,
         "noise": noise,
+        "intervals": _about(honest, found["parameters"], len(windows)),
         "misfit": {
             **misfit_of_windows(belief, windows).as_dict(),
             "noise": _noise_words(names, noise, windows, units(system)),
@@ -244,6 +268,20 @@ def _summarise(
         "trace_note": "Forecasts of half a second from causal starts, of the logs that "
         "were fitted; they know the recorded inputs and nothing else of the future.",
         **found,
+    }
+
+
+def _about(
+    honest: Corrected, parameters: dict[str, dict[str, Any]], windows: int
+) -> dict[str, Any]:
+    """Which intervals the parameters have, and what they rest on."""
+    widened = [entry["widened"] or 1.0 for entry in parameters.values()]
+    return {
+        "which": "corrected" if honest.enough else "plain",
+        "text": intervals.words(honest, widened, windows),
+        "pulls_times_white": math.sqrt(honest.inflation) if honest.enough else None,
+        "windows_at_once": honest.lag,
+        "freedom": honest.freedom,
     }
 
 
@@ -277,8 +315,8 @@ def _noise_words(
         out.append(
             f"The noise of {name}, {noise[name]:.2g} {unit[name]}, is {times:.0f} "
             "times the rounding of its sensor: the rest is error of the start and of "
-            "the model, which is not independent from sample to sample, so that the "
-            "posterior may be narrower than it should be."
+            "the model, which is not independent from sample to sample: the plain "
+            "posterior, which takes it for that, is narrower than it should be."
             if times > 3.0
             else f"The noise of {name}, {noise[name]:.2g} {unit[name]}, is that of "
             "its sensor's rounding: these windows show no other error."

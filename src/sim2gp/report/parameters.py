@@ -56,6 +56,16 @@ def _remaining(entry: Mapping[str, Any]) -> Raw:
     return Raw(f'<span class="bar"><i style="width:{width}"></i></span>{text}')
 
 
+def _interval(entry: Mapping[str, Any]) -> Raw:
+    """The run's interval; below it the plain one, where that is another."""
+    text = esc(interval(entry.get("q025"), entry.get("q975")))
+    plain = entry.get("plain")
+    if not isinstance(plain, Mapping):
+        return Raw(text)
+    below = esc(interval(plain.get("q025"), plain.get("q975")))
+    return Raw(f'{text}<span class="why">plain: {below}</span>')
+
+
 def _row(name: str, entry: Mapping[str, Any], truth: bool) -> list[object]:
     verdict = entry.get("verdict")
     why = entry.get("note") or VERDICTS.get(str(verdict), ("", ""))[1]
@@ -66,7 +76,7 @@ def _row(name: str, entry: Mapping[str, Any], truth: bool) -> list[object]:
         unit_text(entry.get("unit")) or "1",
         plus_minus(entry.get("prior_mean"), entry.get("prior_sd")),
         plus_minus(entry.get("mean"), entry.get("sd")),
-        interval(entry.get("q025"), entry.get("q975")),
+        _interval(entry),
         _remaining(entry),
     ]
     if truth:
@@ -96,8 +106,24 @@ def parameter_table(summary: Summary) -> Raw:
             "prior's.",
             "soft",
         ),
+        _why(summary.get("intervals")),
+        _checked(summary.get("check")),
         table(columns, rows, words=(0, 1, last)),
     )
+
+
+def _why(about: object) -> Raw:
+    """Which intervals these are."""
+    if not isinstance(about, Mapping) or not about.get("text"):
+        return Raw("")
+    return paragraph(about["text"])
+
+
+def _checked(check: object) -> Raw:
+    """What importance sampling said of the posterior, where it was asked."""
+    if not isinstance(check, Mapping) or not check.get("text"):
+        return Raw("")
+    return paragraph(check["text"])
 
 
 def _area(axes: svg.Axes, draws: np.ndarray, axis: densities.View, css: str) -> str:

@@ -1,0 +1,196 @@
+"""Do 95 % intervals hold? Coverage under coloured noise and under missing friction.
+
+    python benchmarks/intervals.py [--sets N] [--workers N] [--out DIR]
+
+Ten seconds of a hidden two-link arm (`interval_arms.py`) are fitted with the likelihood
+of `sim2gp identify`; masses and dampings are unknown. Beside the plain intervals
+(Laplace) and the library's stand what it was chosen from (`interval_candidates.py`) and
+an oracle that knows what is wrong: the noise's true covariance, or a simulator with the
+missing term. Coverage with its 95 % interval (Clopper-Pearson), the mean interval score
+(Gneiting and Raftery 2007; lower is better) over the oracle's, and the median width
+over the plain one's. Finished cells are not computed again.
+"""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import interval_candidates as candidates
+import jax
+import numpy as np
+from interval_arms import CONDITIONS, NAMES, NOISE, recordings, with_friction
+from scipy.stats import beta
+
+from sim2gp.diagnose.intervals import corrected, pulls_of_windows
+from sim2gp.models.cutting import cut
+from sim2gp.models.windows import fit_windows
+from sim2gp.runs.cells import Cells
+from sim2gp.runs.workers import cores, spread
+from sim2gp.systems import UniformRodArm
+from sim2gp.types import in_float64
+
+WINDOW = 0.2  # s, the default of a project file
+CHUNK = 20  # sets of a cell
+METHODS = {
+    "plain": "plain (Laplace)",
+    "corrected": "sim2gp",
+    "clusters": "sandwich, windows as clusters",
+    "mixture": "fitted covariance",
+    "five_parts": "five parts",
+    "oracle": "oracle",
+}
+ASKED = {"white": (0.92, 0.98)}  # of the others:
+ASKED_ELSE, ASKED_SCORE = (0.90, 0.99), 1.5
+Z = 1.959963984540054
+
+
+class Job(NamedTuple):
+    condition: str
+    chunk: int
+    out: Path
+
+
+@in_float64
+def work(job: Job) -> dict[str, Any]:
+    """Errors and sd of every method, in prior sd: (sets, 2, constants)."""
+    condition = CONDITIONS[job.condition]
+    data = recordings(condition, CHUNK, job.chunk)
+    system, key = UniformRodArm(), jax.random.key(job.chunk)
+    prior_sd = np.asarray(system.parameters.prior().sd())
+    found: dict[str, list[Any]] = {name: [] for name in METHODS}
+    for s in range(CHUNK):
+        windows, of = cut([data.log(s)], system, window=WINDOW)
+        belief = fit_windows(system, windows, key=key)
+        pulls = pulls_of_windows(belief, windows, np.asarray([k for k, _ in of]))
+        x = candidates.linear(belief, windows, pulls)
+        mine = corrected(belief.prior, belief.posterior, pulls).posterior
+        each = {
+            "plain": (x.z, np.asarray(belief.posterior.sd()) / prior_sd),
+            "corrected": (np.asarray(mine.mean) / prior_sd, mine.sd() / prior_sd),
+            "clusters": candidates.clusters(x),
+            "mixture": candidates.mixture(x),
+            "five_parts": candidates.five_parts(x),
+        }
+        if condition.friction:
+            knows = with_friction()
+            again, _ = cut([data.log(s)], knows, window=WINDOW)
+            best = fit_windows(knows, again, key=key).posterior
+            each["oracle"] = tuple(
+                np.asarray(v)[: len(NAMES)] / prior_sd for v in (best.mean, best.sd())
+            )
+        else:
+            each["oracle"] = candidates.oracle(x, condition.rho, NOISE)
+        for name, (centre, sd) in each.items():
+            error = np.asarray(centre) - data.truth[s] / prior_sd
+            found[name].append([_rounded(error), _rounded(np.asarray(sd))])
+    return found
+
+
+def _rounded(x: np.ndarray) -> list[float]:
+    return [float(f"{v:.4g}") for v in x]
+
+
+def table(found: dict[str, np.ndarray]) -> dict[str, Any]:
+    """Figures of one condition: of every method, an entry per constant."""
+    scores = {name: _score(*np.moveaxis(v, 1, 0)) for name, v in found.items()}
+    out: dict[str, Any] = {}
+    for name, values in found.items():
+        error, sd = values[:, 0], values[:, 1]
+        inside = np.abs(error) <= Z * sd
+        ratio = scores[name].mean(axis=0) / scores["oracle"].mean(axis=0)
+        width = np.median(sd / found["plain"][:, 1], axis=0)
+        rms = np.sqrt(np.mean(error**2, axis=0))
+        best = np.sqrt(np.mean(found["oracle"][:, 0] ** 2, axis=0))
+        out[name] = {
+            constant: {
+                "coverage": float(inside[:, j].mean()),
+                "between": _binomial(int(inside[:, j].sum()), len(inside)),
+                "score": float(ratio[j]),
+                "width": float(width[j]),
+                "error": float(rms[j] / best[j]),
+                "sd": float(np.median(sd[:, j])),
+            }
+            for j, constant in enumerate(NAMES)
+        }
+    return out
+
+
+def _score(error: np.ndarray, sd: np.ndarray) -> np.ndarray:
+    """Interval score of 95 % intervals: width, and 40 times what is outside."""
+    return 2.0 * Z * sd + 40.0 * np.maximum(np.abs(error) - Z * sd, 0.0)
+
+
+def _binomial(k: int, n: int) -> list[float]:
+    low = float(beta.ppf(0.025, k, n - k + 1)) if k else 0.0
+    high = float(beta.ppf(0.975, k + 1, n - k)) if k < n else 1.0
+    return [low, high]
+
+
+def lines(summary: dict[str, Any]) -> list[str]:
+    """The table that docs/intervals.md shows, and the goals."""
+    out = []
+    for name, entry in summary["conditions"].items():
+        out += ["", f"{entry['title']} ({summary['sets']} sets)"]
+        titles = "".join(f"{c:^27s}" for c in NAMES)
+        out.append(f"{'':30s}{titles}")
+        head = f"{'coverage':>14s}{'width':>6s}{'score':>6s} "
+        out.append(f"{'':30s}{head * len(NAMES)}")
+        for method, title in METHODS.items():
+            row = f"{title:30s}"
+            for c in entry["methods"][method].values():
+                low, high = c["between"]
+                row += f"{c['coverage']:.3f} {low:.2f}-{high:.2f}"
+                row += f"{c['width']:6.2f}{c['score']:6.2f} "
+            out.append(row)
+        out.append(_goal(name, entry["methods"]["corrected"]))
+    return out
+
+
+def _goal(condition: str, mine: dict[str, Any]) -> str:
+    """Masses only where friction is missing: a damping must make up for it."""
+    low, high = ASKED.get(condition, ASKED_ELSE)
+    asked = [c for c in NAMES if c[0] == "m" or not condition.startswith("friction")]
+    inside = all(low <= mine[c]["coverage"] <= high for c in asked)
+    worst = max(mine[c]["score"] for c in asked)
+    return (
+        f"coverage of {', '.join(asked)} in [{low}, {high}]: "
+        f"{'holds' if inside else 'does not hold'}; score at most {ASKED_SCORE} times "
+        f"the oracle's: {'holds' if worst <= ASKED_SCORE else 'does not hold'} "
+        f"({worst:.2f})"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--sets", type=int, default=200)
+    parser.add_argument("--workers", type=int, default=cores())
+    parser.add_argument("--out", type=Path, default=Path("results/intervals"))
+    options = parser.parse_args()
+    chunks = -(-options.sets // CHUNK)
+    cells, arguments = Cells(options.out), {"window": WINDOW, "sets": CHUNK}
+    groups, found = [], {}
+    for name in CONDITIONS:
+        jobs = [Job(name, k, options.out) for k in range(chunks)]
+        done = {j: cells.load(f"{name}_{j.chunk}", arguments) for j in jobs}
+        found |= {j: v for j, v in done.items() if v is not None}
+        groups.append([j for j in jobs if done[j] is None])
+    for job, values in spread(work, groups, options.workers):
+        found[job] = cells.save(f"{job.condition}_{job.chunk}", arguments, values)
+        print(f"{len(found)}/{chunks * len(CONDITIONS)}", end="\r", file=sys.stderr)
+    summary: dict[str, Any] = {"sets": chunks * CHUNK, "conditions": {}}
+    for name, condition in CONDITIONS.items():
+        parts = [found[Job(name, k, options.out)] for k in range(chunks)]
+        joined = {m: np.concatenate([p[m] for p in parts]) for m in METHODS}
+        about = {"title": condition.title, "methods": table(joined)}
+        summary["conditions"][name] = about
+    text = "\n".join(lines(summary))
+    print(text)
+    options.out.mkdir(parents=True, exist_ok=True)
+    (options.out / "table.txt").write_text(text.lstrip() + "\n")
+    (options.out / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

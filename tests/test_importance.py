@@ -1,0 +1,100 @@
+"""Pareto-smoothed importance sampling against closed forms."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import genpareto, norm
+from scipy.stats import t as student
+
+from sim2gp.diagnose.importance import DRAWS, Checked, checked, pareto, smoothed
+
+
+@pytest.mark.parametrize("k", [-0.3, 0.0, 0.4, 0.9])
+def test_the_shape_of_a_tail_is_found(k: float) -> None:
+    """Quantiles of the law itself; the estimate is drawn to .5 by ten values."""
+    n = 4000
+    x = genpareto.ppf((np.arange(n) + 0.5) / n, k, scale=3.0)
+    got, scale = pareto(x)
+    assert got == pytest.approx((n * k + 5.0) / (n + 10.0), abs=0.01)
+    assert scale == pytest.approx(3.0, rel=0.02)
+
+
+def test_few_values_are_drawn_to_one_half() -> None:
+    x = genpareto.ppf((np.arange(10) + 0.5) / 10, -0.5)
+    assert -0.5 < pareto(x)[0] < 0.5
+
+
+def test_the_right_gaussian_has_equal_weights() -> None:
+    draws = np.random.default_rng(0).standard_normal((DRAWS, 2))
+    found = checked(np.full(DRAWS, 7.0), draws)
+    assert found.verdict == "fine"
+    assert found.k == -math.inf
+    assert found.draws == pytest.approx(DRAWS)
+    np.testing.assert_allclose(found.shift, 0.0, atol=1e-12)
+    np.testing.assert_allclose(found.ratio, 1.0)
+    assert found.as_dict(("a", "b"))["k"] is None
+    assert "all weights alike, 256" in found.words(("a", "b"))
+
+
+def test_weights_of_a_known_tail() -> None:
+    """``p(w > x) ~ x^-1/k``."""
+    for k in (0.3, 0.6, 1.0):
+        w = (1.0 - (np.arange(4000) + 0.5) / 4000) ** -k
+        assert smoothed(np.log(w))[1] == pytest.approx(k, abs=0.04)
+
+
+def test_moments_of_another_gaussian() -> None:
+    """A posterior moved by .3 sd and .8 as wide: inside what the draws reach."""
+    x = norm.ppf((np.arange(4000) + 0.5) / 4000)
+    log_weights = norm.logpdf(x, 0.3, 0.8) - norm.logpdf(x)
+    found = checked(log_weights + 50.0, x[:, None])
+    assert found.k < 0.5
+    assert found.verdict == "fine"
+    assert found.shift[0] == pytest.approx(0.3, abs=0.01)
+    assert found.ratio[0] == pytest.approx(0.8, abs=0.01)
+
+
+def test_a_posterior_with_heavier_tails_is_not_trusted() -> None:
+    """Student's t with two degrees of freedom: the ratio to a Gaussian has no mean."""
+    x = np.random.default_rng(1).standard_normal((DRAWS, 1))
+    wide = 3.0 * x  # draws of q = N(0, 1) of a posterior three times as wide
+    found = checked(norm.logpdf(x[:, 0], 0.0, 3.0) - norm.logpdf(x[:, 0]), x)
+    assert found.k > 0.7
+    assert found.verdict == "not to be trusted"
+    right = checked(student.logpdf(wide[:, 0], 30) - norm.logpdf(x[:, 0]), x)
+    assert right.k > checked(np.zeros(DRAWS), x).k
+
+
+def test_a_gaussian_that_is_too_wide_is_strained() -> None:
+    """As along a curved ridge: light tails, and another spread."""
+    x = np.random.default_rng(2).standard_normal((DRAWS, 2))
+    found = checked(norm.logpdf(x[:, 0], 0.0, 0.4) - norm.logpdf(x[:, 0]), x)
+    assert found.k < 0.5
+    assert found.verdict == "strained"
+    assert found.far().tolist() == [True, False]
+    assert "it differs in a (mean by" in found.words(("a", "b"))
+
+
+def test_a_draw_that_fails_has_no_weight() -> None:
+    x = np.random.default_rng(3).standard_normal((DRAWS, 1))
+    log_weights = np.zeros(DRAWS)
+    log_weights[x[:, 0] > 1.0] = np.nan
+    found = checked(log_weights, x)
+    assert found.shift[0] < -0.1
+    nothing = checked(np.full(DRAWS, np.nan), x)
+    assert nothing.verdict == "not to be trusted"
+    assert nothing.as_dict(("a",))["constants"]["a"] == {
+        "shift": None,
+        "sd_ratio": None,
+    }
+    assert "too few to say" in nothing.words(("a",))
+
+
+@pytest.mark.parametrize(
+    ("k", "verdict"),
+    [(0.2, "fine"), (0.6, "strained"), (0.8, "not to be trusted"),
+     (math.inf, "not to be trusted"), (math.nan, "not to be trusted")],
+)  # fmt: skip
+def test_words_follow_the_shape(k: float, verdict: str) -> None:
+    assert Checked(k, 200.0, np.zeros(1), np.ones(1)).verdict == verdict
