@@ -12,6 +12,7 @@ from machines import against, close
 from sim2gp import systems as sy
 from sim2gp.errors import InputError
 from sim2gp.parameters import Parameter
+from sim2gp.systems import actuator
 from test_systems import cartpole_forces, furuta_forces
 
 pytestmark = pytest.mark.usefixtures("float64")
@@ -92,6 +93,27 @@ def test_an_encoders_offset_moves_the_machine_not_its_equations(machine, joint):
         p = machines.params_at(bare, tt)
         got = system.ode(system.with_effects(p), s, a)
         close(got, bare.ode(p, s.at[joint].add(0.2), a))
+
+
+def test_zeroed_is_the_effect_of_an_offset_on_any_machine():
+    """Two ways to the same: the whole flow shifted, and the equations."""
+    bare = sy.Furuta()
+    offset = Parameter("alpha.encoder", "rad", "", "identity", mean=0.0, sd=0.1)
+    system = sy.Zeroed(bare, {"alpha": offset, "theta": -0.3})
+    assert system.parameters.names == (*bare.parameters.names, "alpha.encoder")
+    effects = [sy.EncoderOffset("alpha", 0.2), sy.EncoderOffset("theta", -0.3)]
+    other = sy.Perturbed(bare, effects)
+    values = bare.parameters.nominal()
+    values |= {"alpha.encoder": 0.2, "theta.encoder": -0.3}
+    params = system.record({k: jnp.asarray(v, float) for k, v in values.items()})
+    s, a = jnp.array([0.4, 1.1, -2.0, 5.0]), jnp.array([3.0])
+    known = other.with_effects(bare.nominal())
+    close(system.flow(params, s, a, 0.002), other.flow(known, s, a, 0.002))
+    assert actuator.bare(sy.Actuated(system)) is bare
+    with pytest.raises(InputError, match="E145 encoder of"):
+        sy.Zeroed(bare, {"alpha.velocity": 0.1})
+    with pytest.raises(InputError, match=r"E103.*did you mean alpha"):
+        sy.Zeroed(bare, {"alfa": 0.1})
 
 
 def test_friction_formulas():

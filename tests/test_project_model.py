@@ -94,8 +94,8 @@ def test_without_mujoco_the_extra_is_named(tmp_path: Path, monkeypatch) -> None:
 
 def test_without_parameters_all_usual_ones_are_open(tmp_path: Path) -> None:
     names = load_project(project(tmp_path, "")).system.parameters.names
-    assert {n.split("/")[-1] for n in names} == {"damping", "mass", "gain"}
-    assert len(names) == 5
+    assert {n.split("/")[-1] for n in names} == {"damping", "mass"}
+    assert len(names) == 4
 
 
 @pytest.mark.parametrize(
@@ -105,13 +105,27 @@ def test_without_parameters_all_usual_ones_are_open(tmp_path: Path) -> None:
         ('[parameters."joint/*/frictionloss"]\ntie = true', "E160.*line 3"),
         ('[parameters."joint/*/stiffness"]\nrelative_sd = 0.1', "E160.*relative_sd"),
         ("[options]\ngravity = 9.8", "E160 unknown option.*line 4.*root"),
-        ("[effects.shoulder.spring]\nmean = 0.0\nsd = 1.0", "E160 unknown table"),
+        (
+            "[effects.shoulder.spring]\nmean = 0.0\nsd = 1.0",
+            "E160 unknown effect.*encoder",
+        ),
+        ("[effects.wrist.encoder]\nsd = 0.1", "E103 unknown channel.*line 3"),
         ("[limits]\nwrist = [0.0, 1.0]", "E160 unknown channel.*line 4"),
     ],
 )
 def test_faults_name_their_line(tmp_path: Path, text: str, fault: str) -> None:
     with pytest.raises(InputError, match=fault):
         load_project(project(tmp_path, "\n" + text))
+
+
+def test_an_encoder_of_a_model_may_be_off(tmp_path: Path) -> None:
+    text = "[effects.elbow.encoder]\nmean = 0.0\nsd = 0.2\n"
+    text += "[effects.shoulder]\nencoder = 0.1"
+    system = load_project(project(tmp_path, text)).system
+    table = system.parameters
+    p = table["elbow.encoder"]
+    assert (p.mean, p.sd, p.unit) == (0.0, 0.2, "rad")
+    assert dict(table.fixed)["shoulder.encoder"] == 0.1
 
 
 def test_a_tie_is_for_files(tmp_path: Path) -> None:

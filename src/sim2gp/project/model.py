@@ -18,8 +18,10 @@ from sim2gp.project.priors import located, prior
 from sim2gp.project.schema import PriorSpec, ProjectSpec
 from sim2gp.project.source import Source
 from sim2gp.systems import AbstractSystem, MuJoCo
+from sim2gp.systems.base import AbstractPlant
 from sim2gp.systems.mjcf import Constant, constants_of, matching
 from sim2gp.systems.mujoco import default_prior, loaded
+from sim2gp.systems.zeros import Zeroed, offset_prior
 
 
 def build_model(
@@ -29,9 +31,6 @@ def build_model(
 
     Raises `InputError` E130 to E172.
     """
-    if spec.effects:
-        line = source.where("effects")
-        raise unknown("table", "effects", (), line)
     path = folder / spec.system if other is None else other
     root = _root(spec, source, folder)
     try:
@@ -54,10 +53,26 @@ def build_model(
             groups.append([c.path for c in group])
             priors[group[0].path] = _prior(stated, group[0], model, where)
     try:
-        system = MuJoCo(model, groups or None, priors, source=path)
+        system: AbstractPlant = MuJoCo(model, groups or None, priors, source=path)
     except InputError as error:
         raise located(error, source.where("parameters")) from error
-    return actuated(system, spec.actuators, source)
+    return actuated(_zeroed(system, spec, source), spec.actuators, source)
+
+
+def _zeroed(system: AbstractPlant, spec: ProjectSpec, source: Source) -> AbstractPlant:
+    """The machine behind encoders with offsets, the one effect that a model has."""
+    offsets: dict[str, Parameter | float] = {}
+    for joint, kinds in spec.effects.items():
+        for what, said in kinds.items():
+            line = source.where("effects", joint, what)
+            if what != "encoder":
+                raise unknown("effect", what, ("encoder",), line)
+            try:
+                base = offset_prior(system, joint)
+            except InputError as error:
+                raise located(error, line) from error
+            offsets[joint] = prior(said, base, line)
+    return Zeroed(system, offsets) if offsets else system
 
 
 def _root(spec: ProjectSpec, source: Source, folder: Path) -> Path | None:

@@ -48,6 +48,7 @@ from sim2gp.systems.two_link import (
     UniformRodArm,
     UniformRodParams,
 )
+from sim2gp.systems.zeros import Zeroed
 
 __all__ = [
     "ODE",
@@ -92,6 +93,7 @@ __all__ = [
     "TwoLinkParams",
     "UniformRodArm",
     "UniformRodParams",
+    "Zeroed",
     "actuator_prior",
     "catalogue",
     "delayed_means",

@@ -49,12 +49,13 @@ class MuJoCo(AbstractPlant):
     """A MuJoCo model whose constants are named by path (`sim2gp.systems.mjcf`).
 
     Its joints are the states, ``<joint>`` and ``<joint>.velocity``, then activations of
-    actuators; its actuators are the inputs. ``constants`` are paths or patterns, all
-    with a non-zero value in the model where it is None. Those in one inner sequence are
-    tied: one number, under the first one's name. Priors are within a factor of 3 of the
-    model's number; ``priors`` replaces them by name, or fixes the constant. ``root`` is
-    the folder that the model's files must lie in, its own if None; ``source`` the file
-    that a compiled model was made of.
+    actuators; its actuators are the inputs. ``constants`` are paths or patterns; where
+    it is None, dampings, armatures, dry frictions, masses and gains of servos that are
+    not zero in the model. Those in one inner sequence are tied: one number, under the
+    first one's name. Priors are within a factor of 3 of the model's number; ``priors``
+    replaces them by name, or fixes the constant. ``root`` is the folder that the
+    model's files must lie in, its own if None; ``source`` the file that a compiled
+    model was made of.
 
     Raises `InputError` E130, E170 and E171 for a file that is no model, E170 for what
     the model does not have, E142 for a constant that is zero in the model and has no
@@ -172,7 +173,8 @@ def _groups(
 ) -> list[list[Constant]]:
     """The open constants; each inner list is one number."""
     if constants is None:
-        usual = ("damping", "armature", "frictionloss", "mass", "gain", "kp", "kv")
+        # No motor's gain: where it is free, so is the scale of all masses and forces.
+        usual = ("damping", "armature", "frictionloss", "mass", "kp", "kv")
         found = [c for c in known.values() if c.quantity in usual]
         return [[c] for c in found if c.get(model) != 0.0]
     groups: list[list[Constant]] = []
