@@ -190,6 +190,13 @@ LOGS = (
         ("test_bad_formats.py", "grows"),
     ),
     Mutant(
+        "parquet: the first column that pyarrow brings is the one",
+        PARQUET,
+        "table.column(name)",
+        "table.column(0)",
+        ("test_formats.py", "with_dots"),
+    ),
+    Mutant(
         "parquet: checksums are not looked at",
         PARQUET,
         "page_checksum_verification=True",

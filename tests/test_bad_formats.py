@@ -6,6 +6,7 @@ import os
 import struct
 import subprocess
 import sys
+import warnings
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -133,6 +134,15 @@ def test_pickles_are_not_opened(suffix: str, tmp_path: Path) -> None:
     assert line_of(path).startswith("E180 pickle refused")
 
 
+def test_an_archive_with_one_name_twice(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    np.savez(path, **GOOD)
+    with zipfile.ZipFile(path, "a") as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        file.writestr("q.npy", header((0,)))
+    assert line_of(path).startswith("E104 column q stands twice")
+
+
 def test_transposed_tables(tmp_path: Path) -> None:
     path, names = tmp_path / "a.npz", ("x[0]", "x[1]", "u")
     np.savez(path, time=T, x=TABLE[:, 1:3].T, u=U)
@@ -198,6 +208,9 @@ def test_bad_parquet(tmp_path: Path) -> None:
     for column, pattern in columns.values():
         with pytest.raises(InputError, match=pattern):
             raise_of(parquet(path, q=column))
+    twice = pa.table([T, Q, Q], names=["time", "q", "q"])
+    pq.write_table(twice, path)
+    assert line_of(path).startswith("E104 column q stands twice")
     ragged = pa.array([[1.0, 2.0]] + [[1.0]] * 119)
     line = line_of(parquet(path, q=ragged), names=("q[0]", "dq", "u"))
     assert line.startswith("E140 lists of different lengths")

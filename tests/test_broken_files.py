@@ -23,8 +23,9 @@ WRITTEN: dict[str, Callable[[Path], Any]] = {
 }
 
 
+@pytest.mark.parametrize("rounds", [12, pytest.param(400, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("name", WRITTEN)
-def test_no_bytes_break_a_reader(name: str, tmp_path: Path) -> None:
+def test_no_bytes_break_a_reader(name: str, rounds: int, tmp_path: Path) -> None:
     """Cut off and with bytes changed: columns or one line, never anything else."""
     path = tmp_path / name
     WRITTEN[name](path)
@@ -34,7 +35,7 @@ def test_no_bytes_break_a_reader(name: str, tmp_path: Path) -> None:
     whole = path.read_bytes()
     rng = np.random.default_rng(len(name))
     spoilt = [whole[: int(share * len(whole))] for share in (0.02, 0.3, 0.9, 0.999)]
-    for _ in range(12):
+    for _ in range(rounds):
         changed = bytearray(whole)
         for place in rng.integers(16, len(whole), 4):
             changed[place] ^= int(rng.integers(1, 256))

@@ -144,6 +144,34 @@ def test_a_bag_without_definitions(folder: Path, tmp_path: Path) -> None:
         read(tmp_path / "bag", JOINT)
 
 
+def test_fields_of_any_message_by_path(tmp_path: Path) -> None:
+    from rosbags.rosbag2 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    make = store.types
+    stamp = make["builtin_interfaces/msg/Time"](12, 34)
+    header = make["std_msgs/msg/Header"](stamp=stamp, frame_id="base")
+    vector, nine = make["geometry_msgs/msg/Vector3"], np.arange(9.0)
+    turn = make["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+    rate, pull = vector(1.0, 2.0, 3.0), vector(4.0, 5.0, 6.0)
+    imu = make["sensor_msgs/msg/Imu"](header, turn, nine, rate, nine, pull, nine)
+    pixels = np.zeros(3000, dtype=np.uint8)
+    picture = make["sensor_msgs/msg/CompressedImage"](header, "jpeg", pixels)
+    state = make["std_msgs/msg/Float64"](7.5)
+    with Writer(tmp_path / "bag", version=9) as writer:
+        for topic, said in (("/imu", imu), ("/camera", picture), ("/level", state)):
+            kind = said.__msgtype__
+            connection = writer.add_connection(topic, kind, typestore=store)
+            writer.write(connection, 10**9, store.serialize_cdr(said, kind))
+    found = {name: float(v[0]) for name, v in columns_of(tmp_path / "bag").items()}
+    assert found["/imu/angular_velocity/z"] == 3.0
+    assert found["/imu/linear_acceleration/x"] == 4.0
+    assert found["/imu/linear_acceleration_covariance[8]"] == 8.0
+    assert found["/level/data"] == 7.5
+    assert not [name for name in found if "header" in name or "camera" in name]
+
+
 def test_nanoseconds_keep_their_digits(tmp_path: Path) -> None:
     """Stamps since 1970 in float64 are 256 ns apart: the start goes first."""
     now = rec.START + rec.stamps()
@@ -168,6 +196,18 @@ def test_arrays_by_columns_and_of_other_byte_orders(tmp_path: Path) -> None:
     assert state.flags.f_contiguous
     np.savez(path, time=ONE[:, 0].astype(">f8"), q=state, u=ONE[:, 3])
     (log,) = read(path, names)
+    assert_same(log, ONE)
+
+
+def test_names_with_dots_are_whole_names(tmp_path: Path) -> None:
+    """Asked for "arm.u", pyarrow brings the record "arm" along, and first."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    columns = {"arm": pa.array([{"u": 0.0}] * 400), "time": ONE[:, 0]}
+    columns |= {"arm.q": pa.array(ONE[:, 1:3].tolist()), "arm.u": ONE[:, 3]}
+    pq.write_table(pa.table(columns), tmp_path / "a.parquet")
+    (log,) = read(tmp_path / "a.parquet", ("arm.q[0]", "arm.q[1]", "arm.u"))
     assert_same(log, ONE)
 
 

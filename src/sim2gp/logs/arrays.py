@@ -112,6 +112,20 @@ def missing(
     )
 
 
+def distinct(names: Sequence[str], source: str) -> None:
+    """Each column is named once (E104)."""
+    twice = next((n for i, n in enumerate(names) if n in names[:i]), None)
+    if twice is not None:
+        raise InputError(
+            "E104",
+            f"column {twice} stands twice",
+            where=source,
+            got=f"{names.count(twice)} of this name",
+            expected="each name once",
+            fix="rename one of them",
+        )
+
+
 def _check_kind(entry: Entry, name: str, source: str) -> None:
     """Real numbers with digits enough, in rows and columns (E121, E123, E124, E140)."""
     where, kind = f"{source}:column {name}", entry.dtype.kind

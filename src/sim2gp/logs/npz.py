@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Shaped
 
 from sim2gp.errors import InputError
-from sim2gp.logs.arrays import Entry, table_of
+from sim2gp.logs.arrays import Entry, distinct, table_of
 from sim2gp.logs.file import check_declared, pickled, readable, shown, steady
 from sim2gp.logs.table import Table
 
@@ -30,6 +30,7 @@ def read_npz(path: Path, wanted: Sequence[str] | None, time: str | None) -> Tabl
     ):
         members = [_checked(info, where) for info in archive.infolist()]
         names = [info.filename.removesuffix(".npy") for info in members]
+        distinct(names, where)
         entries = {
             name: _entry(archive, info, size, f"{where}:array {name}")
             for name, info in zip(names, members, strict=True)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Shaped
 
 from sim2gp.errors import InputError
-from sim2gp.logs.arrays import Entry, table_of
+from sim2gp.logs.arrays import Entry, distinct, table_of
 from sim2gp.logs.file import MAGIC, check_declared, library, readable, shown, steady
 from sim2gp.logs.table import Table
 
@@ -36,6 +36,7 @@ def read_parquet(
         with parquet.ParquetFile(path, page_checksum_verification=True) as file:
             rows = file.metadata.num_rows
             check_declared(8 * rows, size, where, "rows")
+            distinct(file.schema_arrow.names, where)
             entries = {
                 field.name: _entry(file, field, where, (labels or {}).get(field.name))
                 for field in file.schema_arrow
@@ -71,7 +72,7 @@ def _entry(file: Any, field: Any, where: str, labels: Sequence[str] | None) -> E
     if not any(test(kind) for test in lists):
         return Entry((rows,), _dtype(kind), values)
     first = next(file.iter_batches(1, columns=[name]), None)
-    lead = first.column(0)[0].as_py() if first is not None and len(first) else None
+    lead = first.column(name)[0].as_py() if first is not None and len(first) else None
     shape = (rows, len(lead or ()))
     names = tuple(labels or ())
     if len(names) != shape[1]:
@@ -114,7 +115,7 @@ def _column(file: Any, name: str, where: str) -> Shaped[np.ndarray, "..."]:
                 expected="pages as they were written",
                 fix="copy the file again, or record it again",
             ) from error
-        parts.append(table.column(0))
+        parts.append(table.column(name))  # dotted names may bring others
     chunks = [chunk for part in parts for chunk in part.chunks if len(chunk)]
     return np.concatenate([_array(chunk, name, where) for chunk in chunks])
 
