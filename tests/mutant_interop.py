@@ -92,6 +92,27 @@ INTEROP = (
         ("test_black_box.py", "when_the_system"),
     ),
     Mutant(
+        "black box: a fault amid an episode is JAX's",
+        "flight.py",
+        "@of_callbacks()\ndef episode(",
+        "def episode(",
+        ("test_black_box.py", "amid_an_episode"),
+    ),
+    Mutant(
+        "black box: a fault amid training is JAX's",
+        "loops.py",
+        "@of_callbacks()\ndef posterior_sampling(",
+        "def posterior_sampling(",
+        ("test_black_box.py", "amid_an_episode"),
+    ),
+    Mutant(
+        "black box: a fault amid a fit is JAX's",
+        "types.py",
+        "with jax.enable_x64(True), of_callbacks():",
+        "with jax.enable_x64(True):",
+        ("test_black_box.py", "later_fault"),
+    ),
+    Mutant(
         "sinks: NaN is left out without a word",
         SINKS,
         "if lost:",
