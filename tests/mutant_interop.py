@@ -38,8 +38,8 @@ INTEROP = (
     Mutant(
         "gymnasium: a vector begins the same episode again",
         VECTOR,
-        "np.asarray(now.episode) + again",
-        "np.asarray(now.episode)",
+        "self.episode = self.episode + again.astype(np.int32)",
+        "pass",
         ("test_gymnasium.py", "vector"),
     ),
     Mutant(
@@ -60,7 +60,7 @@ INTEROP = (
         "gymnasium: a vector clocks what began anew",
         VECTOR,
         "np.where(again, 0, np.asarray(now.step) + 1)",
-        "np.asarray(now.step) + 1",
+        "(np.asarray(now.step) + 1)",
         ("test_gymnasium.py", "vector"),
     ),
     Mutant(
@@ -90,6 +90,27 @@ INTEROP = (
         "np.array_equal(one, two, equal_nan=True)",
         "np.array_equal(one, one, equal_nan=True)",
         ("test_black_box.py", "when_the_system"),
+    ),
+    Mutant(
+        "black box: a fault amid an episode is JAX's",
+        "flight.py",
+        "@of_callbacks()\ndef episode(",
+        "def episode(",
+        ("test_black_box.py", "amid_an_episode"),
+    ),
+    Mutant(
+        "black box: a fault amid training is JAX's",
+        "loops.py",
+        "@of_callbacks()\ndef posterior_sampling(",
+        "def posterior_sampling(",
+        ("test_black_box.py", "amid_an_episode"),
+    ),
+    Mutant(
+        "black box: a fault amid a fit is JAX's",
+        "types.py",
+        "with jax.enable_x64(True), of_callbacks():",
+        "with jax.enable_x64(True):",
+        ("test_black_box.py", "later_fault"),
     ),
     Mutant(
         "sinks: NaN is left out without a word",

@@ -2,16 +2,21 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from sim2gp.errors import InputError
+from sim2gp.flight import episode, oracle_world
+from sim2gp.loops import psrl
 from sim2gp.models import Sim2GP
 from sim2gp.parameters import Parameter, Parameters
+from sim2gp.planning import AbstractPlanner
 from sim2gp.robot.export import export_model
 from sim2gp.systems import ODE, BlackBox, Channel
+from sim2gp.tasks import furuta_swingup
 from sim2gp.transitions import Transitions
 from sim2gp.types import in_float64
 
@@ -210,6 +215,37 @@ def test_a_later_fault_ends_a_fit_as_one_line() -> None:
     assert caught.value.code == "E173"
     assert "\n" not in str(caught.value)
     assert str(caught.value).count("E173") == 1
+
+
+class Broken(AbstractPlanner):
+    """Says what JAX says of a program that called back in vain."""
+
+    said: str = eqx.field(static=True)
+
+    def init(self, world: Any, *, key: Any) -> Any:
+        raise RuntimeError(self.said)
+
+    def prepare(self, state: Any, world: Any, data: Any, *, key: Any) -> Any:
+        raise RuntimeError(self.said)
+
+    def act(self, state: Any, world: Any, s: Any, *, key: Any) -> Any:
+        raise RuntimeError(self.said)
+
+    def failed(self, state: Any) -> Any:
+        return jnp.asarray(False)
+
+
+def test_a_fault_amid_an_episode_is_one_line_too() -> None:
+    """Of a draw that is planned in, or trained in; what is not ours passes."""
+    task = furuta_swingup()
+    world, model = oracle_world(task), Sim2GP(EXACT, dt=DT)
+    ours = Broken("A traceback:\n  a line\nInputError: E173 told.")
+    with pytest.raises(InputError, match=r"^E173 told\.$"):
+        episode(task, ours, (), world, key=KEY)
+    with pytest.raises(InputError, match=r"^E173 told\.$"):
+        psrl(task, model, ours, episodes=1, key=KEY)
+    with pytest.raises(RuntimeError, match="InputError: nothing"):
+        episode(task, Broken("InputError: nothing"), (), world, key=KEY)
 
 
 def test_names_are_given_once() -> None:

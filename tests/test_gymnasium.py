@@ -175,10 +175,10 @@ def test_one_vectors_end_is_not_the_others(shares: np.ndarray) -> None:
     np.testing.assert_allclose(seen[1], before[1], atol=0.2)
     assert (reward[0], ended.tolist()) == (0.0, [False, False])
     assert info["_input"].tolist() == [False, True]
-    now = both.unwrapped.now
+    now = both.unwrapped.fleet.now
     assert (now.episode.tolist(), now.step.tolist()) == ([2, 1], [0, t + 1])
     seen, _ = both.reset()
-    assert both.unwrapped.now.episode.tolist() == [3, 2]
+    assert both.unwrapped.fleet.now.episode.tolist() == [3, 2]
     assert seen in both.observation_space
     with pytest.raises(InputError, match="E140"):
         both.reset(seed=[1, 2, 3])

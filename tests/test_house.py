@@ -232,6 +232,7 @@ def test_every_module_imports_without_extras() -> None:
     """An extra that is not installed breaks its own feature, never an import."""
     names = [module_name(path) for path in MODULES if path.stem != "__main__"]
     extras = ["mujoco", "gymnasium", "h5py", "pyarrow", "beartype", "hypothesis"]
+    extras += ["tensorboardX", "wandb"]
     block = f"import sys\nfor name in {extras}: sys.modules[name] = None\n"
     run_python(block + "".join(f"import {name}\n" for name in names))
 

@@ -97,7 +97,7 @@ def _kind() -> Any:
 
         def __init__(self, made: Hidden) -> None:
             self.made = made
-            self.task = made.task(jax.random.key(0))
+            self.task = made.published()
             self.bound = bound_of(self.task, made.machine)
             m = self.task.actions.low.size
             self.action_space = Box(-1.0, 1.0, (m,), np.float32)
@@ -148,15 +148,19 @@ class Hidden:
     params: Mapping[str, float]
     effects: tuple[AbstractEffect | InputDelay, ...]
 
+    def published(self) -> Task:
+        """The machine before anything is drawn."""
+        make, preset = MACHINES[self.machine]
+        values = make().parameters.nominal()
+        return preset(values | dict(self.params), self.effects)
+
     def task(self, key: Key) -> Task:
         """The machine that a key draws."""
+        if self.truth == PUBLISHED:
+            return self.published()
         make, preset = MACHINES[self.machine]
-        system = make()
-        values = system.parameters.nominal()
-        if self.truth != PUBLISHED:
-            drawing = key_for(key, 0, Purpose.TRUTH)
-            values = vars(draw_truth(system, drawing, self.truth))
-        return preset(dict(values) | dict(self.params), self.effects)
+        drawn = draw_truth(make(), key_for(key, 0, Purpose.TRUTH), self.truth)
+        return preset(vars(drawn) | dict(self.params), self.effects)
 
 
 def hidden(

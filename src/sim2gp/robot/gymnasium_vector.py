@@ -91,6 +91,58 @@ def stepped(tasks: Task, bound: AnyArray, keys: Array, now: Batch, U: AnyArray) 
     return jax.vmap(one)(arrays, keys, now.state, now.episode, now.step, U)
 
 
+class Fleet:
+    """The machines and where they are, without Gymnasium."""
+
+    def __init__(self, made: Hidden, count: int, longest: int) -> None:
+        self.made, self.count = made, count
+        self.task = made.published()
+        self.bound = bound_of(self.task, made.machine)
+        self.longest = min(longest, self.task.horizon)
+        self.each: list[Task] = [self.task] * count
+        self.keys: list[Key | None] = [None] * count
+        self.episode: Int[np.ndarray, " N"] = np.zeros(count, np.int32)
+        self.over: Bool[np.ndarray, " N"] = np.zeros(count, bool)
+        self.now: Batch | None = None
+
+    def reset(
+        self, seeds: Sequence[int | None], rng: np.random.Generator
+    ) -> np.ndarray:
+        """The next episodes; the first of its machine where there is a seed."""
+        for i, given in enumerate(seeds):
+            if given is None and self.keys[i] is not None:
+                continue
+            key = key_of(int(rng.integers(SEEDS)) if given is None else given)
+            self.keys[i], self.each[i] = key, self.made.task(key)
+            self.episode[i] = 0
+        self.episode = self.episode + np.int32(1)
+        self.tasks = stacked(self.each)
+        self.key = jnp.stack([key for key in self.keys if key is not None])
+        state, seen = begun(self.tasks, self.bound, self.key, self.episode)
+        self.now = Batch(state, self.episode, np.zeros(self.count, np.int32))
+        self.over = np.zeros(self.count, bool)
+        return np.array(seen)
+
+    def step(self, now: Batch, U: np.ndarray) -> Any:
+        """One period of each; its start anew where an episode was over."""
+        again = self.over
+        met = stepped(self.tasks, self.bound, self.key, now, U)
+        state, seen = met.state, met.observation
+        self.episode = self.episode + again.astype(np.int32)
+        step = np.where(again, 0, np.asarray(now.step) + 1).astype(np.int32)
+        if again.any():
+            fresh = begun(self.tasks, self.bound, self.key, self.episode)
+            state, seen = (
+                jnp.where(again[:, None], new, old)
+                for new, old in zip(fresh, (state, seen), strict=True)
+            )
+        self.now = Batch(state, self.episode, step)
+        ended = np.asarray(met.outside) & ~again
+        late = (step == self.longest) & ~again
+        self.over = ended | late
+        return told(met, np.array(seen), again, ended, late)
+
+
 @functools.cache
 def _kind() -> Any:
     """The one class of vectors of environments."""
@@ -110,20 +162,13 @@ def _kind() -> Any:
         render_mode = None
 
         def __init__(self, made: Hidden, count: int, longest: int) -> None:
-            self.made, self.num_envs = made, count
-            task = made.task(jax.random.key(0))
-            self.longest = min(longest, task.horizon)
-            self.bound = bound_of(task, made.machine)
-            self.each: list[Task] = [task] * count
-            self.keys: list[Key | None] = [None] * count
-            self.now: Batch | None = None
-            self.over: Bool[np.ndarray, " N"] = np.zeros(count, bool)
-            box = Box(-1.0, 1.0, task.actions.low.shape, np.float32)
-            self.single_action_space = box
-            seen = Box(-self.bound, self.bound, dtype=np.float32)
-            self.single_observation_space = seen
-            self.action_space = batch_space(box, count)
-            self.observation_space = batch_space(seen, count)
+            self.fleet = Fleet(made, count, longest)
+            self.num_envs = count
+            m, bound = self.fleet.task.actions.low.size, self.fleet.bound
+            self.single_action_space = Box(-1.0, 1.0, (m,), np.float32)
+            self.single_observation_space = Box(-bound, bound, dtype=np.float32)
+            self.action_space = batch_space(self.single_action_space, count)
+            self.observation_space = batch_space(self.single_observation_space, count)
 
         def reset(
             self,
@@ -136,56 +181,31 @@ def _kind() -> Any:
             if options:
                 got = ", ".join(map(str, options))
                 raise InputError("E145", "unknown option of reset", got=got)
-            before = np.zeros(self.num_envs, np.int32)
-            if self.now is not None:
-                before = np.array(self.now.episode)
-            for i, given in enumerate(self.seeds(seed)):
-                if given is None and self.keys[i] is not None:
-                    continue
-                if given is None:
-                    given = int(self.np_random.integers(SEEDS))
-                key = key_of(given)
-                self.keys[i], self.each[i], before[i] = key, self.made.task(key), 0
-            self.tasks = stacked(self.each)
-            self.key = jnp.stack([key for key in self.keys if key is not None])
-            state, seen = begun(self.tasks, self.bound, self.key, before + 1)
-            self.now = Batch(state, before + 1, np.zeros_like(before))
-            self.over = np.zeros(self.num_envs, bool)
-            return np.array(seen), {"status": np.full(self.num_envs, "running", object)}
-
-        def seeds(self, seed: Any) -> list[int | None]:
-            """One for each environment (E140 for another number of them)."""
-            if seed is None or isinstance(seed, int):
-                count = range(self.num_envs)
-                return [None if seed is None else seed + i for i in count]
-            if len(seed) != self.num_envs:
-                got, expected = f"{len(seed)} seeds", f"{self.num_envs}"
-                raise InputError("E140", "a reset", got=got, expected=expected)
-            return list(seed)
+            seeds = seeds_of(seed, self.num_envs)
+            seen = self.fleet.reset(seeds, self.np_random)
+            return seen, {"status": np.full(self.num_envs, "running", object)}
 
         def step(self, actions: np.ndarray) -> Any:
             """One period of each, or its start anew. Raises E140, E101, E203."""
-            if self.now is None:
+            if self.fleet.now is None:
                 raise gymnasium.error.ResetNeeded("call reset before step")
-            assert self.action_space.shape is not None
-            U = checked(actions, self.action_space.shape)
-            again, now = self.over, self.now
-            met = stepped(self.tasks, self.bound, self.key, now, U)
-            state, episode = met.state, np.asarray(now.episode) + again
-            seen, step = met.observation, np.where(again, 0, np.asarray(now.step) + 1)
-            if again.any():
-                fresh = begun(self.tasks, self.bound, self.key, episode)
-                state, seen = (
-                    jnp.where(again[:, None], new, old)
-                    for new, old in zip(fresh, (state, seen), strict=True)
-                )
-            self.now = Batch(state, episode.astype(np.int32), step.astype(np.int32))
-            ended = np.asarray(met.outside) & ~again
-            late = (step == self.longest) & ~again
-            self.over = ended | late
-            return told(met, np.array(seen), again, ended, late)
+            m = self.fleet.task.actions.low.size
+            U = checked(actions, (self.num_envs, m))
+            return self.fleet.step(self.fleet.now, U)
 
     return TaskVectorEnv
+
+
+def seeds_of(seed: int | Sequence[int | None] | None, count: int) -> list[int | None]:
+    """One for each environment (E140 for another number of them)."""
+    if seed is None:
+        return [None] * count
+    if isinstance(seed, int):
+        return [seed + i for i in range(count)]
+    if len(seed) != count:
+        got, expected = f"{len(seed)} seeds", f"{count}"
+        raise InputError("E140", "a reset", got=got, expected=expected)
+    return list(seed)
 
 
 def stacked(tasks: Sequence[Task]) -> Task:
