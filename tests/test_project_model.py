@@ -237,11 +237,7 @@ def test_a_file_that_cannot_say_it_leaves_nothing_behind(
     other, out = tmp_path / "other.xml", tmp_path / "out" / "new.xml"
     out.parent.mkdir()
     given = ["apply", str(identified), "--model", str(other), "--out", str(out)]
-    other.write_text(
-        MODEL.replace('name="shoulder"', 'name="hip"').replace(
-            'joint="shoulder"', 'joint="hip"'
-        )
-    )
+    other.write_text(MODEL.replace('name="lower"', 'name="fore"'))
     assert main(given) == 2
     assert "E170" in capsys.readouterr().err
     other.write_text(MODEL)
