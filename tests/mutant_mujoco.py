@@ -201,14 +201,21 @@ ON_THE_HOST = (
         "systems/mujoco_mjx.py",
         "return _derived(model) if self.derive else model",
         "return model",
-        ("test_mujoco_mjx.py", "rollouts"),
+        ("test_mujoco_mjx.py", "follows"),
+    ),
+    Mutant(
+        "mjx: bodies that slide are as others",
+        "systems/mujoco_mjx.py",
+        "if model.body_simple[body] == 2:",
+        "if False:",
+        ("test_mujoco_mjx.py", "follows"),
     ),
     Mutant(
         "mjx: constants stay at one",
         "systems/mujoco_mjx.py",
         "one + jnp.tensordot(theta - 1.0, by, 1)",
         "one + 0.0 * jnp.tensordot(theta - 1.0, by, 1)",
-        ("test_mujoco_mjx.py", "rollouts"),
+        ("test_mujoco_mjx.py", "follows"),
     ),
     Mutant(
         "apply: what failed is left behind",

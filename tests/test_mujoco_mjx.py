@@ -129,6 +129,36 @@ def test_rollouts_and_their_jacobians_are_c_mujocos(text, constants, start) -> N
     np.testing.assert_allclose(along, J @ tangent, rtol=1e-9, atol=1e-12)
 
 
+@in_float64
+def test_constants_and_what_follows_from_them_are_c_mujocos() -> None:
+    """As `mujoco.mj_setConst` derives it, of bodies that turn, slide, or are welded."""
+    c, x = systems(MODEL, CONSTANTS)
+    theta = np.asarray([g[0].get(c.engine.model) for g in c.engine.constants]) * 1.3
+    names = ["dof_M0", "dof_invweight0", "body_invweight0", "dof_damping", "body_mass"]
+    names += [
+        "dof_frictionloss",
+        "dof_armature",
+        "body_inertia",
+        "body_pos",
+        "body_ipos",
+    ]
+    names += ["actuator_gear", "actuator_gainprm", "geom_friction"]
+    expected = c.engine.with_values(theta)
+
+    @jax.jit
+    def fields(theta):
+        model = x.mjx.with_values(theta)
+        return [getattr(model, name) for name in names], model.opt.gravity
+
+    found, gravity = fields(jnp.asarray(theta))
+    np.testing.assert_allclose(gravity, expected.opt.gravity, rtol=1e-14)
+    for name, value in zip(names, found, strict=True):
+        wanted = getattr(expected, name)
+        np.testing.assert_allclose(
+            np.asarray(value).reshape(wanted.shape), wanted, rtol=1e-9, atol=1e-12
+        )
+
+
 @pytest.mark.parametrize(
     ("parts", "constant", "got"),
     [

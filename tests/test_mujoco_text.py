@@ -118,6 +118,8 @@ def test_one_constant_changes_alone(tmp_path: Path, path: str) -> None:
         assert changed == {line}
     if path == "body/upper/mass":
         assert """size=".02" mass='0.6'/>""" in text.decode()
+    if path == "body/body4/mass":
+        assert re.search(r'mass="3" diaginertia="\S+ \S+\t\S+"', text.decode())
     if path == "body/body4/com_y":
         assert (
             """pos="0 0.12 0" mass="2" diaginertia=".1 .2	.25\"""" in text.decode()

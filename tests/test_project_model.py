@@ -86,6 +86,15 @@ value = 0.3
         load_project(project(tmp_path, text))
 
 
+def test_an_empty_table_opens_all_of_an_inertia(tmp_path: Path) -> None:
+    text = '[parameters."body/lower/inertia"]\n[parameters."joint/elbow/damping"]\n'
+    table = load_project(project(tmp_path, text + "sd = 0.01\nmean = 0.02\n")).system
+    free = {p.name: p for p in table.parameters.free}
+    assert len(free) == 11
+    alpha = free["body/lower/inertia/alpha"]
+    assert (alpha.map, alpha.mean, alpha.sd) == ("identity", 0.0, 0.2)
+
+
 def test_without_mujoco_the_extra_is_named(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(InputError, match=r"E135.*pip install 'sim2gp\[mujoco\]'"):
@@ -251,11 +260,7 @@ def test_a_file_that_cannot_say_it_leaves_nothing_behind(
     other, out = tmp_path / "other.xml", tmp_path / "out" / "new.xml"
     out.parent.mkdir()
     given = ["apply", str(identified), "--model", str(other), "--out", str(out)]
-    other.write_text(
-        MODEL.replace('name="shoulder"', 'name="hip"').replace(
-            'joint="shoulder"', 'joint="hip"'
-        )
-    )
+    other.write_text(MODEL.replace('name="lower"', 'name="fore"'))
     assert main(given) == 2
     assert "E170" in capsys.readouterr().err
     other.write_text(MODEL)

@@ -45,6 +45,13 @@ class Element:
         """Children of these kinds."""
         return (child for child in self.children if child.tag in tags)
 
+    def stated(self, name: str) -> str:
+        """An attribute as it stands in the file, with its tabs and line breaks."""
+        tag = _TAG.match(self.document.data, self.start)
+        pairs = _ATTRIBUTE.finditer(tag.group()) if tag else ()
+        found = {p.group(1).decode(): p.group(2).decode()[1:-1] for p in pairs}
+        return found.get(name, "")
+
     @property
     def line(self) -> str:
         """``file:line 7``."""
@@ -183,7 +190,9 @@ class Edits:
 
         ``rest`` fills places before them that the attribute does not state.
         """
-        words = _NUMBER.findall(self.get(element, name) or "")
+        now = self._attributes.get(element, {})
+        text = (now[name] or "") if name in now else element.stated(name)
+        words = _NUMBER.findall(text)
         if len(words) <= max(numbers):  # rewritten whole, as it gets longer
             more = range(len(words), max(numbers) + 1)
             known = {**(rest or {}), **numbers}
@@ -191,7 +200,7 @@ class Edits:
         for i, value in numbers.items():
             if float(words[i]) != value:
                 words[i] = number(value)
-        self.set(element, name, _spaced(self.get(element, name) or "", words))
+        self.set(element, name, _spaced(text, words))
 
     def rename(self, element: Element, tag: str) -> None:
         """Make it an element of another kind (one that has no children)."""

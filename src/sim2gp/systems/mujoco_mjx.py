@@ -68,7 +68,7 @@ class MJXEngine:
         from mujoco import mjx
 
         with _lenient():
-            model = self._with_values(theta)
+            model = self.with_values(theta)
             count = jnp.maximum(1, jnp.ceil(h / self.timestep - 1e-6)).astype(int)
             step = h / count
             model = model.tree_replace({"opt.timestep": step})
@@ -84,15 +84,15 @@ class MJXEngine:
             moved = jnp.concatenate([data.qpos, data.qvel, data.act])
             return jnp.where(h > 0.0, moved, s)
 
-    def _with_values(self, theta: Float[Array, " p"]) -> Any:
+    def with_values(self, theta: Float[Array, " p"]) -> Any:
         """The model with these constants, and what is derived of them."""
-        model = _cast(self.model, theta.dtype)
         changes = {}
         for name, (at_one, slope) in self.affine.items():
             one, by = (jnp.asarray(x, theta.dtype) for x in (at_one, slope))
             changes[name] = one + jnp.tensordot(theta - 1.0, by, 1)
-        model = model.tree_replace(changes)
-        return _derived(model) if self.derive else model
+        with _lenient():
+            model = _cast(self.model, theta.dtype).tree_replace(changes)
+            return _derived(model) if self.derive else model
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
