@@ -2,7 +2,7 @@
 
     python benchmarks/robots.py [--models FOLDER] [--draws N] [--workers N] [--out DIR]
 
-The cart-pole, the acrobot and the reacher (an arm) of dm_control's suite; their files are
+The cart-pole, acrobot and reacher (an arm) of the suite of dm_control; their files are
 looked for where dm_control is installed, or in FOLDER. For each draw their constants
 are drawn from the project's priors, two recordings of ten seconds are made by C MuJoCo
 with noisy encoders and no velocities, and the project is fitted as `sim2gp identify`

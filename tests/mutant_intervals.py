@@ -60,7 +60,7 @@ INTERVALS = (
         WEIGHTS,
         "return -cost[best] - log_det[best]",
         "return -cost[best]",
-        (HERE, "exact_posterior"),
+        (TAILS, "nuisances_are"),
     ),
     Mutant(
         "importance: the Gaussian's density left out",

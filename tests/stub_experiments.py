@@ -26,7 +26,7 @@ def install(
 
 
 def identify(
-    project: Path, *, out: Path, seed: int, progress: Progress
+    project: Path, *, out: Path, seed: int, progress: Progress, check: bool = False
 ) -> dict[str, Any]:
     """Everything of an identification that reads input, and no fit."""
     found = load_project(project)
@@ -35,6 +35,7 @@ def identify(
         "n_transitions": sum(len(log) - 1 for log in logs),
         "parameters": {p.name: {"sd": p.sd} for p in found.system.parameters.free},
         "seed": seed,
+        "check": check,
         "warnings": [str(note) for log in logs for note in log.notes],
     }
     with new_run(out, "identify") as run, progress.task("fit", 2) as task:

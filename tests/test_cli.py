@@ -252,6 +252,10 @@ def test_identify_of_a_small_project(
     assert said.err == ""
     stored = Path("runs", "arm", "summary.json").read_text()
     assert json.loads(stored) == json.loads(said.out)
+    assert not json.loads(stored)["check"]
+    words = ["identify", "arm.toml", "--check", "--json", "--quiet", "--out", "two"]
+    assert main(words) == 0
+    assert json.loads(capsys.readouterr().out)["check"]
 
 
 @pytest.mark.parametrize("unbuffered", ["", "1"])

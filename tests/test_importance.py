@@ -2,12 +2,25 @@
 
 import math
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxtyping import Array, Float
 from scipy.stats import genpareto, norm
 from scipy.stats import t as student
 
-from sim2gp.diagnose.importance import DRAWS, Checked, checked, pareto, smoothed
+from sim2gp.arrowhead import Blocks, Noise
+from sim2gp.diagnose.importance import (
+    DRAWS,
+    Checked,
+    _log_posterior,
+    checked,
+    pareto,
+    smoothed,
+)
+from sim2gp.laplace import AbstractLikelihood
+from sim2gp.least_squares import factor
 
 
 @pytest.mark.parametrize("k", [-0.3, 0.0, 0.4, 0.9])
@@ -98,3 +111,30 @@ def test_a_draw_that_fails_has_no_weight() -> None:
 )  # fmt: skip
 def test_words_follow_the_shape(k: float, verdict: str) -> None:
     assert Checked(k, 200.0, np.zeros(1), np.ones(1)).verdict == verdict
+
+
+class Product(AbstractLikelihood):
+    """``y = z e + eps``: linear in the nuisance, whose weight is the constant."""
+
+    y: float
+
+    def blocks(self, z: Float[Array, " p"], e: Float[Array, "W n"]) -> Blocks:
+        J = jnp.stack([z, e[0]], axis=1)
+        return factor(J, z * e[0] - self.y)[None, None]
+
+    def curvature(
+        self, z: Float[Array, " p"], gradient: Float[Array, " p"]
+    ) -> Float[Array, "p p"]:
+        return jnp.zeros((1, 1))
+
+
+def test_nuisances_are_integrated_not_fitted() -> None:
+    """``p(y | z) = N(y; 0, sig^2 + z^2)``, in closed form."""
+    z, sd, y = np.linspace(0.2, 3.0, 8), 0.5, 1.3
+    with jax.enable_x64(True):
+        noise = Noise(jnp.full(1, sd), jnp.ones(1))
+        start = jnp.full((1, 1), 0.1)
+        found = _log_posterior(Product(y), jnp.asarray(z[:, None]), start, noise)
+    want = norm.logpdf(y, 0.0, np.hypot(sd, z)) + norm.logpdf(z)
+    got = np.asarray(found)
+    np.testing.assert_allclose(got - got[0], want - want[0], atol=1e-9)

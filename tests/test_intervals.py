@@ -132,7 +132,7 @@ def test_between_the_plain_and_the_prior() -> None:
     rng = np.random.default_rng(5)
     for size in (0.01, 0.05, 0.3):
         model = Linear(smooth(rng, size))
-        for rho in (0.0, 0.99):
+        for rho in (-0.9, 0.0, 0.99):  # -0.9: samples say more than counted
             y = model.J @ np.ones(P) + 3.0 * ar1(rng, rho)
             plain, found = model.corrected(y)
             assert np.linalg.eigvalsh(found.C - plain.C).min() > -1e-12
@@ -253,6 +253,24 @@ def test_a_corrected_posterior_changes_spreads_and_not_the_structure() -> None:
     assert "plain" not in plain["parameters"]["a"]
     for key, value in c["plain"].items():
         assert value == pytest.approx(plain["parameters"]["c"][key])
+    with jax.enable_x64(True):
+        other = Gaussian(belief[2].mean, belief[2].scale.at[2].multiply(16.0))
+    open_now = json.dumps(study(*belief, corrected=other)["directions"])
+    assert "The data fix c" in json.dumps(plain["directions"])
+    assert "The data hardly tell c: 80 % of the prior" in open_now
+
+
+def test_the_words_say_which_intervals_these_are() -> None:
+    found = intervals.Corrected(gaussian(np.zeros(1), np.eye(1)), 9.0, 2, 30.0, True)
+    text = intervals.words(found, [1.0, 2.96, 3.31], 40)
+    assert text.startswith("Intervals are 1 to 3.3 times as wide")
+    assert "40 windows are coloured and pull the constants 3 times" in text
+    assert "are 3 times as wide" in intervals.words(found, [3.0, 3.0], 40)
+    white = dataclasses.replace(found, inflation=1.0)
+    text = intervals.words(white, [1.02, 1.1], 40)
+    assert "those of independent samples, times 1.1 at most" in text
+    few = dataclasses.replace(found, enough=False)
+    assert "3 windows are too few" in intervals.words(few, [1.0], 3)
 
 
 @pytest.fixture(scope="module")

@@ -75,7 +75,7 @@ def _weakly_seen(spec: Spectrum, k: int) -> dict[str, Any]:
 def _fixed(spec: Spectrum, k: int) -> dict[str, Any]:
     l = float(spec.eigenvalues[k])
     what = weighted_sum(combination(spec, k), spec.names)
-    # With corrected spreads the data may know more than the prior, yet leave it open.
+    # With corrected spreads the data may inform and yet leave it open.
     verb = "fix" if _spread(spec, k) <= _FLAT else "hardly tell"
     return _direction(f"The data {verb} {what}: {_left(spec, k)}.", what, l)
 
