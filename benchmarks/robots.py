@@ -26,6 +26,7 @@ import jax
 import numpy as np
 
 from sim2gp.diagnose.intervals import corrected, pulls_of_windows
+from sim2gp.errors import InputError
 from sim2gp.experiments.prediction import cut_logs
 from sim2gp.models.windows import fit_windows
 from sim2gp.project import Project, load_project
@@ -49,7 +50,7 @@ class Robot:
     columns: dict[str, str]  # channel: column
     start: tuple[float, ...]
     push: float = 0.0  # of three unrecorded pushes, N m
-    centred: float = 0.0  # share of the input, per m and m/s, that keeps off the stops
+    centred: float = 0.0  # share of the input, per m, rad and s, that keeps off stops
 
     @property
     def arguments(self) -> dict[str, Any]:
@@ -110,6 +111,7 @@ robust = true
         },
         (0.0, 0.3),
         push=0.02,
+        centred=0.3,
     ),
 }
 
@@ -204,8 +206,8 @@ def record(
     rows = []
     for k in range(count):
         seen = data.qpos - zero[: model.nq] + NOISE * rng.standard_normal(model.nq)
-        away = robot.centred * (data.qpos[0] + data.qvel[0])
-        command[k] = np.clip(command[k] - away, low, high)
+        away = (data.qpos + data.qvel)[: model.nu]
+        command[k] = np.clip(command[k] - robot.centred * away, low, high)
         rows.append([data.time, *seen, *command[k]])
         for i, d in enumerate(delay):
             data.ctrl[i] = command[max(k - d, 0), i]
@@ -248,7 +250,8 @@ def models_of_dm_control() -> Path:
     """The folder of the suite's files."""
     spec = find_spec("dm_control")
     if spec is None or spec.origin is None:
-        sys.exit("dm_control is not installed: pip install dm_control, or --models")
+        fix = "pip install dm_control, or give --models"
+        raise InputError("E135", "dm_control is not installed", fix=fix)
     return Path(spec.origin).parent / "suite"
 
 

@@ -102,7 +102,7 @@ DESCENTS = (
     Mutant(
         "arrived by the gradient alone",
         LAPLACE,
-        " | (left <= LEFT_TOLERANCE)",
+        " | (left <= GRADIENT_TOLERANCE)",
         "",
         ("test_sim2gp.py", "without_noise"),
     ),

@@ -99,7 +99,7 @@ def time_column(columns: Mapping[str, Values], where: str) -> Match:
             where=where,
             got=", ".join(columns)[:120],
             expected="a column that grows, such as time",
-            fix="add one, or write the project file by hand",
+            fix="say --period, add one, or write the project file by hand",
         )
     name = (named or grow)[0]
     why = "by name" if named else "it grows"
