@@ -26,7 +26,7 @@ import jax
 import numpy as np
 
 from sim2gp.diagnose.intervals import corrected, pulls_of_windows
-from sim2gp.errors import InputError
+from sim2gp.errors import InputError, NotConverged, NotFinite
 from sim2gp.experiments.prediction import cut_logs
 from sim2gp.models.windows import fit_windows
 from sim2gp.project import Project, load_project
@@ -144,12 +144,11 @@ def work(job: Job) -> dict[str, Any]:
         started = time.perf_counter()
         logs = project.read_logs(sorted(Path(folder).iterdir()))
         windows, of = cut_logs(project, logs)
-        belief = fit_windows(
-            project.system,
-            windows,
-            key=jax.random.key(job.draw),
-            robust=project.spec.likelihood.robust,
-        )
+        robust, key = project.spec.likelihood.robust, jax.random.key(job.draw)
+        try:
+            belief = fit_windows(project.system, windows, key=key, robust=robust)
+        except (NotConverged, NotFinite) as error:
+            return {"failed": str(error)}
         pulls = pulls_of_windows(belief, windows, of)
         mine = corrected(belief.prior, belief.posterior, pulls).posterior
         seconds = time.perf_counter() - started
@@ -224,9 +223,10 @@ def record(
 
 def table(cells: list[dict[str, Any]]) -> dict[str, Any]:
     """Of each constant: coverage, share of draws that identify it, median error."""
-    get = {key: np.array([cell[key] for cell in cells]) for key in cells[0]}
+    fitted = [cell for cell in cells if "failed" not in cell]
+    get = {key: np.array([cell[key] for cell in fitted]) for key in fitted[0]}
     out = {}
-    for j, name in enumerate(cells[0]["names"]):
+    for j, name in enumerate(fitted[0]["names"]):
         known = get["sd_corrected"][:, j] <= IDENTIFIED * get["prior_sd"][:, j]
         truth, found = get["truth"][:, j], get["found"][:, j]
         error = np.abs(found - truth) / np.abs(truth)
@@ -238,7 +238,8 @@ def table(cells: list[dict[str, Any]]) -> dict[str, Any]:
             "identified": float(known.mean()),
             "median_error": float(np.median(error[known])) if known.any() else None,
         }
-    return {"constants": out, "seconds": float(np.median(get["seconds"]))}
+    seconds = float(np.median(get["seconds"]))
+    return {"constants": out, "seconds": seconds, "failed": len(cells) - len(fitted)}
 
 
 def _inside(get: dict[str, np.ndarray], which: str, j: int) -> float:

@@ -8,9 +8,11 @@ import pytest
 
 from sim2gp.cli import main
 from sim2gp.errors import InputError
-from sim2gp.logs import Column
+from sim2gp.logs import Column, Log
+from sim2gp.models.cutting import cut
 from sim2gp.project import load_project
 from sim2gp.project.columns import match, time_column, unit_in, words_of
+from sim2gp.systems import MuJoCo
 from sim2gp.systems.base import Channel
 
 T = np.arange(0.0, 4.0, 0.01)
@@ -157,6 +159,20 @@ def test_an_odd_log_becomes_a_project(tmp_path: Path, capsys) -> None:
     assert main(["init", *map(str, words)]) == 2
     assert "E132 file exists" in capsys.readouterr().err
     assert out.read_text() == text
+
+
+def test_a_coarse_model_is_stepped_as_it_is() -> None:
+    """Half of its own step would be another simulator."""
+    mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is absent")
+    text = MODEL.replace('"0.01" integrator="RK4"', '"0.03" integrator="Euler"')
+    system = MuJoCo(mujoco.MjModel.from_xml_string(text))
+    fine = MuJoCo(mujoco.MjModel.from_xml_string(MODEL.replace("0.01", "0.002")))
+    assert (system.window_substep, fine.window_substep) == (0.03, 0.01)
+    time, y = 0.03 * np.arange(20), np.linspace(0.5, 1.0, 20)
+    log = Log("a", "a.csv", time, {"hinge": y}, {"drive": 0.0 * y}, {"hinge": y > 0})
+    windows, _ = cut([log], system, window=0.3)
+    spans = np.asarray(windows.span)
+    np.testing.assert_allclose(spans[spans > 0.0], 0.03, rtol=1e-9)
 
 
 def test_bad_input_is_one_line_and_nothing_is_written(tmp_path: Path, capsys) -> None:

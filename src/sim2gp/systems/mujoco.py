@@ -124,7 +124,9 @@ class MuJoCo(AbstractPlant):
 
     @property
     def window_substep(self) -> float:
-        return LONGEST_MEAN  # of a delayed input, which is averaged between rows
+        # A delayed input is averaged over no more; but a coarser model is stepped as
+        # it is: half of its step is another simulator.
+        return max(LONGEST_MEAN, float(self.engine.model.opt.timestep))
 
     def record(self, values: Mapping[str, Scalar]) -> Float[Array, " p"]:
         """Values in the order of the engine's constants."""
