@@ -17,6 +17,7 @@ from pathlib import Path
 
 from mutant_descent import DESCENTS
 from mutant_design import DESIGN
+from mutant_draft import FIRST_DRAFT
 from mutant_exploring import EXPLORING
 from mutant_interop import INTEROP
 from mutant_intervals import INTERVALS
@@ -37,6 +38,7 @@ MUTANTS = (
     *STUDIES,
     *EXPLORING,
     *DESIGN,
+    *FIRST_DRAFT,
     *OFF_POLICY,
     *ON_THE_HOST,
     *LOGS,
