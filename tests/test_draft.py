@@ -59,11 +59,11 @@ def test_no_time_is_an_error() -> None:
 
 def test_columns_by_names_and_rates() -> None:
     columns = {
+        "pos_des1": Q[1] + 0.1,
         "pos_meas1": Q[1],
         "pos_meas2": Q[2],
         "vel_meas1": V[1],
         "vel_meas2": V[2],
-        "pos_des1": Q[1] + 0.1,
         "tau_meas1": U[1],
         "tau_cmd1": U[1],
         "tau_cmd2": U[2],
