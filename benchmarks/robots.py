@@ -231,10 +231,8 @@ def table(cells: list[dict[str, Any]]) -> dict[str, Any]:
         truth, found = get["truth"][:, j], get["found"][:, j]
         error = np.abs(found - truth) / np.abs(truth)
         out[name] = {
-            "coverage": _inside(
-                get["error_corrected"][:, j], get["sd_corrected"][:, j]
-            ),
-            "coverage_plain": _inside(get["error"][:, j], get["sd"][:, j]),
+            "coverage": _inside(get, "_corrected", j),
+            "coverage_plain": _inside(get, "", j),
             "identified": float(known.mean()),
             "median_error": float(np.median(error[known])) if known.any() else None,
         }
