@@ -6,22 +6,19 @@ file before it replaces the old one, whole or not at all.
 """
 
 import dataclasses
-import re
 from pathlib import Path
 
 from sim2gp.errors import InputError, Sim2GPError
 from sim2gp.project.project import Project
-from sim2gp.project.replace import replace_project
+from sim2gp.project.replace import key, replace_project
 from sim2gp.project.schema import EFFECT_OPTIONS
 from sim2gp.systems import AbstractEffect, Candidate, InputDelay
-
-_BARE = re.compile(r"[A-Za-z0-9_-]+")
 
 
 def lines_for(candidate: Candidate) -> tuple[str, list[str]]:
     """Header and lines of the table that frees a candidate (E160 for a lag)."""
     effect = candidate.effect
-    where = _key(effect.where)
+    where = key(effect.where)
     if isinstance(effect, AbstractEffect):
         lines = ["mean = 0.0", f"sd = {effect.magnitude!r}"]
         for field in dataclasses.fields(effect):
@@ -87,7 +84,3 @@ def amend(path: Path, candidate: Candidate, note: str = "") -> None:
             expected="a file that can end with a table more",
             fix="add by hand: " + ", ".join([header, *lines]),
         ) from error
-
-
-def _key(name: str) -> str:
-    return name if _BARE.fullmatch(name) else f'"{name}"'

@@ -5,9 +5,7 @@ What is written can be identified as it stands: it is loaded, with its logs, bef
 takes its place.
 """
 
-import json
 import os
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,14 +20,14 @@ from sim2gp.logs.units import UNITS
 from sim2gp.project.columns import Match, match, time_column
 from sim2gp.project.project import SYSTEMS, is_model, system_class
 from sim2gp.project.readings import SURE, Found, Reading, Version, find_readings
-from sim2gp.project.replace import replace_project
+from sim2gp.project.replace import key as toml_key
+from sim2gp.project.replace import quoted, replace_project
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import Key
 
 DELAY = 0.04  # s, the longest that a draft lets an input be late
 LARGE = 3.2  # rad or m of travel that may be degrees or millimetres
 LISTED = 40  # constants that are named in the file
-_BARE = re.compile(r"[A-Za-z0-9_-]+")
 
 
 @dataclass(frozen=True)
@@ -215,12 +213,12 @@ def _text(
     listed = [_relative(file, folder) for file in files]
     rows = [
         "# A draft by sim2gp init: every guess has its reason beside it. Read them.",
-        f"system = {_quoted(named)}",
+        f"system = {quoted(named)}",
         "",
         *_constants(system, is_model(model)),
         "",
         "[[logs]]",
-        f"files = [{', '.join(_quoted(file) for file in listed)}]",
+        f"files = [{', '.join(quoted(file) for file in listed)}]",
     ]
     if time is not None:
         rows.append(f"time = {_value(time.column)}  # {time.why}")
@@ -234,10 +232,10 @@ def _text(
         ]
     rows.append("[logs.columns]")
     for name, m in columns.items():
-        rows.append(f"{_key(name)} = {_value(m.column)}  # {m.why}")
+        rows.append(f"{toml_key(name)} = {_value(m.column)}  # {m.why}")
     rows += ["", "# Inputs act late on most machines; delay = 0.0 takes that out."]
     for channel in system.actions:
-        rows.append(f"[actuators.{_key(channel.name)}]")
+        rows.append(f"[actuators.{toml_key(channel.name)}]")
         rows.append(f"delay = {{low = 0.0, high = {DELAY}}}")
     return "\n".join(rows) + "\n"
 
@@ -252,7 +250,7 @@ def _constants(system: AbstractSystem, file: bool) -> list[str]:
         rows.append(f"#   {p.name} = {nominal[p.name]:.4g} {p.unit}".rstrip())
     if len(table) > LISTED:
         rows.append(f"#   and {len(table) - LISTED} more")
-    example = _key(table[0].name) if table else "NAME"
+    example = toml_key(table[0].name) if table else "NAME"
     rows.append(f"# To say what you know: [parameters.{example}] mean = ... sd = ...")
     return rows
 
@@ -261,10 +259,10 @@ def _value(column: Column) -> str:
     """A column as the file says it."""
     plain = Column(column.column)
     if column == plain:
-        return _quoted(column.column)
-    words = [f"column = {_quoted(column.column)}"]
+        return quoted(column.column)
+    words = [f"column = {quoted(column.column)}"]
     if column.unit is not None:
-        words.append(f"unit = {_quoted(column.unit)}")
+        words.append(f"unit = {quoted(column.unit)}")
     if column.sign != plain.sign:
         words.append(f"sign = {column.sign}")
     if column.offset != plain.offset:
@@ -274,14 +272,6 @@ def _value(column: Column) -> str:
 
 def _relative(file: Path, folder: Path) -> str:
     return Path(os.path.relpath(file, folder)).as_posix()
-
-
-def _quoted(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False)
-
-
-def _key(name: str) -> str:
-    return name if _BARE.fullmatch(name) else _quoted(name)
 
 
 def told(draft: Draft, out: Path) -> dict[str, Any]:

@@ -1,11 +1,25 @@
 """A project file takes its place whole or not at all, once it has been read back."""
 
+import json
 import os
+import re
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
 from sim2gp.project.project import Project, load_project
+
+_BARE = re.compile(r"[A-Za-z0-9_-]+")
+
+
+def quoted(text: str) -> str:
+    """A text as TOML writes it."""
+    return json.dumps(text, ensure_ascii=False)
+
+
+def key(name: str) -> str:
+    """A name as a key of TOML: quoted where it must be."""
+    return name if _BARE.fullmatch(name) else quoted(name)
 
 
 def replace_project(path: Path, text: str, check: Callable[[Project], object]) -> None:
