@@ -22,7 +22,7 @@ from sim2gp.errors import InputError
 from sim2gp.parameters import Parameter, Parameters
 from sim2gp.systems.actuator import LONGEST_MEAN
 from sim2gp.systems.base import AbstractPlant, Channel, named_once, names_of, table_of
-from sim2gp.systems.external import AbstractSimulator, Differences, flow
+from sim2gp.systems.external import AbstractSimulator, Differences, flow, untouched
 from sim2gp.types import Action, Scalar, State
 
 Step = Callable[[dict[str, Any], np.ndarray, np.ndarray, Any], Any]
@@ -46,9 +46,7 @@ class Called(AbstractSimulator):
         a: Float[np.ndarray, "B m"],
         h: Float[np.ndarray, " B"],
     ) -> Float[np.ndarray, "B n"]:
-        out = s.copy()
-        good = np.isfinite(np.concatenate([theta, s, a, h[:, None]], axis=1)).all(1)
-        out[~good] = np.nan
+        out, good = untouched(theta, s, a, h)
         rows = np.flatnonzero(good & (h > 0.0))
         with self._lock:
             if self.batched and rows.size:

@@ -21,7 +21,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from sim2gp.parameters import Parameter, Parameters
 from sim2gp.types import Action, Scalar, State
@@ -108,6 +108,17 @@ class AbstractSimulator(abc.ABC):
         moved[:p][np.abs(moved[:p]) <= nothing[:, None]] = 0.0
         J = moved / apart[..., None]
         return out[0], np.moveaxis(J, 0, -1)
+
+
+def untouched(
+    theta: Float[np.ndarray, "B p"],
+    s: Float[np.ndarray, "B n"],
+    a: Float[np.ndarray, "B m"],
+    h: Float[np.ndarray, " B"],
+) -> tuple[Float[np.ndarray, "B n"], Bool[np.ndarray, " B"]]:
+    """States as they are, NaN where anything is not finite; and where all is."""
+    good = np.isfinite(np.concatenate([theta, s, a, h[:, None]], axis=1)).all(1)
+    return np.where(good[:, None], s, np.nan), good
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from sim2gp.errors import InputError
 from sim2gp.parameters import Parameters
-from sim2gp.systems.external import AbstractSimulator, Differences
+from sim2gp.systems.external import AbstractSimulator, Differences, untouched
 from sim2gp.systems.mjcf import CENTRED, DERIVED, Constant, set_constants
 
 #: Fewer steps than these are not worth waking other threads for.
@@ -71,9 +71,7 @@ class Engine(AbstractSimulator):
         a: Float[np.ndarray, "B m"],
         h: Float[np.ndarray, " B"],
     ) -> Float[np.ndarray, "B n"]:
-        out = s.copy()
-        good = np.isfinite(np.concatenate([theta, s, a, h[:, None]], axis=1)).all(1)
-        out[~good] = np.nan
+        out, good = untouched(theta, s, a, h)
         values, which = np.unique(theta[good], axis=0, return_inverse=True)
         index = np.flatnonzero(good)
         with self._lock:
