@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from sim2gp.diagnose.intervals import corrected, pulls_of_windows
+from sim2gp.diagnose.intervals import corrected_windows
 from sim2gp.errors import InputError, NotConverged, NotFinite
 from sim2gp.experiments.prediction import cut_logs
 from sim2gp.models.windows import fit_windows
@@ -149,8 +149,7 @@ def work(job: Job) -> dict[str, Any]:
             belief = fit_windows(project.system, windows, key=key, robust=robust)
         except (NotConverged, NotFinite) as error:
             return {"failed": str(error)}
-        pulls = pulls_of_windows(belief, windows, of)
-        mine = corrected(belief.prior, belief.posterior, pulls).posterior
+        mine = corrected_windows(belief, windows, of).posterior
         seconds = time.perf_counter() - started
     found = table.values(mine.mean)
     return {

@@ -50,6 +50,13 @@ FIRST_DRAFT = (
         ("test_draft.py", "names_and_rates"),
     ),
     Mutant(
+        "draft: theta is the first of two hinges",
+        COLUMNS,
+        "if units.count(u) == 1",
+        "if units.count(u) >= 1",
+        ("test_draft.py", "only_joint"),
+    ),
+    Mutant(
         "draft: time in s whatever its step",
         COLUMNS,
         "next(u for u, least in marks if period >= least)",

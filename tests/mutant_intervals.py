@@ -76,4 +76,18 @@ INTERVALS = (
         "return (10.0 * 0.5 - n * k) / (n + 10.0), -k / best",
         (TAILS, "shape_of_a_tail"),
     ),
+    Mutant(
+        "intervals: a centre is believed wherever it lies",
+        PULLS,
+        "if there - before - told <= TRUSTED * max(found.inflation, 1.0):",
+        "if there < np.inf:",
+        (HERE, "at_its_bound"),
+    ),
+    Mutant(
+        "intervals: starts do not follow the constants",
+        PULLS,
+        "np.sum(R[:, n:, n] ** 2)",
+        "np.sum(R[..., n] ** 2)",
+        (HERE, "where_the_gaussian_says"),
+    ),
 )

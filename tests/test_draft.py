@@ -82,6 +82,23 @@ def test_columns_by_names_and_rates() -> None:
     }
 
 
+def test_the_only_joint_that_slides_is_x_and_the_only_hinge_theta() -> None:
+    """Of two hinges neither is: no guess is better than one by the columns' order."""
+    cart = [Channel("slider", "m"), Channel("hinge_1", "rad")]
+    cart += [Channel(f"{c.name}.velocity", f"{c.unit}/s") for c in cart]
+    columns = {"theta": Q[1], "x": Q[2], "x_dot": V[2], "u": U[1]}
+    found = match(columns, T, cart, [Channel("slide", "1")], "")
+    assert {name: m.column.column for name, m in found.items()} == {
+        "slider": "x",
+        "hinge_1": "theta",
+        "slider.velocity": "x_dot",
+        "slide": "u",
+    }
+    swap = {"x": Q[1], "theta": Q[2], "u": U[1]}
+    with pytest.raises(InputError, match="E103 no column for joint"):
+        match(swap, T, joints("left", "right"), [Channel("slide", "1")], "")
+
+
 @pytest.mark.parametrize(
     ("position", "velocity", "units"),
     [

@@ -10,6 +10,7 @@ import pytest
 import scipy.signal
 
 from beliefs import believe, named, study
+from linear_system import Linear as Machine
 from linear_system import linear
 from sim2gp.diagnose import intervals
 from sim2gp.diagnose.importance import DRAWS, check_windows
@@ -19,6 +20,7 @@ from sim2gp.gaussian import Gaussian
 from sim2gp.logs import Log
 from sim2gp.models.cutting import cut
 from sim2gp.models.windows import Windows, WindowsBelief, fit_windows, linearise
+from sim2gp.parameters import Parameter, Parameters
 
 W, L, P = 40, 10, 3
 ROWS = W * L
@@ -273,24 +275,75 @@ def test_the_words_say_which_intervals_these_are() -> None:
     assert "3 windows are too few" in intervals.words(few, [1.0], 3)
 
 
+def recorded(system: Machine, rows: int, rate: list[float], error: np.ndarray) -> Log:
+    """Rows at 10 Hz of ``x' = a . rate`` under held inputs, measured with an error."""
+    rng = np.random.default_rng(20)
+    held = rng.standard_normal((rows // 4 + 1, 2))
+    a = np.repeat(held, 4, axis=0)[:rows]
+    x = np.cumsum(np.concatenate([[0.0], 0.1 * a[:-1] @ rate]))
+    return Log(
+        name="log",
+        source="log.csv",
+        time=0.1 * np.arange(rows),
+        channels={"x0": x + error},
+        inputs={"a0": a[:, 0], "a1": a[:, 1]},
+        mask={"x0": np.ones(rows, bool)},
+    )
+
+
 @pytest.fixture(scope="module")
 def fitted() -> tuple[Windows, WindowsBelief]:
     """A machine that is linear in constants and start states, three seconds of it."""
-    rng = np.random.default_rng(20)
-    time = 0.1 * np.arange(31)
-    a = np.repeat(rng.standard_normal((8, 2)), 4, axis=0)[:31]
-    x = np.cumsum(0.1 * a @ [0.7, -0.4]) + 0.02 * rng.standard_normal(31)
-    log = Log(
-        name="log",
-        source="log.csv",
-        time=time,
-        channels={"x0": x},
-        inputs={"a0": a[:, 0], "a1": a[:, 1]},
-        mask={"x0": np.ones(31, bool)},
-    )
     system = linear(2, 1)
-    windows, _ = cut([log], system, window=0.6)
+    noise = 0.02 * np.random.default_rng(21).standard_normal(31)
+    windows, _ = cut([recorded(system, 31, [0.7, -0.4], noise)], system, window=0.6)
     return windows, fit_windows(system, windows, key=jax.random.key(0))
+
+
+def test_a_linear_machines_centre_is_where_the_gaussian_says(
+    fitted: tuple[Windows, WindowsBelief],
+) -> None:
+    """The misfit is the linear one, starts included, however far away."""
+    windows, belief = fitted
+    of = np.zeros(len(windows), int)
+    pulls = intervals.pulls_of_windows(belief, windows, of)
+    at = np.asarray(belief.posterior.mean)
+    dz = np.array([0.8, -1.1])
+    told = dz @ pulls.scores.sum(axis=0)
+    told += 0.5 * np.sum((pulls.factors @ dz) ** 2)
+    with jax.enable_x64(True):
+        there, here = (
+            intervals.cost_of_windows(belief, windows, jnp.asarray(x))
+            for x in (at + dz, at)
+        )
+    assert there - here == pytest.approx(told, rel=1e-6)
+    ours = intervals.corrected_windows(belief, windows, of)
+    plain = corrected(belief.prior, belief.posterior, pulls)
+    np.testing.assert_allclose(ours.posterior.mean, plain.posterior.mean, atol=1e-12)
+
+
+def test_a_constant_at_its_bound_stays_where_the_data_are() -> None:
+    """Its map is flat there: with less data the Gaussian alone leaves for the prior."""
+    at = Parameter("k1", "1", "slope", "box", low=0.0, high=4.0)
+    system = linear(1, 1)
+    system = Machine(Parameters((*system.parameters.free, at)), 1)
+    rng = np.random.default_rng(22)
+    drift = 0.05 * ar1(rng, 0.97).ravel()[:301]
+    windows, _ = cut([recorded(system, 301, [0.7, 0.0], drift)], system, window=0.8)
+    belief = fit_windows(system, windows, key=jax.random.key(0))
+    of = np.zeros(len(windows), int)
+    pulls = intervals.pulls_of_windows(belief, windows, of)
+    naive = corrected(belief.prior, belief.posterior, pulls)
+    ours = intervals.corrected_windows(belief, windows, of)
+    with jax.enable_x64(True):
+        best, bad, good = (
+            intervals.cost_of_windows(belief, windows, found.posterior.mean)
+            for found in (belief, naive, ours)
+        )
+    assert bad - best > 50.0 * naive.inflation
+    assert good - best < 2.0 * naive.inflation
+    assert 4.0 / (1.0 + np.exp(-float(naive.posterior.mean[1]))) > 0.1  # the truth is 0
+    assert 4.0 / (1.0 + np.exp(-float(ours.posterior.mean[1]))) < 0.02
 
 
 def test_pulls_are_those_of_the_dense_marginal(

@@ -226,7 +226,7 @@ def test_its_constants_go_into_the_file(identified: Path, capsys) -> None:
         assert f"+{new}\n" in shown
         assert f"+{new}\n" in summary["diff"]
     assert main(["apply", run, "--out", str(out)]) == 2
-    assert "E132 output file" in capsys.readouterr().err
+    assert "E132 file exists" in capsys.readouterr().err
 
 
 def test_a_file_that_was_changed_in_place_is_no_longer_the_one_fitted(

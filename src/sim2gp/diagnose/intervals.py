@@ -36,11 +36,11 @@ Davison 2012, arXiv 0911.5357; (I - P)^-1/2: Bell and McCaffrey 2002.)
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
 from sim2gp.diagnose.misfit import must_be_finite
 from sim2gp.diagnose.words import digits
@@ -53,6 +53,8 @@ from sim2gp.types import in_float64
 FEWEST = 4.0
 #: Of Bartlett's weights: ``1.5 W / b`` degrees of freedom (Priestley 1981).
 BARTLETT = 1.5
+TRUSTED = 1.0  # nats that a centre may cost beyond what the linear misfit says
+HALVINGS = 6
 LIKE_WHITE = 1.3  # times as wide: small samples alone make so much of white noise
 
 
@@ -92,8 +94,36 @@ def pulls_of_windows(
 
     Raises `NotFinite` E203.
     """
+    n = cut.start.shape[1]
+    rows = _rows(belief, cut, belief.posterior.mean)
+    must_be_finite("derivatives or residuals", rows, "the intervals")
+    R = np.asarray(np.linalg.qr(rows, mode="r"))[:, n:, n:]
+    scores = np.einsum("wkp,wk->wp", R[..., :-1], R[..., -1])
+    return Pulls(R[..., :-1], scores, np.asarray(group))
+
+
+@in_float64
+def cost_of_windows(belief: WindowsBelief, cut: Windows, tt: Array) -> float:
+    """Half the windows' squared misfit at ``tt``, each from the start that suits it.
+
+    Starts follow by one Gauss-Newton step from where the fit has put them. Infinite
+    where the simulation is not finite.
+    """
+    n = cut.start.shape[1]
+    rows = _rows(belief, cut, tt)
+    if not np.isfinite(rows).all():
+        return math.inf
+    both = np.concatenate([rows[..., :n], rows[..., -1:]], axis=-1)
+    R = np.asarray(np.linalg.qr(both, mode="r"))
+    return 0.5 * float(np.sum(R[:, n:, n] ** 2))
+
+
+def _rows(
+    belief: WindowsBelief, cut: Windows, tt: Array
+) -> Float[np.ndarray, "W k npr"]:
+    """Of each window ``[J_e J_z r]``, whitened, the start's prior in its last rows."""
     p, n = belief.prior.mean.size, cut.start.shape[1]
-    found = linearise(belief, cut, belief.posterior.mean)
+    found = linearise(belief, cut, tt)
     weight = np.sqrt(np.asarray(belief.weights))[:, None, None]
     scale = weight / np.asarray(belief.noise)
     r, J = np.asarray(found.residual) * scale, np.asarray(found.jacobian)
@@ -102,13 +132,41 @@ def pulls_of_windows(
     away = np.asarray(belief.starts) - np.asarray(cut.start)
     e = np.divide(away, sd, out=np.zeros_like(away), where=sd > 0.0)
     rows = np.concatenate([J[..., p:], J[..., :p], r[..., None]], axis=-1)
-    own = np.zeros((len(e), n, n + p + 1))  # the start's prior
+    own = np.zeros((len(e), n, n + p + 1))
     own[..., :n], own[..., -1] = np.eye(n), e
-    rows = np.concatenate([rows.reshape(len(e), -1, n + p + 1), own], axis=1)
-    must_be_finite("derivatives or residuals", rows, "the intervals")
-    R = np.asarray(np.linalg.qr(rows, mode="r"))[:, n:, n:]
-    scores = np.einsum("wkp,wk->wp", R[..., :-1], R[..., -1])
-    return Pulls(R[..., :-1], scores, np.asarray(group))
+    return np.concatenate([rows.reshape(len(e), -1, n + p + 1), own], axis=1)
+
+
+@in_float64
+def corrected_windows(
+    belief: WindowsBelief, cut: Windows, group: Int[np.ndarray, " W"]
+) -> Corrected:
+    """The corrected posterior of a fit, its centre checked with the simulator itself.
+
+    Near a bound the machine is not linear in ``z``, and a centre far from the MAP is
+    one that no data suggest. Halfway back, and again, until the misfit there grows by
+    no more than the linear one says, to `TRUSTED` nats of data that count as often as
+    they should.
+    """
+    pulls = pulls_of_windows(belief, cut, group)
+    found = corrected(belief.prior, belief.posterior, pulls)
+    start = np.asarray(belief.posterior.mean)
+    step = np.asarray(found.posterior.mean) - start
+    if not found.enough or not np.any(step):
+        return found
+    dz = np.linalg.solve(np.asarray(belief.prior.scale), step)
+    score = pulls.scores.sum(axis=0)
+    F = np.einsum("wkp,wkq->pq", pulls.factors, pulls.factors)
+    before = cost_of_windows(belief, cut, jnp.asarray(start))
+    for share in 0.5 ** np.arange(HALVINGS):
+        there = cost_of_windows(belief, cut, jnp.asarray(start + share * step))
+        told = share * dz @ (score + 0.5 * share * F @ dz)
+        if there - before - told <= TRUSTED * max(found.inflation, 1.0):
+            break
+    else:
+        share = 0.0
+    centre = Gaussian(jnp.asarray(start + share * step), found.posterior.scale)
+    return replace(found, posterior=centre)
 
 
 @in_float64

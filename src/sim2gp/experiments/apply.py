@@ -5,7 +5,6 @@ text is compiled and compared before anything is kept. Values are the posterior'
 """
 
 import difflib
-import os
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -14,8 +13,9 @@ from sim2gp.errors import InputError
 from sim2gp.experiments.identify import PROJECT, project_of
 from sim2gp.project import Project
 from sim2gp.project.project import is_model
+from sim2gp.project.replace import replace_file
 from sim2gp.runs import Progress, load_run
-from sim2gp.runs.store import Run
+from sim2gp.runs.store import Run, check_absent
 from sim2gp.systems import MuJoCo
 from sim2gp.systems.actuator import bare
 from sim2gp.systems.mjcf import matching
@@ -39,10 +39,11 @@ def run(
     `InputError` E130 for a run without a model's constants, E132 where ``out`` exists,
     E170 where the file cannot say them: then nothing is written.
     """
-    if out is not None and (in_place or out.exists() or out.is_symlink()):
-        got = "--in-place as well" if in_place else "a file that exists"
-        fix = "name a new file, or leave one of the two out"
+    if out is not None and in_place:
+        got, fix = "--out and --in-place", "leave one of the two out"
         raise InputError("E132", "output file", where=str(out), got=got, fix=fix)
+    if out is not None:
+        check_absent(out)
     stored = load_run(run)
     project = _project(run, stored, model)
     system = bare(project.system)
@@ -123,14 +124,7 @@ def _keep(
         return []
     changed = file.replaced(edited)
     for path, data in changed.items():
-        mode = path.stat().st_mode & 0o777
-        handle, aside = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-")
-        with os.fdopen(handle, "wb") as opened:
-            opened.write(data)
-            opened.flush()
-            os.fsync(opened.fileno())
-        os.chmod(aside, mode)
-        os.replace(aside, path)
+        replace_file(path, data)
     return [str(path) for path in changed]
 
 

@@ -19,7 +19,7 @@ from jaxtyping import Array
 from sim2gp import diagnose
 from sim2gp.diagnose import intervals
 from sim2gp.diagnose.importance import check_windows
-from sim2gp.diagnose.intervals import Corrected, corrected, pulls_of_windows
+from sim2gp.diagnose.intervals import Corrected, corrected_windows
 from sim2gp.diagnose.residuals import misfit_of_windows
 from sim2gp.errors import InputError
 from sim2gp.experiments.prediction import (
@@ -76,9 +76,7 @@ def run(
         band = band_of(belief, grid, logs)
         names = channels(found.system, windows)
         picture = drawn(found.system, belief.posterior, band, grid)
-        honest = corrected(
-            belief.prior, belief.posterior, pulls_of_windows(belief, windows, of)
-        )
+        honest = corrected_windows(belief, windows, of)
         arrays = _stored(belief, honest.posterior, band, seed)
         arrays |= trace_arrays(picture, grid, logs, names)
         task.advance("forecasts")

@@ -20,6 +20,7 @@ from sim2gp.systems.base import AbstractSystem
 HALF_WIDTH = 0.025  # s, half the span of the local parabola that guesses a start
 PAST = 0.049  # s, the span of the causal one: 25 samples of 2 ms
 SPACING = 0.1  # s, between the starts of forecasts
+FAR = 10.0  # a start's unmeasured rate may lie so many times its rms away
 TOLERANCE = 0.05  # a substep may exceed its limit by this share of clock jitter
 Start = Literal["smoothed", "causal"]
 
@@ -103,8 +104,9 @@ def assemble(
     """Padded windows of rows ``i .. j - 1`` of log ``k``, for each piece (k, i, j).
 
     The start's prior is a local parabola's value and slope, with a spread far wider
-    than its error, so that the same rows are not believed twice. A causal start is the
-    recorded value and the slope of the parabola through the past alone.
+    than its error, so that the same rows are not believed twice, and no slope that a
+    coarse clock blurs pulls at the constants. A causal start is the recorded value and
+    the slope of the parabola through the past alone.
     """
     actions = [channel.name for channel in system.actions]
     names = [channel.name for channel in system.physical_states]
@@ -129,7 +131,7 @@ def assemble(
         x0[w] = start_of(names, measured, *guesses[k](i))
     floor = np.asarray([resolution(logs, name) for name in measured])
     outputs = tuple(names.index(name) for name in measured)
-    spread = np.sqrt(np.mean(x0**2, axis=0))
+    spread = FAR * np.sqrt(np.mean(x0**2, axis=0))
     for index, quantum in zip(outputs, floor, strict=True):
         spread[index] = 100.0 * quantum
     spread = np.where(spread > 0.0, spread, 1.0)

@@ -34,6 +34,11 @@ INPUT = _words(
     "u a tau torque cmd command commanded con control ctrl input action act effort "
     "force voltage volt motor pwm"
 )
+#: What the only joint that slides, or the only one that turns, is called elsewhere.
+_KIND = {
+    "m": _words("x y z cart carriage slide slider trolley"),
+    "rad": _words("theta phi psi alpha beta angle pole pendulum rod hinge"),
+}
 #: Not the thing itself: what it should be, and what somebody made of it.
 _AIMED = _words("des desired ref reference target goal setpoint err error fric")
 _MADE = _words("filt filtered smooth smoothed est estimate estimated")
@@ -192,10 +197,12 @@ def _assigned(
         return {}
     spelt = {name: words_of(name) for name in columns}
     zero = any("0" in words for words in spelt.values())
+    units = [c.unit for c in channels]
+    kinds = {u: words for u, words in _KIND.items() if units.count(u) == 1}
     scores = np.array(
         [
             [
-                _alike(c, k + (not zero), spelt[name])
+                _alike(c, k + (not zero), spelt[name], kinds)
                 + _of_role(set(spelt[name]), role, others)
                 + seen[name]
                 for name in columns
@@ -212,14 +219,19 @@ def _assigned(
     }
 
 
-def _alike(channel: Channel, number: int, words: Words) -> float:
-    """How much of a channel's own name a column's has; else its number counts."""
+def _alike(
+    channel: Channel, number: int, words: Words, kinds: Mapping[str, frozenset[str]]
+) -> float:
+    """How much of a channel's own name a column's has; else its number or kind."""
     plain = POSITION | VELOCITY | INPUT
     own = [w for w in words_of(channel.name) if w not in plain]
     own = own or list(words_of(channel.name))
     share = 2.0 * sum(w in words for w in own) / len(own)
     numbered = any(w.isdigit() for w in own)
-    return share or 0.75 * (str(number) in words and not numbered)
+    if share:
+        return share
+    counted = 0.75 * (str(number) in words and not numbered)
+    return max(counted, 1.0 * bool(kinds.get(channel.unit, frozenset()) & set(words)))
 
 
 def _of_role(words: set[str], role: frozenset[str], others: frozenset[str]) -> float:

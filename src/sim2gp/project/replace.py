@@ -1,4 +1,4 @@
-"""A project file takes its place whole or not at all, once it has been read back."""
+"""A file takes its place whole or not at all, a project once it has been read back."""
 
 import json
 import os
@@ -27,15 +27,22 @@ def replace_project(path: Path, text: str, check: Callable[[Project], object]) -
 
     Raises whatever the loading or ``check`` raises; the old file is then untouched.
     """
+    replace_file(path, text.encode(), lambda aside: check(load_project(aside)))
+
+
+def replace_file(
+    path: Path, data: bytes, check: Callable[[Path], object] = lambda aside: None
+) -> None:
+    """Write ``data`` beside ``path``, and put it in place once ``check`` has passed."""
     handle, aside = tempfile.mkstemp(
-        dir=path.parent, prefix=f".{path.stem}-", suffix=".toml"
+        dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix
     )
     try:
-        with os.fdopen(handle, "w", encoding="utf-8", newline="") as file:
-            file.write(text)
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
             file.flush()
             os.fsync(file.fileno())
-        check(load_project(aside))
+        check(Path(aside))
         mode = path.stat().st_mode & 0o777 if path.exists() else 0o666 & ~_umask()
         os.chmod(aside, mode)
         os.replace(aside, path)
