@@ -1,14 +1,15 @@
 """Do 95 % intervals hold? Coverage under coloured noise and under missing friction.
 
-    python benchmarks/intervals.py [--sets N] [--workers N] [--out DIR]
+    python benchmarks/intervals.py [--sets N] [--workers N] [--sysid] [--out DIR]
 
 Ten seconds of a hidden two-link arm (`interval_arms.py`) are fitted with the likelihood
 of `sim2gp identify`; masses and dampings are unknown. Beside the plain intervals
 (Laplace) and the library's stand what it was chosen from (`interval_candidates.py`) and
 an oracle that knows what is wrong: the noise's true covariance, or a simulator with the
-missing term. Coverage with its 95 % interval (Clopper-Pearson), the mean interval score
-(Gneiting and Raftery 2007; lower is better) over the oracle's, and the median width
-over the plain one's. Finished cells are not computed again.
+missing term; `--sysid` adds mujoco.sysid (`interval_sysid.py`, extra `bench`), which is
+told the start. Coverage with its 95 % interval (Clopper-Pearson), the mean interval
+score (Gneiting and Raftery 2007; lower is better) over the oracle's, and the median
+width over the plain one's. Finished cells are not computed again.
 """
 
 import argparse
@@ -21,6 +22,7 @@ import interval_candidates as candidates
 import jax
 import numpy as np
 from interval_arms import CONDITIONS, NAMES, NOISE, recordings, with_friction
+from interval_sysid import intervals
 from scipy.stats import beta
 
 from sim2gp.diagnose.intervals import corrected, pulls_of_windows
@@ -41,6 +43,7 @@ METHODS = {
     "five_parts": "five parts",
     "oracle": "oracle",
 }
+SYSID = {"sysid": "mujoco.sysid"}
 ASKED = {"white": (0.92, 0.98)}  # of the others:
 ASKED_ELSE, ASKED_SCORE = (0.90, 0.99), 1.5
 Z = 1.959963984540054
@@ -50,6 +53,12 @@ class Job(NamedTuple):
     condition: str
     chunk: int
     out: Path
+    sysid: bool = False
+
+    @property
+    def name(self) -> str:
+        """Of its cell."""
+        return f"{self.condition}_{self.chunk}{'_sysid' * self.sysid}"
 
 
 @in_float64
@@ -59,8 +68,14 @@ def work(job: Job) -> dict[str, Any]:
     data = recordings(condition, CHUNK, job.chunk)
     system, key = UniformRodArm(), jax.random.key(job.chunk)
     prior_sd = np.asarray(system.parameters.prior().sd())
-    found: dict[str, list[Any]] = {name: [] for name in METHODS}
+    methods = SYSID if job.sysid else METHODS
+    found: dict[str, list[Any]] = {name: [] for name in methods}
     for s in range(CHUNK):
+        if job.sysid:
+            centre, sd = intervals(data, s, system.parameters)
+            error = centre - data.truth[s] / prior_sd
+            found["sysid"].append([_rounded(error), _rounded(sd)])
+            continue
         windows, of = cut([data.log(s)], system, window=WINDOW)
         belief = fit_windows(system, windows, key=key)
         pulls = pulls_of_windows(belief, windows, np.asarray([k for k, _ in of]))
@@ -137,7 +152,9 @@ def lines(summary: dict[str, Any]) -> list[str]:
         out.append(f"{'':30s}{titles}")
         head = f"{'coverage':>14s}{'width':>6s}{'score':>6s} "
         out.append(f"{'':30s}{head * len(NAMES)}")
-        for method, title in METHODS.items():
+        for method, title in (METHODS | SYSID).items():
+            if method not in entry["methods"]:
+                continue
             row = f"{title:30s}"
             for c in entry["methods"][method].values():
                 low, high = c["between"]
@@ -166,25 +183,29 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sets", type=int, default=200)
     parser.add_argument("--workers", type=int, default=cores())
+    parser.add_argument("--sysid", action="store_true")
     parser.add_argument("--out", type=Path, default=Path("results/intervals"))
     options = parser.parse_args()
     chunks = -(-options.sets // CHUNK)
     cells, arguments = Cells(options.out), {"window": WINDOW, "sets": CHUNK}
     groups, found = [], {}
     for name in CONDITIONS:
-        jobs = [Job(name, k, options.out) for k in range(chunks)]
-        done = {j: cells.load(f"{name}_{j.chunk}", arguments) for j in jobs}
-        found |= {j: v for j, v in done.items() if v is not None}
-        groups.append([j for j in jobs if done[j] is None])
+        for sysid in (False, True)[: 1 + options.sysid]:
+            jobs = [Job(name, k, options.out, sysid) for k in range(chunks)]
+            done = {j: cells.load(j.name, arguments) for j in jobs}
+            found |= {j: v for j, v in done.items() if v is not None}
+            groups.append([j for j in jobs if done[j] is None])
     for job, values in spread(work, groups, options.workers):
-        found[job] = cells.save(f"{job.condition}_{job.chunk}", arguments, values)
-        print(f"{len(found)}/{chunks * len(CONDITIONS)}", end="\r", file=sys.stderr)
+        found[job] = cells.save(job.name, arguments, values)
+        print(f"{len(found)}", end="\r", file=sys.stderr)
     summary: dict[str, Any] = {"sets": chunks * CHUNK, "conditions": {}}
     for name, condition in CONDITIONS.items():
-        parts = [found[Job(name, k, options.out)] for k in range(chunks)]
-        joined = {m: np.concatenate([p[m] for p in parts]) for m in METHODS}
-        about = {"title": condition.title, "methods": table(joined)}
-        summary["conditions"][name] = about
+        joined: dict[str, list[Any]] = {}
+        for job in sorted(found, key=lambda j: j.chunk):
+            for method, values in found[job].items() if job.condition == name else ():
+                joined.setdefault(method, []).extend(values)
+        figures = table({method: np.asarray(v) for method, v in joined.items()})
+        summary["conditions"][name] = {"title": condition.title, "methods": figures}
     text = "\n".join(lines(summary))
     print(text)
     options.out.mkdir(parents=True, exist_ok=True)
