@@ -41,6 +41,7 @@ from sim2gp.models.sim2gp import PRIOR_NOISE
 from sim2gp.parameters import unknown_parameter
 from sim2gp.project import Project, load_project
 from sim2gp.runs import Progress, new_run
+from sim2gp.systems import alone
 from sim2gp.systems.base import AbstractSystem, index_of
 from sim2gp.types import in_float64
 
@@ -65,6 +66,7 @@ class Asked:
     start: Mapping[str, float]
     period: float | None
     starts: int = 1
+    configuration: str | None = None
 
     def words(self) -> str:
         """As they were typed."""
@@ -81,6 +83,8 @@ class Asked:
             parts += [f"{option} {' '.join(pairs)}"] if pairs else []
         parts += [f"--period {self.period:g}"] if self.period else []
         parts += [f"--starts {self.starts}"]
+        if self.configuration:
+            parts += [f"--configuration {self.configuration}"]
         return " ".join(parts)
 
 
@@ -141,6 +145,7 @@ def setting(source: Path, asked: Asked) -> tuple[Project, Experiment, list[str]]
         found = restored(source)
         project, system, belief = found.project, found.project.system, found.posterior
         names, noise, period = found.outputs, found.noise, found.period
+    system, belief = alone(system, belief, asked.configuration)
     states = [channel.name for channel in system.physical_states]
     period = asked.period or period
     steps = round(asked.seconds / period)

@@ -22,11 +22,11 @@ from sim2gp.diagnose.importance import check_windows
 from sim2gp.diagnose.intervals import Corrected, corrected, pulls_of_windows
 from sim2gp.diagnose.residuals import misfit_of_windows
 from sim2gp.errors import InputError
+from sim2gp.experiments.configurations import told
 from sim2gp.experiments.prediction import (
     channels,
     cut_logs,
     drawn,
-    load,
     recordings,
     rows_for,
     trace_arrays,
@@ -62,7 +62,7 @@ def run(
     """
     started = time.perf_counter()
     found = load_project(project)
-    logs = load(found)
+    logs = found.load_logs()
     with new_run(out, "identify") as writer, progress.task("identify", 4) as task:
         windows, of = cut_logs(found, logs)
         task.advance(f"{len(windows)} windows")
@@ -267,6 +267,7 @@ def _summarise(
         "warnings": [str(note) for log in logs for note in log.notes],
         "trace_note": "Forecasts of half a second from causal starts, of the logs that "
         "were fitted; they know the recorded inputs and nothing else of the future.",
+        **told(system.parameters, logs, found["parameters"]),
         **found,
     }
 

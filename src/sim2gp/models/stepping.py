@@ -135,6 +135,7 @@ def samples_of(logs: Sequence[Log], stepper: AbstractSystem, period: float) -> S
         start,
         np.zeros_like(start),
         np.zeros(len(measured)),
+        np.asarray([logs[k].group for k, _, _ in spans], np.int32),
         tuple(names.index(name) for name in measured),
     )
     return Samples(

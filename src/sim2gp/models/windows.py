@@ -20,7 +20,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp.ahead import ahead
 from sim2gp.arrowhead import Blocks, Noise, eliminate
@@ -44,7 +44,8 @@ class Windows(eqx.Module):
     since the previous row, s. ``knots`` and ``area`` are the times and values at which
     the integral of the held input bends; between them it is straight, so its mean over
     any delayed interval is exact. ``outputs`` are the indices of the measured states,
-    ``floor`` the sensors' resolution.
+    ``floor`` the sensors' resolution. ``configuration`` is the machine's, an index into
+    its table's.
     """
 
     y: Float[AnyArray, "W L c"]
@@ -55,6 +56,7 @@ class Windows(eqx.Module):
     start: Float[AnyArray, "W n"]
     start_sd: Float[AnyArray, "W n"]
     floor: Float[AnyArray, " c"]
+    configuration: Int[AnyArray, " W"]
     outputs: tuple[int, ...] = eqx.field(static=True)
 
     def __len__(self) -> int:
@@ -165,7 +167,8 @@ class _Windowed(AbstractLikelihood):
         """``prediction - y`` of one window at ``x = (z, e)``, zero where masked."""
         p = self.prior.mean.size
         tt = self.prior.mean + self.prior.scale @ x[:p]
-        params = self.system.record(self.system.parameters.values(tt))
+        values = self.system.parameters.values(tt, window.configuration)
+        params = self.system.record(values)
         x0 = window.start + window.start_sd * x[p:]
         states = simulate(self.system, params, window, x0)
         r = states[:, np.asarray(window.outputs)] - window.y
@@ -276,9 +279,11 @@ def _linearise(
     n = windows.start.shape[1]
 
     def rows(x: Array) -> tuple[Array, ...]:
-        params = system.record(system.parameters.values(tt + prior.scale @ x[:-n]))
+        own = tt + prior.scale @ x[:-n]
 
         def one(window: Windows, start: Array) -> tuple[Array, ...]:
+            values = system.parameters.values(own, window.configuration)
+            params = system.record(values)
             states = simulate(system, params, window, start + window.start_sd * x[-n:])
             r = states[:, np.asarray(window.outputs)] - window.y
             u = inputs_of(window, system.delays(params))

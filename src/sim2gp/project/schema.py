@@ -84,13 +84,16 @@ class ResampleSpec(Section):
 
 
 class LogSpec(Section):
-    """A group of files with the same columns and the same fixed values.
+    """A group of files with the same columns, of the machine in one configuration.
 
     ``time`` is a column (default "time"; in a bag "header" or "log"), or rows have a
-    fixed ``period``. ``episode`` is a column of episode numbers.
+    fixed ``period``. ``episode`` is a column of episode numbers. ``name`` is that of
+    the configuration (default the group's number): ``fixed`` are constants known in it
+    alone, ``free`` those that it does not share with the other groups.
     """
 
     files: Annotated[list[str], Field(min_length=1)]
+    name: Annotated[str, Field(pattern=r"^[^\s@]+$")] | None = None
     time: str | ColumnSpec | None = None
     period: Positive | None = None
     episode: str | None = None
@@ -99,6 +102,7 @@ class LogSpec(Section):
     exclude: list[Pair] = []
     columns: dict[str, str | FiniteFloat | ColumnSpec]
     fixed: dict[str, FiniteFloat] = {}
+    free: list[str] = []
     drop_nonfinite: bool = False
 
 
@@ -165,6 +169,16 @@ class ProjectSpec(Section):
     rates: dict[str, Positive] = {}
     model: ModelSpec = ModelSpec()
     planner: PlannerSpec = PlannerSpec()
+
+    def configuration(self, group: int) -> str:
+        """Name of the configuration that a group of logs recorded."""
+        return self.logs[group].name or str(group + 1)
+
+    @property
+    def configurations(self) -> tuple[str, ...]:
+        """All of them, in the order of the file."""
+        names = (self.configuration(i) for i in range(len(self.logs)))
+        return tuple(dict.fromkeys(names))
 
 
 def validated(source: Source) -> ProjectSpec:
