@@ -13,17 +13,28 @@ from linear_system import linear
 from payload_arm import TRUTH, arm, log
 from sim2gp.arrowhead import Noise
 from sim2gp.configurations import Configuration
+from sim2gp.diagnose.residuals import misfit_of_windows
 from sim2gp.errors import InputError
 from sim2gp.gaussian import Gaussian
 from sim2gp.laplace import Fit, minimise
 from sim2gp.logs import Log
+from sim2gp.models import Sim2GP
 from sim2gp.models import windows as likelihood
 from sim2gp.models.cutting import cut
 from sim2gp.models.windows import Windows, WindowsBelief, fit_windows
 from sim2gp.parameters import Parameter
-from sim2gp.systems import AbstractSystem, Actuated, alone, configured
+from sim2gp.systems import (
+    ODE,
+    AbstractSystem,
+    Actuated,
+    BlackBox,
+    Channel,
+    alone,
+    configured,
+)
 from sim2gp.systems.actuator import actuator_prior
 from sim2gp.systems.configured import own_table
+from sim2gp.transitions import Transitions
 from sim2gp.types import in_float64
 
 KEY = jax.random.key(0)
@@ -136,8 +147,7 @@ def test_what_makes_no_sense_is_refused() -> None:
     unknown = refused(BARE, LOADED, **{"payload @ bare": arm().parameters["payload"]})
     assert "E145 unknown parameter: got payload @ bare" in unknown
     held = arm().parameters.replace(payload=0.2)
-    machine = eqx.tree_at(lambda s: s, arm(), arm())
-    machine = type(machine)(arm().function, held, arm().channels, arm().inputs)
+    machine = ODE(arm().function, held, arm().channels, arm().inputs)
     with pytest.raises(InputError, match=r"E145 a fixed .* got payload = 0\.2"):
         configured(machine, [LOADED])
 
@@ -273,9 +283,97 @@ def test_a_payload_is_found_and_the_arm_is_known_better(
             assert (mean, sd) == pytest.approx((p.mean, p.sd))
 
 
-def test_a_value_that_is_wrong_is_seen(logs: tuple[Log, Log]) -> None:
-    """0.15 kg were there; 0.25 are stated. The bare logs say what the arm is."""
+def test_a_value_that_is_wrong_is_seen(
+    joined: tuple[WindowsBelief, Windows],
+) -> None:
+    """0.15 kg were there; 0.05 are stated. The bare log says what the arm is."""
+    belief, windows = joined
+    assert not misfit_of_windows(belief, windows).alarm
+    known = Configuration("loaded", fixed=(("payload", 0.05),))
+    wrong = fit_windows(joint(BARE, known), windows, key=KEY)
+    assert wrong.system.parameters.names == SHARED
+    assert float(wrong.log_evidence) < float(belief.log_evidence) - 50.0
+    assert misfit_of_windows(wrong, windows).alarm
 
 
-def test_the_program_does_not_grow_with_configurations() -> None:
+@in_float64
+def test_the_program_does_not_grow_with_configurations(
+    logs: tuple[Log, Log],
+) -> None:
     """The simulation is traced as often for three configurations as for one."""
+    traced: list[int] = []
+
+    def counted(k: Any, s: Any, a: Any) -> Any:
+        traced.append(1)
+        return arm().function(k, s, a)
+
+    machine = ODE(counted, arm().parameters, arm().channels, arm().inputs)
+    third = Configuration("third", own=("weight",))
+    windows, _ = cut(logs, machine, window=0.2)
+    counts = []
+    for system in (machine, configured(machine, [BARE, LOADED, third])):
+        prior = system.parameters.prior()
+        model = likelihood.likelihood(system, prior, jax.tree.map(jnp.asarray, windows))
+        nothing = jnp.zeros(prior.mean.size), jnp.zeros_like(windows.start)
+        traced.clear()
+        jax.make_jaxpr(model.blocks)(*nothing)
+        counts.append(len(traced))
+    assert counts[0] == counts[1] > 0
+
+
+@in_float64
+def test_one_step_is_fitted_jointly_as_well(getkey: Any) -> None:
+    """Of a linear machine: regression by configuration, rows in any order."""
+    a = Configuration("a", (("k1", 0.5),))
+    system = configured(linear(2, 1), [a, Configuration("b", own=("k1",))])
+    assert system.parameters.names == ("k0", "k1 @ b")
+    rng = np.random.default_rng(5)
+    A, group = rng.normal(size=(30, 1, 2)), rng.integers(0, 2, 30)
+    k1 = np.where(group == 0, 0.5, -1.0)
+    y = A[..., 0] * 1.5 + A[..., 1] * k1[:, None] + 0.1 * rng.normal(size=(30, 1))
+    data = Transitions.of(np.zeros_like(y), A.reshape(30, -1), y, group)
+    more = data.extend(data.state[:2], data.action[:2], data.next_state[:2])
+    assert more.configuration is not None
+    assert more.configuration[:32].tolist() == [*group, 0, 0]
+    model = Sim2GP(system, dt=1.0)
+    belief = model.fit(model.init(getkey()), data, key=getkey())
+    X = np.stack([A[:, 0, 0], A[:, 0, 1] * group], axis=1) / float(belief.noise[0])
+    right = (y[:, 0] - 0.5 * A[:, 0, 1] * (1 - group)) / float(belief.noise[0])
+    precision = X.T @ X + np.eye(2)
+    scale = np.asarray(belief.posterior.scale)
+    np.testing.assert_allclose(scale @ scale.T, np.linalg.inv(precision), rtol=1e-8)
+    mean = np.linalg.solve(precision, X.T @ right)
+    np.testing.assert_allclose(belief.posterior.mean, mean, rtol=1e-8)
+    with pytest.raises(InputError, match="E152"):  # a draw is of one configuration
+        belief.latent(jnp.zeros(1), jnp.zeros(2))
+
+
+def test_rows_on_the_host_have_constants_of_their_own() -> None:
+    """A known value beyond the prior's bounds is simulated as it is."""
+    inside = Parameter("k", "1", "gain", "box", 0.5, 2.0)
+    asked: list[float] = []
+
+    def step(params: Any, s: Any, a: Any, h: Any) -> Any:
+        asked.extend(np.atleast_1d(params["k"]).tolist())
+        return s + np.asarray(params["k"] * h)[..., None] * a
+
+    channel = Channel("x", "m")
+    machine = BlackBox(step, [inside], [channel], [Channel("u", "1")], batched=True)
+    known = Configuration("a", (("k", 5.0),))
+    system = configured(machine, [known, Configuration("b")])
+
+    @in_float64
+    def slopes() -> tuple[np.ndarray, np.ndarray]:
+        def f(tt: Any, which: Any) -> Any:
+            s, a = jnp.ones(1), 2.0 * jnp.ones(1)
+            return system.transition(tt, s, a, 0.1, which)
+
+        tt, which = jnp.zeros(1), jnp.asarray([0, 1])
+        value = jax.vmap(f, in_axes=(None, 0))(tt, which)
+        return value, jax.vmap(jax.jacfwd(f), in_axes=(None, 0))(tt, which)
+
+    value, J = slopes()
+    np.testing.assert_allclose(value[:, 0], [2.0, 1.25], rtol=1e-12)
+    # dk/dtt is a quarter of the box at its middle.
+    np.testing.assert_allclose(J[:, 0, 0], [0.0, 0.2 * 1.5 / 4.0], rtol=1e-7)
+    assert max(asked) <= 5.0 + 1e-3

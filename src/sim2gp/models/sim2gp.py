@@ -194,16 +194,19 @@ class _OneStep(AbstractLikelihood):
         """Residuals ``f - y`` and their Jacobian in ``z``; masked rows are zero."""
         model, d = self.model, len(self.model.system.physical_states)
 
-        def one(s: Array, a: Array, s2: Array, valid: Array) -> tuple[Array, Array]:
+        def one(
+            s: Array, a: Array, s2: Array, valid: Array, which: Array | None
+        ) -> tuple[Array, Array]:
             def f(z: Array) -> Array:
                 tt = model.prior.mean + model.prior.scale @ z
-                return model.system.transition(tt, s, a, model.dt)[:d]
+                return model.system.transition(tt, s, a, model.dt, which)[:d]
 
             value, J = linearized.value_and_jacobian(f, z)
             return jnp.where(valid, value - s2[:d], 0.0), jnp.where(valid, J, 0.0)
 
         data = self.data
-        return jax.vmap(one)(data.state, data.action, data.next_state, data.mask)
+        rows = data.state, data.action, data.next_state, data.mask, data.configuration
+        return jax.vmap(one)(*rows)
 
     def blocks(self, z: Float[Array, " p"], e: Float[Array, "1 0"]) -> Blocks:
         """All data as one window; a step of exact states has no nuisances ``e``."""
