@@ -79,8 +79,8 @@ MUTANTS = (
     Mutant(
         "prior mean omitted",
         LS,
-        "z[:, None]], axis=1)\n    return stack(data, prior)",
-        "0.0 * z[:, None]], axis=1)\n    return stack(data, prior)",
+        "z[:, None]], axis=1)\n    return stack(data, prior, *more)",
+        "0.0 * z[:, None]], axis=1)\n    return stack(data, prior, *more)",
         ORACLE,
     ),
     Mutant(

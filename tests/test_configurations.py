@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from linear_system import linear
+from linear_system import linear, windows_of
 from payload_arm import TRUTH, arm, log
 from sim2gp.arrowhead import Noise
 from sim2gp.configurations import Configuration
@@ -186,19 +186,7 @@ def test_a_linear_machine_has_the_closed_form() -> None:
     X[group == 1, :, 3] = A[group == 1, :, 2]
     known[group == 0] = 0.5 * A[group == 0, :, 2]
     y = X @ np.asarray([*truth.values()]) + known + 0.1 * rng.normal(size=(N, d))
-    windows = Windows(
-        np.stack([np.zeros_like(y), y], axis=1),
-        np.broadcast_to(np.asarray([False, True])[None, :, None], (N, 2, d)),
-        np.broadcast_to(np.asarray([0.0, 1.0])[None], (N, 2)),
-        np.broadcast_to(np.asarray([0.0, 1.0])[None], (N, 2)),
-        np.stack([np.zeros((N, d * 3)), A.reshape(N, -1)], axis=1),
-        np.zeros((N, d)),
-        np.zeros((N, d)),
-        np.full(d, 1e-2),
-        group.astype(np.int32),
-        (0, 1),
-    )
-    belief = fit_windows(system, windows, key=KEY)
+    belief = fit_windows(system, windows_of(A, y, group), key=KEY)
     sd = np.asarray(belief.noise)
     white = (X / sd[None, :, None]).reshape(-1, 4)
     mu0, sd0 = np.asarray([0.0, 0.0, 1.5, 0.0]), np.asarray([1.0, 1.0, 0.3, 1.0])

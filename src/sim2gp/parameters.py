@@ -23,6 +23,7 @@ from sim2gp.configurations import Configuration, Which, valued
 from sim2gp.errors import InputError, nearest
 from sim2gp.gaussian import Gaussian
 from sim2gp.types import Scalar
+from sim2gp.weighed import Weighed, residuals
 
 #: Standard deviation of a boxed parameter's virtual value: the box is nearly uniform
 #: and the sigmoid stays out of saturation.
@@ -225,12 +226,14 @@ class Parameters(eqx.Module):
     """The table of a system's constants: those to be learned, and those held fixed.
 
     Of a machine in several ``configurations``, the columns of all of them: ``mass`` for
-    those that share it, ``mass @ payload`` where a configuration has its own.
+    those that share it, ``mass @ payload`` where a configuration has its own. Sums of
+    constants that were ``weighed`` are part of every fit.
     """
 
     free: tuple[Parameter, ...] = eqx.field(static=True)
     fixed: tuple[tuple[str, float], ...] = eqx.field(static=True, default=())
     configurations: tuple[Configuration, ...] = eqx.field(static=True, default=())
+    weighed: tuple[Weighed, ...] = eqx.field(static=True, default=())
 
     def __len__(self) -> int:
         return len(self.free)
@@ -288,10 +291,22 @@ class Parameters(eqx.Module):
 
         ``configuration`` is an index; only a table that has several needs it (E147).
         """
+        return valued(self._columns(tt), self.configurations, configuration)
+
+    def known(self, prior: Gaussian, z: Float[Array, " p"]) -> Float[Array, "q p1"]:
+        """Rows ``[K r]`` of what was weighed, in its sd, at ``tt = mu0 + L0 z``."""
+
+        def r(z: Array) -> Array:
+            values = self._columns(prior.mean + prior.scale @ z)
+            return residuals(self.weighed, values, z)
+
+        return jnp.concatenate([jax.jacfwd(r)(z), r(z)[:, None]], axis=1)
+
+    def _columns(self, tt: Float[Array, " p"]) -> dict[str, Scalar]:
+        """Every column, and every fixed value."""
         theta = self.constrain(tt)
         values = {name: jnp.asarray(v, tt.dtype) for name, v in self.fixed}
-        values |= {p.name: theta[i] for i, p in enumerate(self.free)}
-        return valued(values, self.configurations, configuration)
+        return values | {p.name: theta[i] for i, p in enumerate(self.free)}
 
     def prior(self) -> Gaussian:
         """The independent Gaussian over virtual values; call it under `in_float64`."""
@@ -327,12 +342,14 @@ class Parameters(eqx.Module):
                 free.append(dataclasses.replace(value, name=name))
             else:
                 fixed.append((name, float(value)))
-        return Parameters(tuple(free), tuple(fixed), self.configurations)
+        return dataclasses.replace(self, free=tuple(free), fixed=tuple(fixed))
 
     def merge(self, other: "Parameters") -> "Parameters":
         """Both tables as one, this one's constants first."""
-        both = self.configurations + other.configurations
-        return Parameters(self.free + other.free, self.fixed + other.fixed, both)
+        mine, more = (
+            (x.free, x.fixed, x.configurations, x.weighed) for x in (self, other)
+        )
+        return Parameters(*(a + b for a, b in zip(mine, more, strict=True)))  # type: ignore[arg-type]
 
     def _groups(self, dtype: Any) -> list[tuple[str, np.ndarray, Any, Any]]:
         """Free constants grouped by map, so that each map is one vector operation."""

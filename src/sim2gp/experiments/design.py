@@ -37,6 +37,7 @@ from sim2gp.experiments.identify import restored
 from sim2gp.experiments.prediction import units
 from sim2gp.experiments.record import provenance
 from sim2gp.models.features import Encoding
+from sim2gp.models.informed import informed_prior
 from sim2gp.models.sim2gp import PRIOR_NOISE
 from sim2gp.parameters import unknown_parameter
 from sim2gp.project import Project, load_project
@@ -138,7 +139,7 @@ def setting(source: Path, asked: Asked) -> tuple[Project, Experiment, list[str]]
     if source.suffix == ".toml":
         project = load_project(source)
         system = project.system
-        belief, names = system.parameters.prior(), _measured(project)
+        belief, names = informed_prior(system.parameters), _measured(project)
         noise, period = _stated_noise(project, names), PERIOD
         notes.append("no log was used: what is believed is the project's priors")
     else:

@@ -71,11 +71,12 @@ def run(
         grid = evaluation_windows(logs, found.system, longest=CURVE[-1])
         compile_forecast(found.system, grid.windows)
         compile_linearise(found.system, windows)
-        belief = fit_windows(found.system, windows, key=key, robust=robust)
+        fitted = belief = fit_windows(found.system, windows, key=key, robust=robust)
         task.advance("posterior")
         band = band_of(belief, grid, logs)
         names = channels(found.system, windows)
         picture = drawn(found.system, belief.posterior, band, grid)
+        belief = belief.informed()
         honest = corrected(
             belief.prior, belief.posterior, pulls_of_windows(belief, windows, of)
         )
@@ -86,7 +87,7 @@ def run(
         line = f"sim2gp identify {project} --seed {seed}"
         if check:
             key = jax.random.fold_in(jax.random.key(seed), 2)
-            exact = check_windows(belief, windows, key=key)
+            exact = check_windows(fitted, windows, key=key)
             summary["check"] = exact.as_dict(found.system.parameters.names)
             line += " --check"
         folder = Path(os.path.abspath(project)).parent

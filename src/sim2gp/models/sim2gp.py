@@ -15,8 +15,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from sim2gp.arrowhead import Blocks, Noise
+from sim2gp.em import expectation
 from sim2gp.gaussian import LOG_2PI, Gaussian
-from sim2gp.laplace import AbstractLikelihood, Fit, expectation, multi_start
+from sim2gp.laplace import AbstractLikelihood, Fit, multi_start
 from sim2gp.least_squares import factor, gauss_newton_step, over, stack
 from sim2gp.linalg import triangular
 from sim2gp.models import linearized
@@ -214,6 +215,10 @@ class _OneStep(AbstractLikelihood):
         r, J = self.rows(z)
         return jax.vmap(factor, in_axes=1)(J, r)[None]
 
+    def known(self, z: Float[Array, " p"]) -> Float[Array, "q p1"]:
+        """Of sums that were weighed."""
+        return self.model.system.parameters.known(self.model.prior, z)
+
     def curvature(
         self, z: Float[Array, " p"], gradient: Float[Array, " p"]
     ) -> Float[Array, "p p"]:
@@ -325,7 +330,8 @@ def _hessian(belief: Sim2GPBelief, data: Transitions) -> Float[Array, "p p"]:
 
     def loss(z: Array) -> Scalar:
         r = likelihood.rows(z)[0] / belief.noise[None]
-        return 0.5 * jnp.sum(r**2) + 0.5 * z @ z
+        apart = likelihood.known(z)[:, -1]
+        return 0.5 * (jnp.sum(r**2) + z @ z + apart @ apart)
 
     offset = belief.posterior.mean - belief.prior.mean
     return jax.hessian(loss)(jnp.linalg.solve(belief.prior.scale, offset))

@@ -24,9 +24,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp.ahead import ahead
 from sim2gp.arrowhead import Blocks, Noise, eliminate
+from sim2gp.em import expectation
 from sim2gp.gaussian import Gaussian
-from sim2gp.laplace import AbstractLikelihood, Fit, expectation, multi_start
+from sim2gp.laplace import AbstractLikelihood, Fit, multi_start
 from sim2gp.least_squares import factor
+from sim2gp.models.informed import informed
 from sim2gp.models.linearized import jacobian_by_columns, value_and_jacobian
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import AnyArray, Key, Scalar, in_float64
@@ -155,6 +157,16 @@ class WindowsBelief(eqx.Module):
     starts: Float[Array, "W n"]
     log_evidence: Scalar
 
+    @in_float64
+    def informed(self) -> "WindowsBelief":
+        """The same belief, with what was weighed counted as prior."""
+        table, L0 = self.system.parameters, self.prior.scale
+        if not table.weighed:
+            return self
+        prior = informed(table, self.prior, self.posterior.mean)
+        factor = self.information @ jnp.linalg.solve(L0, prior.scale)
+        return eqx.tree_at(lambda b: (b.prior, b.information), self, (prior, factor))
+
 
 class _Windowed(AbstractLikelihood):
     """The likelihood as least squares: per-window functions, vmapped at the edge."""
@@ -185,6 +197,10 @@ class _Windowed(AbstractLikelihood):
 
         found: Array = self.windows.each(one, e)
         return found
+
+    def known(self, z: Float[Array, " p"]) -> Float[Array, "q p1"]:
+        """Of sums that were weighed."""
+        return self.system.parameters.known(self.prior, z)
 
     def curvature(
         self, z: Float[Array, " p"], gradient: Float[Array, " p"]
@@ -334,8 +350,9 @@ def fit_windows(
 ) -> WindowsBelief:
     """Posterior of the constants given windows of logs.
 
-    Noise by EM, one Student-t weight per window where ``robust``. Raises
-    `NotConverged`, `NotFinite` or `DeadParameters`.
+    Noise by EM, one Student-t weight per window where ``robust``. A ``prior`` is what
+    is believed but for what was weighed. Raises `NotConverged`, `NotFinite` or
+    `DeadParameters`.
     """
     prior = system.parameters.prior() if prior is None else prior
     p = prior.mean.size

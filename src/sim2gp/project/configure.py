@@ -1,4 +1,4 @@
-"""Groups of logs as configurations of one machine: what each knows or has alone.
+"""Groups of logs as configurations of one machine, and sums that were weighed.
 
     [[logs]]                                  [[logs]]
     name = "bare"                             name = "payload"
@@ -18,6 +18,8 @@ from sim2gp.project.schema import PriorSpec, ProjectSpec
 from sim2gp.project.source import Source
 from sim2gp.systems import AbstractSystem, configured
 from sim2gp.systems.base import names_of
+from sim2gp.systems.configured import with_weighed
+from sim2gp.weighed import Weighed
 
 
 def in_configurations(
@@ -59,6 +61,31 @@ def in_configurations(
             raise located(error, where) from error
     priors = _priors(spec, source, system, found)
     return configured(system, found, priors)
+
+
+def weighed(
+    spec: ProjectSpec, source: Source, system: AbstractSystem
+) -> AbstractSystem:
+    """The machine with the sums that the file says were measured (E142 to E160)."""
+    for i, stated in enumerate(spec.weighed):
+        where = source.where("weighed", i, "of")
+        given = stated.weights
+        weights = tuple([1.0] * len(stated.of) if given is None else given)
+        if len(weights) != len(stated.of):
+            raise InputError(
+                "E160",
+                "weights of a sum",
+                where=source.where("weighed", i, "weights"),
+                got=f"{len(weights)} weights",
+                expected=f"{len(stated.of)}, one for each constant",
+                fix="state one for each, or leave weights out",
+            )
+        found = Weighed(tuple(stated.of), weights, stated.value, stated.sd)
+        try:
+            system = with_weighed(system, [found])
+        except InputError as error:
+            raise located(error, where) from error
+    return system
 
 
 def own_columns(parameters: Mapping[str, object]) -> list[str]:

@@ -165,7 +165,7 @@ def load_project(
     source, spec = read_spec(path)
     # Imported late: a misspelt key is reported before the simulators are loaded.
     from sim2gp.project.build import build_system, check_names
-    from sim2gp.project.configure import in_configurations
+    from sim2gp.project.configure import in_configurations, weighed
 
     if is_model(spec.system):
         from sim2gp.project.model import build_model
@@ -175,7 +175,7 @@ def load_project(
     else:
         system = build_system(spec, source, system_class(spec.system))
     check_names(spec, source, system)
-    system = in_configurations(spec, source, system)
+    system = weighed(spec, source, in_configurations(spec, source, system))
     return Project(path, source, spec, system)
 
 

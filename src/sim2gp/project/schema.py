@@ -1,7 +1,7 @@
 """The shape of a project file, section by section, and its faults in one line each.
 
     system = "two_link"                           (or a model's file, "robot.xml")
-    [options]  [parameters.NAME]  [effects.CHANNEL.EFFECT]  [[logs]]
+    [options]  [parameters.NAME]  [effects.CHANNEL.EFFECT]  [[weighed]]  [[logs]]
     [actuators.INPUT]  [likelihood]  [task]  [limits]  [rates]  [model]  [planner]
 
 Types are strict: a number in quotes is text. A fault names the line of its key.
@@ -106,6 +106,15 @@ class LogSpec(Section):
     drop_nonfinite: bool = False
 
 
+class WeighedSpec(Section):
+    """A measured sum of constants, each times its weight (default 1)."""
+
+    of: Annotated[list[str], Field(min_length=1)]
+    weights: list[FiniteFloat] | None = None
+    value: FiniteFloat
+    sd: Positive
+
+
 class ActuatorSpec(Section):
     """Gain, offset, delay of one input: a number fixes, a table or "free" learns."""
 
@@ -161,6 +170,7 @@ class ProjectSpec(Section):
     options: dict[str, Any] = {}
     parameters: dict[str, FiniteFloat | PriorSpec] = {}
     effects: dict[str, dict[str, FiniteFloat | EffectSpec]] = {}
+    weighed: list[WeighedSpec] = []
     logs: list[LogSpec] = []
     actuators: dict[str, ActuatorSpec] = {}
     likelihood: LikelihoodSpec = LikelihoodSpec()
@@ -225,6 +235,8 @@ def _keys_at(path: Path_) -> list[str]:
     elif section == "logs":
         inner = ResampleSpec if "resample" in path else ColumnSpec
         model = inner if len(path) > 2 else LogSpec
+    elif section == "weighed":
+        model = WeighedSpec
     elif section:
         model = type(ProjectSpec.model_fields[str(section)].default)
     return list(model.model_fields)

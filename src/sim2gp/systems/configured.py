@@ -1,5 +1,7 @@
 """A machine with another table of constants: of several configurations, or of one.
 
+What was weighed is part of a table as well (`with_weighed`).
+
 ``configured(system, [Configuration("bare", fixed=...), Configuration("payload", own=...
 )])`` is one machine for a joint fit: windows and transitions say which configuration
 each row is of. `alone` is the machine as it stands in one of them, for whoever acts on
@@ -21,6 +23,7 @@ from sim2gp.gaussian import Gaussian
 from sim2gp.parameters import Parameter, Parameters, unknown_parameter
 from sim2gp.systems.base import AbstractSystem, Channel, names_of
 from sim2gp.types import Action, Scalar, State, in_float64
+from sim2gp.weighed import Weighed
 
 
 class Configured(AbstractSystem):
@@ -70,6 +73,14 @@ class Configured(AbstractSystem):
     ) -> Float[Array, "count m"]:
         return self.system.mean_inputs(params, held, dt, count)
 
+    def around(self, system: AbstractSystem) -> "Configured":
+        """Another version of the machine inside: its new free constants are shared."""
+        known, had = names_of(self.parameters), self.system.parameters.names
+        new = [p for p in system.parameters.free if p.name not in had]
+        freed = {p.name: p for p in new if p.name in known}  # a fixed one until now
+        more = Parameters(tuple(p for p in new if p.name not in known))
+        return Configured(system, self.parameters.merge(more).replace(**freed))
+
 
 def configured(
     system: AbstractSystem,
@@ -103,6 +114,35 @@ def configured(
     for c in configurations:
         _check_delays(system, both, c)
     return Configured(system, both)
+
+
+def with_weighed(system: AbstractSystem, sums: Sequence[Weighed]) -> Configured:
+    """The machine, of which some sums of constants were measured.
+
+    Of a machine in several configurations a sum names columns. Raises `InputError` E142
+    for a sum that the bounds rule out, E144 for its sd, E145 for an unknown constant,
+    one that stands twice, or a sum of fixed ones alone.
+    """
+    table = system.parameters
+    ranges = {p.name: (p.low, p.high) for p in table.free}
+    ranges |= {name: (value, value) for name, value in table.fixed}
+    for x in sums:
+        for name in x.of:
+            if name not in ranges:
+                raise unknown_parameter(name, ranges)
+        doubled = len(set(x.of)) < len(x.of)
+        if doubled or not set(x.of) & set(table.names):
+            raise InputError(
+                "E145",
+                "a constant twice in a sum" if doubled else "a sum without unknowns",
+                got=" + ".join(x.of),
+                expected="each constant once, one of them free",
+                fix="state its weight" if doubled else "give one of them a prior",
+            )
+        x.check(ranges)
+    more = dataclasses.replace(table, weighed=(*table.weighed, *sums))
+    inner = system.system if isinstance(system, Configured) else system
+    return Configured(inner, more)
 
 
 def _check(table: Parameters, configuration: Configuration) -> None:
@@ -172,6 +212,7 @@ def own_table(
             free.append(dataclasses.replace(p, name=constant))
             places.append(i)
             known.pop(constant, None)
+    # A posterior knows what was weighed already.
     return Parameters(tuple(free), tuple(known.items())), tuple(places)
 
 
