@@ -10,6 +10,8 @@ import pytest
 from sim2gp.configurations import Configuration
 from sim2gp.errors import InputError
 from sim2gp.experiments import apply, compare, design, evaluate, explain, identify
+from sim2gp.experiments.configurations import told
+from sim2gp.logs import Log
 from sim2gp.project import load_project
 from sim2gp.runs import Progress, load_run
 from sim2gp.systems import Furuta
@@ -99,6 +101,27 @@ def test_what_makes_no_sense_is_one_line(
     assert "\n" not in str(caught.value)
 
 
+def test_a_table_says_what_each_configuration_has(tmp_path: Path) -> None:
+    table = load_project(project_in(tmp_path, BARE, LOADED)).system.parameters
+    entries = {name: {"mean": 0.0061, "sd": 2e-4} for name in table.names}
+    t, none = np.arange(2.0), dict[str, Any]()
+    logs = [
+        Log("x", source, t, none, none, none, group=group)
+        for source, group in (("a", 0), ("a", 0), ("b", 1), ("c", 1))
+    ]
+    found = told(table, logs, entries)
+    assert found["configurations"] == {
+        "bare": {"recordings": 1, "fixed": {"alpha.payload": 0.0}, "own": []},
+        "loaded": {"recordings": 2, "fixed": {}, "own": ["alpha.payload"]},
+    }
+    assert found["tables"][0]["columns"] == ["", "bare", "loaded"]
+    assert found["tables"][0]["rows"] == [
+        ["recordings", "1", "2"],
+        ["alpha.payload", "0 (known)", "0.0061 kg +- 0.0002"],
+    ]
+    assert told(Furuta().parameters, logs, entries) == {}
+
+
 # A model of MuJoCo's: an arm whose hand weighs 0.1 kg, or some more.
 
 ARM = """
@@ -170,6 +193,7 @@ def run(folder: Path) -> Path:
 NAMES = ("joint/shoulder/damping", "body/arm/mass", "body/hand/mass @ loaded")
 
 
+@pytest.mark.nightly
 def test_a_joint_fit_names_each_column(run: Path) -> None:
     summary = load_run(run).summary
     found = summary["parameters"]
@@ -194,6 +218,7 @@ def test_a_joint_fit_names_each_column(run: Path) -> None:
     assert "body/hand/mass @ loaded" in page
 
 
+@pytest.mark.nightly
 def test_held_out_logs_are_of_one_configuration(
     run: Path, folder: Path, tmp_path: Path
 ) -> None:
@@ -215,6 +240,7 @@ def test_held_out_logs_are_of_one_configuration(
         error("laoded")
 
 
+@pytest.mark.nightly
 def test_an_experiment_is_for_the_machine_as_it_stands(run: Path) -> None:
     def setting(name: str | None) -> Any:
         nothing: dict[str, Any] = {}
@@ -237,6 +263,7 @@ def test_an_experiment_is_for_the_machine_as_it_stands(run: Path) -> None:
         setting(None)
 
 
+@pytest.mark.nightly
 def test_a_models_file_gets_the_constants_of_one(run: Path, tmp_path: Path) -> None:
     def applied(name: str | None) -> Any:
         return apply.run(
@@ -256,6 +283,7 @@ def test_a_models_file_gets_the_constants_of_one(run: Path, tmp_path: Path) -> N
         applied(None)
 
 
+@pytest.mark.nightly
 def test_commands_for_one_configuration_say_so(
     run: Path, folder: Path, tmp_path: Path
 ) -> None:

@@ -56,12 +56,8 @@ def residuals(
     weighed: Sequence[Weighed], values: Mapping[str, Scalar], like: Array
 ) -> Float[Array, " q"]:
     """How far each sum is from what was measured, in sd."""
-    rows = [
-        (
-            sum(w * values[name] for name, w in zip(x.of, x.weights, strict=True))
-            - x.value
-        )
-        / x.sd
-        for x in weighed
-    ]
+    rows = []
+    for x in weighed:
+        terms = zip(x.weights, x.of, strict=True)
+        rows.append((sum(w * values[name] for w, name in terms) - x.value) / x.sd)
     return jnp.stack(rows) if rows else jnp.zeros(0, like.dtype)
