@@ -84,7 +84,7 @@ def test_groups_become_configurations(tmp_path: Path) -> None:
         ((LOADED.replace("alpha.payload", "gravity"),), "", "E145"),
         ((LOADED.replace("alpha.payload", "arm_mass"),), "", "give arm_mass a prior"),
         ((BARE, LOADED.replace("loaded", "bare")), "", "stated in two ways"),
-        ((LOADED.replace('"loaded"', '"a b"'),), "", "key logs.name"),
+        ((LOADED.replace('"loaded"', '"a b"'),), "", "a word without spaces and @"),
         ((BARE,), '[parameters]\n"alpha.payload @ bare" = 1.0', "E145 duplicate"),
         ((BARE,), '[parameters."alpha.payload @ bare"]\nvalue = 1.0', "E145 unknown"),
         ((LOADED,), '[parameters."alpha.payload @ loaded"]\nvalue = 1.0', "fixed = "),

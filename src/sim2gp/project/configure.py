@@ -52,12 +52,14 @@ def in_configurations(
         group = spec.logs[i]
         fixed = tuple(group.fixed.items())
         found.append(Configuration(name, fixed, tuple(group.free)))
-        key = "fixed" if group.fixed else "free"
         try:  # alone, so that a fault has its group's place
             configured(system, found[-1:])
         except InputError as error:
-            keys = [k for k in (error.got, str(error.got).split(" ")[0]) if k in fixed]
-            where = source.where("logs", i, key, *map(str, keys[:1]))
+            wrong = str(error.got).split(" ")[0]
+            if wrong in group.free or not group.fixed:
+                where = source.where("logs", i, "free")
+            else:
+                where = source.where("logs", i, "fixed", wrong)
             raise located(error, where) from error
     priors = _priors(spec, source, system, found)
     return configured(system, found, priors)

@@ -310,6 +310,7 @@ def _expected(error: dict[str, Any]) -> str:
         "finite_number": "a finite number",
         "int_type": "a whole number",
         "string_type": "text in quotes",
+        "string_pattern_mismatch": "a word without spaces and @",
         "bool_type": "true or false",
         "list_type": "a list in brackets",
         "dict_type": "a table",
