@@ -10,8 +10,8 @@ from collections.abc import Iterator
 #: Imports point down; rooms of one layer do not see each other, but for SIBLINGS.
 LAYERS: tuple[frozenset[str], ...] = (
     frozenset(
-        "types errors linalg gaussian least_squares arrowhead laplace parameters "
-        "transitions ahead descent".split()
+        "types errors linalg gaussian least_squares arrowhead laplace em bijections "
+        "configurations weighed parameters transitions ahead descent".split()
     ),
     frozenset({"systems", "logs"}),
     frozenset({"models", "tasks", "planning"}),
@@ -35,11 +35,21 @@ SIBLINGS: frozenset[tuple[str, str]] = frozenset(
         ("gaussian", "linalg"),
         ("gaussian", "types"),
         ("gaussian", "errors"),
+        ("configurations", "types"),
+        ("configurations", "errors"),
+        ("parameters", "bijections"),
+        ("parameters", "configurations"),
+        ("parameters", "weighed"),
+        ("weighed", "types"),
+        ("weighed", "errors"),
         ("parameters", "types"),
         ("parameters", "errors"),
         ("parameters", "gaussian"),
         ("transitions", "types"),
         ("transitions", "errors"),
+        ("em", "types"),
+        ("em", "arrowhead"),
+        ("em", "laplace"),
         ("laplace", "types"),
         ("laplace", "errors"),
         ("laplace", "gaussian"),

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from sim2gp.models.windows import Windows
 from sim2gp.parameters import Parameter, Parameters
 from sim2gp.systems import AbstractODE, Channel
 from sim2gp.transitions import Transitions
@@ -53,3 +54,21 @@ def linear(p: int, d: int, kind: str = "identity", **spec: float) -> Linear:
 def transitions(J: np.ndarray, y: np.ndarray) -> Transitions:
     """From rest at zero: the increments are ``y`` to the last bit."""
     return Transitions.of(np.zeros_like(y), J.reshape(len(J), -1), y)
+
+
+def windows_of(J: np.ndarray, y: np.ndarray, group: np.ndarray) -> Windows:
+    """The same as windows of one step of a second, of machines in configurations."""
+    N, d = y.shape
+    ends = np.broadcast_to(np.asarray([0.0, 1.0])[None], (N, 2))
+    return Windows(
+        np.stack([np.zeros_like(y), y], axis=1),
+        np.broadcast_to((ends > 0.0)[..., None], (N, 2, d)),
+        ends,
+        ends,
+        np.stack([np.zeros((N, J[0].size)), J.reshape(N, -1)], axis=1),
+        np.zeros((N, d)),
+        np.zeros((N, d)),
+        np.full(d, 1e-2),
+        group.astype(np.int32),
+        tuple(range(d)),
+    )

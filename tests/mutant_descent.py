@@ -2,7 +2,7 @@
 
 from mutant_list import MODEL, Mutant
 
-LAPLACE, ARROWS = "laplace.py", "arrowhead.py"
+LAPLACE, ARROWS, NOISE = "laplace.py", "arrowhead.py", "em.py"
 DESCENT = (
     "test_laplace.py",
     "finite or last_turn or noise or too_long or gains or stationary",
@@ -45,21 +45,21 @@ DESCENTS = (
     ),
     Mutant(
         "EM without the posterior's spread",
-        LAPLACE,
+        NOISE,
         EXPECTED,
         EXPECTED.replace("(squares + spread)", "squares"),
         MODEL,
     ),
     Mutant(
         "EM without its prior",
-        LAPLACE,
+        NOISE,
         "/ (2.0 + jnp.sum(count, axis=0))",
         "/ jnp.sum(count, axis=0)",
         MODEL,
     ),
     Mutant(
         "noise of the first channel for all",
-        LAPLACE,
+        NOISE,
         EXPECTED,
         EXPECTED.replace("(squares + spread)", "(squares + spread)[:, :1]"),
         MODEL,
@@ -157,7 +157,7 @@ DESCENTS = (
     ),
     Mutant(
         "robust weights the wrong way round",
-        LAPLACE,
+        NOISE,
         "/ freedom) / (1.0 + misfit / freedom)",
         "/ freedom) * (1.0 + misfit / freedom)",
         ARROW,

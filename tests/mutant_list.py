@@ -40,7 +40,7 @@ class Mutant:
 
 
 LS, SIM, LIN = "least_squares.py", "models/sim2gp.py", "models/linearized.py"
-TABLE, GAUSS = "parameters.py", "gaussian.py"
+TABLE, GAUSS, MAPS = "parameters.py", "gaussian.py", "bijections.py"
 
 #: Where each quantity is formed.
 ROWS = "prior = jnp.concatenate(["
@@ -79,21 +79,21 @@ MUTANTS = (
     Mutant(
         "prior mean omitted",
         LS,
-        "z[:, None]], axis=1)\n    return stack(data, prior)",
-        "0.0 * z[:, None]], axis=1)\n    return stack(data, prior)",
+        "z[:, None]], axis=1)\n    return stack(data, prior, *more)",
+        "0.0 * z[:, None]], axis=1)\n    return stack(data, prior, *more)",
         ORACLE,
     ),
     Mutant(
         "sigmoid range of the paper",
-        TABLE,
+        MAPS,
         BOX,
         BOX.replace("(high - low)", "high").replace(", low, high", ", low, low + high"),
         BOUNDS,
     ),
-    Mutant("box not clamped", TABLE, f"jnp.clip({BOX})", BOX.split(",")[0], BOUNDS),
+    Mutant("box not clamped", MAPS, f"jnp.clip({BOX})", BOX.split(",")[0], BOUNDS),
     Mutant(
         "log box without its exponential",
-        TABLE,
+        MAPS,
         "jnp.exp(np.log(low) + span",
         "(np.log(low) + span",
         BOUNDS,

@@ -17,7 +17,7 @@ ON_THE_HOST = (
     Mutant(
         "external: differences cross bounds",
         EXTERNAL,
-        "np.clip(points[..., :p], by.low, by.high)",
+        "np.clip(points[..., :p], low, high)",
         "points[..., :p]",
         ("test_external.py", "cross_a_bound"),
     ),

@@ -15,6 +15,7 @@ import time
 from collections.abc import Iterable
 from pathlib import Path
 
+from mutant_configurations import CONFIGURATIONS
 from mutant_descent import DESCENTS
 from mutant_design import DESIGN
 from mutant_draft import FIRST_DRAFT
@@ -44,6 +45,7 @@ MUTANTS = (
     *LOGS,
     *INTEROP,
     *INTERVALS,
+    *CONFIGURATIONS,
 )
 
 ROOT = Path(__file__).resolve().parents[1]

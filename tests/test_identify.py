@@ -177,15 +177,6 @@ def test_no_horizon_longer_than_the_log(run: Path, folder: Path) -> None:
     assert not (folder / "none").exists()
 
 
-def test_values_fixed_by_group_are_refused(folder: Path, tmp_path: Path) -> None:
-    path = project_in(folder, "\n[[logs]]\nfiles = ['held/log3.csv']\n"
-        "columns = {theta = 'theta', alpha = 'alpha', voltage = 'u'}\n"
-        "fixed = {pendulum_mass = 0.03}\n")  # fmt: skip
-    with pytest.raises(InputError, match="not supported yet"):
-        identify.run(path, out=tmp_path / "run", seed=0, progress=QUIET)
-    assert not (tmp_path / "run").exists()
-
-
 def test_effects_are_constants_of_the_machine(folder: Path) -> None:
     effect = "[effects.theta.coulomb]\nmean = 5e-4\nsd = 5e-4\nmap = 'log'\n"
     path = project_in(folder, f"\n{effect}width = 0.02\n[effects.alpha]\ndrag = 0.1\n")

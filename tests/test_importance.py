@@ -122,6 +122,9 @@ class Product(AbstractLikelihood):
         J = jnp.stack([z, e[0]], axis=1)
         return factor(J, z * e[0] - self.y)[None, None]
 
+    def known(self, z: Float[Array, " p"]) -> Float[Array, "q p1"]:
+        return jnp.zeros((0, 2))
+
     def curvature(
         self, z: Float[Array, " p"], gradient: Float[Array, " p"]
     ) -> Float[Array, "p p"]:

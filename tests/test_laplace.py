@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from sim2gp import arrowhead, laplace
+from sim2gp import arrowhead, em, laplace
 from sim2gp import least_squares as ls
 from sim2gp.errors import DeadParameters, NotConverged, NotFinite
 from sim2gp.gaussian import Gaussian
@@ -30,6 +30,9 @@ class Whitened(laplace.AbstractLikelihood):
     def blocks(self, z, e):
         J, r = jax.jacfwd(self.residual)(z), self.residual(z)
         return ls.factor(J, r)[None, None]
+
+    def known(self, z):
+        return jnp.zeros((0, z.size + 1))
 
     def curvature(self, z, gradient):
         return jnp.zeros((z.size, z.size))
@@ -261,6 +264,9 @@ class Curves(laplace.AbstractLikelihood):
 
         return jnp.stack([one(w) for w in range(3)])
 
+    def known(self, z):
+        return jnp.zeros((0, z.size + 1))
+
     def curvature(self, z, gradient):
         return jnp.zeros((z.size, z.size))
 
@@ -320,11 +326,11 @@ def test_weights_of_outlying_windows_fall():
     """Student-t: (1 + n / nu) / (1 + |r|^2 / nu), by hand."""
     fit, noise = fit_of_curves(), some_noise()
     count, floor = jnp.full((3, 2), 4.0), jnp.asarray([0.01, 0.02])
-    new = laplace.expectation(count, floor, 4.0)(fit, noise)
+    new = em.expectation(count, floor, 4.0)(fit, noise)
     squares, spread = map(np.asarray, fit.squares())
     variance = np.asarray(noise.weights) @ (squares + spread) + 2.0 * floor**2
     np.testing.assert_allclose(new.sd**2, variance / 14.0, rtol=1e-12)
     misfit = np.sum(squares / np.asarray(new.sd) ** 2, axis=1)
     np.testing.assert_allclose(new.weights, 3.0 / (1.0 + misfit / 4.0), rtol=1e-12)
-    off = laplace.expectation(count, floor)(fit, noise)
+    off = em.expectation(count, floor)(fit, noise)
     np.testing.assert_array_equal(off.weights, 1.0)

@@ -4,7 +4,9 @@ Windows ``w`` of data share the whitened unknowns ``z`` (p), each has its own ``
 (n, possibly none), and each channel ``c`` its noise:
 
     L(z, e) = 1/2 sum_w [ w_w sum_c ||r_wc(z, e_w)||^2 / sig_c^2 + ||e_w||^2 ]
-              + 1/2 ||z||^2
+              + 1/2 ||z||^2 + 1/2 ||r_known(z)||^2
+
+(``r_known``: sums of constants that were weighed, in their sd.)
 
 Levenberg-Marquardt adds ``sqrt(mu) I`` to both parts of the eliminated system
 (`sim2gp.arrowhead`), so its step is the damped step of the whole problem; memory and
@@ -28,7 +30,6 @@ from sim2gp.least_squares import (
     gauss_newton_step,
     log_joint,
     posterior,
-    stack,
     with_prior,
 )
 from sim2gp.linalg import eigh, solve_triangular
@@ -58,6 +59,10 @@ class AbstractLikelihood(eqx.Module):
         """The factors at a point, of residuals in the channels' own units."""
 
     @abstractmethod
+    def known(self, z: Float[Array, " p"]) -> Float[Array, "q p1"]:
+        """Rows ``[K r]`` of what is known of the parameters beside their prior."""
+
+    @abstractmethod
     def curvature(
         self, z: Float[Array, " p"], gradient: Float[Array, " p"]
     ) -> Float[Array, "p p"]:
@@ -74,6 +79,7 @@ class Point(eqx.Module):
     z: Float[Array, " p"]
     e: Float[Array, "W n"]
     blocks: Blocks
+    known: Float[Array, "q p1"]
     cost: Scalar
     by_z: Float[Array, " p"]  # gradient of the cost
     by_e: Float[Array, "W n"]
@@ -93,7 +99,7 @@ class Fit(eqx.Module):
 
     at: Point
     arrow: Elimination
-    full: Factor  # of data and prior
+    full: Factor  # of data, prior and what is known beside it
     left: Scalar  # largest entry of the undamped step to the MAP, in posterior sd
     status: Int[Array, ""]
     steps: Int[Array, ""]
@@ -204,31 +210,6 @@ class Fit(eqx.Module):
             )
 
 
-def expectation(
-    count: Float[Array, "W c"],
-    floor: Float[Array, " c"],
-    freedom: float | Scalar = jnp.inf,
-) -> Callable[[Fit, Noise], Noise]:
-    """EM's update of noise and weights, from squares expected under the posterior.
-
-        sig_c^2 = (2 floor_c^2 + sum_w w_w E||r_wc||^2) / (2 + count_c)
-        w_w     = (1 + count_w / freedom) / (1 + ||r_w||^2 / freedom)
-
-    The prior on the noise counts as two samples at the floor. Weights are Student-t's;
-    an infinite number of degrees of ``freedom`` makes them 1.
-    """
-
-    def update(fit: Fit, noise: Noise) -> Noise:
-        squares, spread = fit.squares()
-        expected = noise.weights @ (squares + spread)
-        sd = jnp.sqrt((2.0 * floor**2 + expected) / (2.0 + jnp.sum(count, axis=0)))
-        misfit = jnp.sum(squares / sd[None] ** 2, axis=1)
-        weights = (1.0 + jnp.sum(count, axis=1) / freedom) / (1.0 + misfit / freedom)
-        return Noise(sd, weights)
-
-    return update
-
-
 def minimise(
     likelihood: AbstractLikelihood,
     start: Float[Array, " p"],
@@ -262,7 +243,9 @@ def multi_start(
     infinite = jnp.asarray(jnp.inf, starts.dtype)
     # No number: where nothing finite is ever found, nothing must look like a fit.
     unknown = jnp.full(blank.shape, jnp.nan, blank.dtype)
-    nowhere = Point(jnp.zeros(p), e, unknown, infinite, jnp.zeros(p), jnp.zeros_like(e))
+    zero, rows = jnp.zeros(p), jax.eval_shape(likelihood.known, starts[0])
+    known = jnp.full(rows.shape, jnp.nan, rows.dtype)
+    nowhere = Point(zero, e, unknown, known, infinite, zero, jnp.zeros_like(e))
     count = len(starts)
     turns = jnp.arange(count + rounds + 1)
     schedule = jnp.concatenate([starts, jnp.zeros((rounds + 1, p))])
@@ -275,7 +258,7 @@ def multi_start(
         settled = update(_verdict(best, noise, steps), noise)
         stay = searching | last
         noise = jax.tree.map(lambda new, old: jnp.where(stay, old, new), settled, noise)
-        again = _point(best.z, best.e, best.blocks, noise)
+        again = _point(best.z, best.e, best.blocks, best.known, noise)
         here = _select(searching, nowhere, again)
         found, taken = _descend(
             likelihood, here, (start, e), searching, noise, tolerance, last
@@ -310,7 +293,7 @@ def _descend(
         first = fresh & (count == 0)
         z = jnp.where(first, start[0], here.z + dz)
         e = jnp.where(first, start[1], here.e + de)
-        there = _point(z, e, likelihood.blocks(z, e), noise)
+        there = _point(z, e, likelihood.blocks(z, e), likelihood.known(z), noise)
         gained = here.cost - there.cost
         # Rounding in the cost must not refuse the last, gradient-only digits.
         slack = 1e-12 * (1.0 + there.cost)
@@ -347,7 +330,7 @@ def _step(
     damping = jnp.where(damping < LEAST_DAMPING, 0.0, damping)
     arrow = eliminate(here.blocks, here.e, noise, damping)
     damped = jnp.sqrt(damping) * jnp.eye(here.z.size, here.z.size + 1)
-    full = stack(with_prior(arrow.data, here.z), damped)
+    full = with_prior(arrow.data, here.z, here.known, damped)
     # Whitened by R, the maps' curvature is a change of the identity. Only where it is
     # positive: it may shorten the QR's step; longer ones were measured to go astray.
     R, c = full[:-1, :-1], full[:-1, -1]
@@ -363,18 +346,23 @@ def _step(
 
 
 def _point(
-    z: Float[Array, " p"], e: Float[Array, "W n"], blocks: Blocks, noise: Noise
+    z: Float[Array, " p"],
+    e: Float[Array, "W n"],
+    blocks: Blocks,
+    known: Float[Array, "q p1"],
+    noise: Noise,
 ) -> Point:
     white, n = noise.scale(blocks), e.shape[1]
-    r = white[..., -1]
-    cost = 0.5 * (jnp.sum(r**2) + jnp.sum(e**2) + z @ z)
+    r, apart = white[..., -1], known[:, -1]
+    cost = 0.5 * (jnp.sum(r**2) + jnp.sum(e**2) + z @ z + apart @ apart)
     g = jnp.einsum("wckj,wck->wj", white[..., :-1], r)
-    return Point(z, e, blocks, cost, jnp.sum(g[:, n:], axis=0) + z, g[:, :n] + e)
+    by_z = jnp.sum(g[:, n:], axis=0) + z + known[:, :-1].T @ apart
+    return Point(z, e, blocks, known, cost, by_z, g[:, :n] + e)
 
 
 def _verdict(best: Point, noise: Noise, steps: Int[Array, ""]) -> Fit:
     arrow = eliminate(best.blocks, best.e, noise)
-    full = with_prior(arrow.data, best.z)
+    full = with_prior(arrow.data, best.z, best.known)
     left = _left(arrow, full)
     there = (best.gradient <= GRADIENT_TOLERANCE) | (left <= GRADIENT_TOLERANCE)
     flat, near = JOINT_TOLERANCE

@@ -39,10 +39,12 @@ def stack(*factors: Float[Array, "_ k"]) -> Float[Array, "k k"]:
     return triangular(jnp.concatenate(factors))
 
 
-def with_prior(data: Factor, z: Float[Array, " p"]) -> Factor:
-    """Add the prior's rows ``[I z]`` to the data's factor."""
+def with_prior(
+    data: Factor, z: Float[Array, " p"], *more: Float[Array, "_ p1"]
+) -> Factor:
+    """Add the prior's rows ``[I z]``, and perhaps ``more``, to the data's factor."""
     prior = jnp.concatenate([jnp.eye(z.size, dtype=z.dtype), z[:, None]], axis=1)
-    return stack(data, prior)
+    return stack(data, prior, *more)
 
 
 def gauss_newton_step(full: Factor) -> Float[Array, " p"]:

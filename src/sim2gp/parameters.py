@@ -1,16 +1,7 @@
 """Physical constants as random variables: prior, bounds, unit and meaning on one line.
 
 Every Gaussian lives on an unconstrained *virtual* value ``tt`` (the paper's theta
-tilde), mapped one by one onto the physical constant ``theta``:
-
-    box       theta = low + (high - low) sigmoid(tt)
-    log_box   log theta = log low + (log high - log low) sigmoid(tt)
-    softplus  theta = low + softplus(tt)
-    log       theta = exp(tt)
-    identity  theta = tt
-
-(The paper prints ``theta_min + theta_max sigmoid``, which leaves the box.) All maps
-are clamped to ``[low, high]``, so that rounding never leaves it either.
+tilde), mapped one by one onto the physical constant ``theta`` (`sim2gp.bijections`).
 """
 
 import dataclasses
@@ -27,15 +18,16 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Array, Float
 
+from sim2gp import bijections
+from sim2gp.configurations import Configuration, Which, valued
 from sim2gp.errors import InputError, nearest
 from sim2gp.gaussian import Gaussian
 from sim2gp.types import Scalar
+from sim2gp.weighed import Weighed, residuals
 
 #: Standard deviation of a boxed parameter's virtual value: the box is nearly uniform
 #: and the sigmoid stays out of saturation.
 BOX_SD = 1.5
-MAPS = ("box", "log_box", "softplus", "log", "identity")
-_EDGE = 1e-13  # closest approach to a bound when a physical value is mapped back
 
 
 @dataclass(frozen=True)
@@ -57,12 +49,12 @@ class Parameter:
     nominal: float | None = None
 
     def __post_init__(self) -> None:
-        if self.map not in MAPS:
+        if self.map not in bijections.MAPS:
             raise InputError(
                 "E141",
                 f"unknown map of parameter {self.name}",
                 got=self.map,
-                expected=f"one of {', '.join(MAPS)}",
+                expected=f"one of {', '.join(bijections.MAPS)}",
             )
         boxed = self.map in ("box", "log_box")
         finite = math.isfinite(self.low) and math.isfinite(self.high)
@@ -231,10 +223,17 @@ def _impossible(p: Parameter, mean: float, sd: float, expected: str) -> InputErr
 
 
 class Parameters(eqx.Module):
-    """The table of a system's constants: those to be learned, and those held fixed."""
+    """The table of a system's constants: those to be learned, and those held fixed.
+
+    Of a machine in several ``configurations``, the columns of all of them: ``mass`` for
+    those that share it, ``mass @ payload`` where a configuration has its own. Sums of
+    constants that were ``weighed`` are part of every fit.
+    """
 
     free: tuple[Parameter, ...] = eqx.field(static=True)
     fixed: tuple[tuple[str, float], ...] = eqx.field(static=True, default=())
+    configurations: tuple[Configuration, ...] = eqx.field(static=True, default=())
+    weighed: tuple[Weighed, ...] = eqx.field(static=True, default=())
 
     def __len__(self) -> int:
         return len(self.free)
@@ -256,15 +255,15 @@ class Parameters(eqx.Module):
         """Physical values of virtual ones, always inside the bounds."""
         out = []
         for kind, index, low, high in self._groups(tt.dtype):
-            out.append(_constrain(kind, tt[index], low, high))
-        return _scatter(out, self._groups(tt.dtype), tt)
+            out.append(bijections.constrain(kind, tt[index], low, high))
+        return bijections.scatter(out, self._groups(tt.dtype), tt)
 
     def unconstrain(self, theta: Float[Array, " p"]) -> Float[Array, " p"]:
         """Virtual values of physical ones; a value on a bound maps just inside it."""
         out = []
         for kind, index, low, high in self._groups(theta.dtype):
-            out.append(_unconstrain(kind, theta[index], low, high))
-        return _scatter(out, self._groups(theta.dtype), theta)
+            out.append(bijections.unconstrain(kind, theta[index], low, high))
+        return bijections.scatter(out, self._groups(theta.dtype), theta)
 
     def curvature(
         self, prior: Gaussian, z: Float[Array, " p"], gradient: Float[Array, " p"]
@@ -285,8 +284,26 @@ class Parameters(eqx.Module):
         by_tt = jnp.linalg.solve(prior.scale.T, gradient)
         return prior.scale.T @ ((by_tt * bend)[:, None] * prior.scale)
 
-    def values(self, tt: Float[Array, " p"]) -> dict[str, Scalar]:
-        """Every constant by name, in physical units: the free ones and the fixed."""
+    def values(
+        self, tt: Float[Array, " p"], configuration: Which = None
+    ) -> dict[str, Scalar]:
+        """Every constant by name, in physical units: the free ones and the fixed.
+
+        ``configuration`` is an index; only a table that has several needs it (E147).
+        """
+        return valued(self._columns(tt), self.configurations, configuration)
+
+    def known(self, prior: Gaussian, z: Float[Array, " p"]) -> Float[Array, "q p1"]:
+        """Rows ``[K r]`` of what was weighed, in its sd, at ``tt = mu0 + L0 z``."""
+
+        def r(z: Array) -> Array:
+            values = self._columns(prior.mean + prior.scale @ z)
+            return residuals(self.weighed, values, z)
+
+        return jnp.concatenate([jax.jacfwd(r)(z), r(z)[:, None]], axis=1)
+
+    def _columns(self, tt: Float[Array, " p"]) -> dict[str, Scalar]:
+        """Every column, and every fixed value."""
         theta = self.constrain(tt)
         values = {name: jnp.asarray(v, tt.dtype) for name, v in self.fixed}
         return values | {p.name: theta[i] for i, p in enumerate(self.free)}
@@ -325,16 +342,19 @@ class Parameters(eqx.Module):
                 free.append(dataclasses.replace(value, name=name))
             else:
                 fixed.append((name, float(value)))
-        return Parameters(tuple(free), tuple(fixed))
+        return dataclasses.replace(self, free=tuple(free), fixed=tuple(fixed))
 
     def merge(self, other: "Parameters") -> "Parameters":
         """Both tables as one, this one's constants first."""
-        return Parameters(self.free + other.free, self.fixed + other.fixed)
+        mine, more = (
+            (x.free, x.fixed, x.configurations, x.weighed) for x in (self, other)
+        )
+        return Parameters(*(a + b for a, b in zip(mine, more, strict=True)))  # type: ignore[arg-type]
 
     def _groups(self, dtype: Any) -> list[tuple[str, np.ndarray, Any, Any]]:
         """Free constants grouped by map, so that each map is one vector operation."""
         groups = []
-        for kind in MAPS:
+        for kind in bijections.MAPS:
             index = [i for i, p in enumerate(self.free) if p.map == kind]
             if index:
                 low = np.asarray([self.free[i].low for i in index], dtype)
@@ -363,38 +383,3 @@ def unknown_parameter(name: str, known: Any) -> InputError:
         expected=f"one of {', '.join(sorted(known))}",
         fix=f"did you mean {close}?" if close else "",
     )
-
-
-def _constrain(kind: str, t: Array, low: Any, high: Any) -> Array:
-    huge = np.asarray(np.finfo(t.dtype).max, t.dtype)
-    if kind == "box":
-        return jnp.clip(low + (high - low) * jax.nn.sigmoid(t), low, high)
-    if kind == "log_box":
-        span = np.log(high) - np.log(low)
-        return jnp.clip(jnp.exp(np.log(low) + span * jax.nn.sigmoid(t)), low, high)
-    if kind == "softplus":
-        return jnp.minimum(low + jax.nn.softplus(t), huge)
-    if kind == "log":
-        limit = np.floor(np.log(huge))
-        return jnp.exp(jnp.clip(t, -limit, limit))
-    return jnp.clip(t, -huge, huge)
-
-
-def _unconstrain(kind: str, theta: Array, low: Any, high: Any) -> Array:
-    if kind in ("box", "log_box"):
-        if kind == "log_box":
-            low, high, theta = np.log(low), np.log(high), jnp.log(theta)
-        u = jnp.clip((theta - low) / (high - low), _EDGE, 1.0 - _EDGE)
-        return jnp.log(u) - jnp.log1p(-u)
-    if kind == "softplus":
-        x = theta - low
-        return x + jnp.log(-jnp.expm1(-x))
-    return jnp.log(theta) if kind == "log" else theta
-
-
-def _scatter(parts: list[Array], groups: list[Any], like: Array) -> Array:
-    """Put the groups' values back into the table's order."""
-    if not parts:
-        return like
-    order = np.concatenate([index for _, index, _, _ in groups])
-    return jnp.concatenate(parts)[np.argsort(order)]

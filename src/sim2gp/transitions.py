@@ -9,7 +9,7 @@ import logging
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp.types import AnyArray
 
@@ -17,12 +17,16 @@ logger = logging.getLogger(__name__)
 
 
 class Transitions(eqx.Module):
-    """Rows of ``(state, action, next_state)``; rows with a false mask do not exist."""
+    """Rows of ``(state, action, next_state)``; rows with a false mask do not exist.
+
+    ``configuration`` is the machine's, an index, where it has several.
+    """
 
     state: Float[AnyArray, "capacity n"]
     action: Float[AnyArray, "capacity m"]
     next_state: Float[AnyArray, "capacity n"]
     mask: Bool[AnyArray, " capacity"]
+    configuration: Int[AnyArray, " capacity"] | None = None
 
     @classmethod
     def empty(cls, capacity: int, n: int, m: int) -> "Transitions":
@@ -37,11 +41,12 @@ class Transitions(eqx.Module):
         state: Float[AnyArray, "N n"],
         action: Float[AnyArray, "N m"],
         next_state: Float[AnyArray, "N n"],
+        configuration: Int[AnyArray, " N"] | None = None,
     ) -> "Transitions":
         """Exactly these transitions, at a capacity of their number."""
         n, m = np.shape(state)[1], np.shape(action)[1]
         empty = cls.empty(len(state), n, m)
-        return empty.extend(state, action, next_state)
+        return empty.extend(state, action, next_state, configuration)
 
     @property
     def count(self) -> int:
@@ -53,8 +58,12 @@ class Transitions(eqx.Module):
         state: Float[AnyArray, "N n"],
         action: Float[AnyArray, "N m"],
         next_state: Float[AnyArray, "N n"],
+        configuration: Int[AnyArray, " N"] | None = None,
     ) -> "Transitions":
-        """These transitions and more; the capacity doubles as often as needed."""
+        """These transitions and more; the capacity doubles as often as needed.
+
+        Where only some rows have a configuration, the others are of the first.
+        """
         count, new = self.count, len(state)
         capacity = len(self.mask)
         while capacity < count + new:
@@ -68,11 +77,19 @@ class Transitions(eqx.Module):
             out[count : count + new] = np.asarray(add)
             return out
 
+        which = None
+        if configuration is not None or self.configuration is not None:
+            which = np.zeros(capacity, np.int32)
+            if self.configuration is not None:
+                which[:count] = np.asarray(self.configuration)[:count]
+            if configuration is not None:
+                which[count : count + new] = np.asarray(configuration)
         return Transitions(
             put(self.state, state),
             put(self.action, action),
             put(self.next_state, next_state),
             np.arange(capacity) < count + new,
+            which,
         )
 
     def delta(self) -> Float[Array, "capacity n"]:

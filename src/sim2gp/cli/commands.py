@@ -48,6 +48,14 @@ class Writes(Common):
 
 
 @dataclass(kw_only=True)
+class Chosen(Common):
+    """The option of a command that needs the machine as it stands."""
+
+    configuration: Annotated[str | None, arg(metavar="NAME")] = None
+    """Which one, where groups of logs are of several."""
+
+
+@dataclass(kw_only=True)
 class Demo(Writes):
     """Learn to swing up a pendulum whose constants are unknown, in a few trials."""
 
@@ -134,7 +142,7 @@ class Identify(Writes):
 
 
 @dataclass(kw_only=True)
-class Evaluate(Writes):
+class Evaluate(Writes, Chosen):
     """Prediction of logs that a fit has not seen."""
 
     run_or_project: Annotated[Positional[Path], arg(metavar="RUN|PROJECT")]
@@ -148,10 +156,11 @@ class Evaluate(Writes):
         name = self.run_or_project.stem
         out = _out(self.out, f"evaluate-{name}")
         if self.run_or_project.suffix == ".toml":
-            if self.logs:
-                got, fix = "--logs", "leave --logs out, or name a run"
-                expected = "no --logs with a project file: its own logs are left out"
-                raise usage_error("too many logs", got, expected, fix)
+            for option in ("logs", "configuration"):
+                if getattr(self, option):
+                    fix = f"leave --{option} out, or name a run"
+                    expected = "a project file alone: its own logs are left out"
+                    raise usage_error("too much", f"--{option}", expected, fix)
             _check_project(self.run_or_project)
             return _experiment("evaluate", "leave_one_out")(
                 self.run_or_project, horizon=self.horizon, out=out, progress=progress
@@ -164,6 +173,7 @@ class Evaluate(Writes):
             self.run_or_project,
             list(self.logs),
             horizon=self.horizon,
+            configuration=self.configuration,
             out=out,
             progress=progress,
         )
@@ -210,7 +220,7 @@ class Compare(Writes):
 
 
 @dataclass(kw_only=True)
-class Design(Writes):
+class Design(Writes, Chosen):
     """The next experiment on a machine, and what it should tell."""
 
     run_or_project: Annotated[Positional[Path], arg(metavar="RUN|PROJECT")]
@@ -255,6 +265,7 @@ class Design(Writes):
             start=numbers("--start", self.start),
             period=self.period,
             starts=self.starts,
+            configuration=self.configuration,
         )
         return _experiment("design")(
             self.run_or_project, asked, out=out, seed=self.seed, progress=progress
@@ -262,7 +273,7 @@ class Design(Writes):
 
 
 @dataclass(kw_only=True)
-class Apply(Common):
+class Apply(Chosen):
     """Write identified constants into the MuJoCo model's own file; shows the diff."""
 
     path: Annotated[Positional[Path], arg(metavar="RUN")]
@@ -280,6 +291,7 @@ class Apply(Common):
             out=self.out,
             model=self.model,
             in_place=self.in_place,
+            configuration=self.configuration,
             progress=progress,
         )
 

@@ -19,8 +19,9 @@ from jaxtyping import Array, Float, Int
 from sim2gp.arrowhead import Noise
 from sim2gp.diagnose.misfit import Misfit
 from sim2gp.diagnose.residuals import misfit_of_transitions, misfit_of_windows
+from sim2gp.em import expectation
 from sim2gp.gaussian import Gaussian
-from sim2gp.laplace import AbstractLikelihood, Fit, expectation, multi_start
+from sim2gp.laplace import AbstractLikelihood, Fit, multi_start
 from sim2gp.models import sim2gp, windows
 from sim2gp.models.sim2gp import FLOOR, Sim2GP
 from sim2gp.models.windows import FREEDOM, Windows, WindowsBelief, fit_windows

@@ -132,11 +132,13 @@ def _log_posterior(
     """Of each draw, the start states integrated around their best."""
 
     def one(z: Array) -> Array:
+        apart = likelihood.known(z)[:, -1]
+
         def step(e: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
             blocks = likelihood.blocks(z, e)
             arrow = eliminate(blocks, e, noise)
             r = noise.scale(blocks)[..., -1]
-            cost = 0.5 * (jnp.sum(r**2) + jnp.sum(e**2) + z @ z)
+            cost = 0.5 * (jnp.sum(r**2) + jnp.sum(e**2) + z @ z + apart @ apart)
             pivots = jnp.diagonal(arrow.R11, axis1=1, axis2=2)
             return e - arrow.slope[..., -1], (cost, jnp.sum(jnp.log(pivots)))
 

@@ -121,8 +121,9 @@ def _one_step(belief: Sim2GPBelief, data: Transitions) -> tuple[Array, Array]:
 
     def residual(z: Array) -> tuple[Array]:
         tt = belief.posterior.mean + prior.scale @ z
-        f = jax.vmap(lambda s, a: system.transition(tt, s, a, belief.dt))
-        return ((f(data.state, data.action) - data.next_state)[:, :d],)
+        f = jax.vmap(lambda s, a, c: system.transition(tt, s, a, belief.dt, c))
+        found = f(data.state, data.action, data.configuration)
+        return ((found - data.next_state)[:, :d],)
 
     J, (r,) = jacobian_by_columns(residual, jnp.zeros_like(prior.mean))
     return r, J

@@ -28,7 +28,8 @@ from jaxtyping import Array, Float, Int
 
 from sim2gp.arrowhead import Blocks, Noise, eliminate
 from sim2gp.diagnose.evidence import AbstractData, Fitted, scores_of
-from sim2gp.laplace import AbstractLikelihood, Fit, expectation, multi_start
+from sim2gp.em import expectation
+from sim2gp.laplace import AbstractLikelihood, Fit, multi_start
 from sim2gp.linalg import triangular
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.effects import AbstractEffect
@@ -124,8 +125,10 @@ def _linear(
     data: AbstractData, bare: Fitted, blocks: np.ndarray, z: np.ndarray
 ) -> _Linearised:
     """The fit of a likelihood that is linear around ``z``."""
+    rows = bare.system.parameters.known(bare.prior, bare.whitened())
+    rows = jnp.insert(rows, -1, 0.0, axis=1)  # no sum has the candidate in it
     fit, noise, value = _linear_fit(
-        _Linear(jnp.asarray(blocks), jnp.asarray(z), bare.nuisances),
+        _Linear(jnp.asarray(blocks), jnp.asarray(z), bare.nuisances, rows),
         bare.noise,
         jnp.asarray(data.count),
         jnp.asarray(data.floor),
@@ -143,6 +146,10 @@ class _Linear(AbstractLikelihood):
     base: Blocks
     z0: Float[Array, " p"]
     e0: Float[Array, "W n"]
+    rows: Float[Array, "q p1"]  # of what was weighed
+
+    def known(self, z: Float[Array, " p"]) -> Float[Array, "q p1"]:
+        return self.rows.at[:, -1].add(self.rows[:, :-1] @ (z - self.z0))
 
     def blocks(self, z: Float[Array, " p"], e: Float[Array, "W n"]) -> Blocks:
         away = jnp.broadcast_to(z - self.z0, (len(e), z.size))

@@ -18,6 +18,7 @@ from sim2gp.runs import Progress, load_run
 from sim2gp.runs.store import Run, check_absent
 from sim2gp.systems import MuJoCo
 from sim2gp.systems.actuator import bare
+from sim2gp.systems.configured import own_table
 from sim2gp.systems.mjcf import matching
 from sim2gp.systems.mjcf_file import Edited, ModelFile
 from sim2gp.systems.mjcf_load import compiled_all
@@ -32,12 +33,14 @@ def run(
     model: Path | None,
     in_place: bool,
     progress: Progress,
+    configuration: str | None = None,
 ) -> dict[str, Any]:
     """Write the constants of a run into ``out``, or the source ``in_place``, or show.
 
-    ``model`` is another copy of the file than the one that was fitted. Raises
-    `InputError` E130 for a run without a model's constants, E132 where ``out`` exists,
-    E170 where the file cannot say them: then nothing is written.
+    ``model`` is another copy of the file than the one that was fitted; the machine is
+    that of one ``configuration``, where it has several (E152). Raises `InputError` E130
+    for a run without a model's constants, E132 where ``out`` exists, E170 where the
+    file cannot say them: then nothing is written.
     """
     if out is not None and in_place:
         got, fix = "--out and --in-place", "leave one of the two out"
@@ -48,7 +51,7 @@ def run(
     project = _project(run, stored, model)
     system = bare(project.system)
     assert isinstance(system, MuJoCo)
-    values, apart = _values(stored, project, system)
+    values, apart = _values(stored, project, system, configuration)
     progress.say(f"editing {system.source}")
     file = system.file()
     edited = file.edited(system.by_path(values))
@@ -91,12 +94,13 @@ def _project(run: Path, stored: Run, model: Path | None) -> Project:
 
 
 def _values(
-    stored: Run, project: Project, system: MuJoCo
+    stored: Run, project: Project, system: MuJoCo, configuration: str | None
 ) -> tuple[dict[str, float], dict[str, str]]:
     """The model's constants by name, and why the run's other ones are none."""
-    modes = stored.arrays["belief/theta"]
-    found = dict(zip(stored.summary["parameters"], modes.tolist(), strict=True))
-    values = dict(project.system.parameters.fixed) | found
+    table, places = own_table(project.system.parameters, configuration)
+    modes = stored.arrays["belief/theta"][list(places)]
+    found = dict(zip(table.names, modes.tolist(), strict=True))
+    values = dict(table.fixed) | found
     for name in values:
         if "/" in name and name not in system.names:
             matching(system.file().constants, name)  # raises with the nearest name

@@ -37,10 +37,12 @@ from sim2gp.experiments.identify import restored
 from sim2gp.experiments.prediction import units
 from sim2gp.experiments.record import provenance
 from sim2gp.models.features import Encoding
+from sim2gp.models.informed import informed_prior
 from sim2gp.models.sim2gp import PRIOR_NOISE
 from sim2gp.parameters import unknown_parameter
 from sim2gp.project import Project, load_project
 from sim2gp.runs import Progress, new_run
+from sim2gp.systems import alone
 from sim2gp.systems.base import AbstractSystem, index_of
 from sim2gp.types import in_float64
 
@@ -65,6 +67,7 @@ class Asked:
     start: Mapping[str, float]
     period: float | None
     starts: int = 1
+    configuration: str | None = None
 
     def words(self) -> str:
         """As they were typed."""
@@ -81,6 +84,8 @@ class Asked:
             parts += [f"{option} {' '.join(pairs)}"] if pairs else []
         parts += [f"--period {self.period:g}"] if self.period else []
         parts += [f"--starts {self.starts}"]
+        if self.configuration:
+            parts += [f"--configuration {self.configuration}"]
         return " ".join(parts)
 
 
@@ -134,13 +139,14 @@ def setting(source: Path, asked: Asked) -> tuple[Project, Experiment, list[str]]
     if source.suffix == ".toml":
         project = load_project(source)
         system = project.system
-        belief, names = system.parameters.prior(), _measured(project)
+        belief, names = informed_prior(system.parameters), _measured(project)
         noise, period = _stated_noise(project, names), PERIOD
         notes.append("no log was used: what is believed is the project's priors")
     else:
         found = restored(source)
         project, system, belief = found.project, found.project.system, found.posterior
         names, noise, period = found.outputs, found.noise, found.period
+    system, belief = alone(system, belief, asked.configuration)
     states = [channel.name for channel in system.physical_states]
     period = asked.period or period
     steps = round(asked.seconds / period)

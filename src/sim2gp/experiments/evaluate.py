@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sim2gp.configurations import index_of
 from sim2gp.errors import InputError
 from sim2gp.experiments.identify import PROJECT, restored
 from sim2gp.experiments.prediction import (
@@ -27,7 +28,6 @@ from sim2gp.experiments.prediction import (
     drawn,
     joined,
     judged,
-    load,
     recordings,
     regression_errors,
     rows_for,
@@ -48,14 +48,24 @@ from sim2gp.types import in_float64
 
 
 def run(
-    run: Path, logs: list[Path], *, horizon: float, out: Path, progress: Progress
+    run: Path,
+    logs: list[Path],
+    *,
+    horizon: float,
+    out: Path,
+    progress: Progress,
+    configuration: str | None = None,
 ) -> dict[str, Any]:
-    """Predict ``logs`` by an identify run; writes and returns the summary."""
+    """Predict ``logs`` by an identify run; writes and returns the summary.
+
+    They are of the machine in one ``configuration``, where it has several (E152).
+    """
     started = time.perf_counter()
     check_horizon(horizon)
     fit = restored(run)
     found, system = fit.project, fit.project.system
-    tested = found.read_logs(logs)
+    index_of(configuration, system.parameters.configurations)
+    tested = found.read_logs(logs, configuration)
     with new_run(out, "evaluate") as writer, progress.task("evaluate", 2) as task:
         rows, longest = rows_for(horizon), max(horizon, CURVE[-1])
         grid = windows_for(tested, found, longest, horizon)
@@ -76,6 +86,7 @@ def run(
             notes.append("the training logs were not found: no regression beside")
         listed = " ".join(map(str, logs))
         line = f"sim2gp evaluate {run} --logs {listed} --horizon {horizon:g}"
+        line += f" --configuration {configuration}" if configuration else ""
         summary |= {
             "command": "evaluate",
             "title": f"{run.name}: prediction of logs it was not fitted to",
@@ -93,7 +104,7 @@ def leave_one_out(
     started = time.perf_counter()
     check_horizon(horizon)
     found = load_project(project)
-    logs = load(found)
+    logs = found.load_logs()
     files = list(dict.fromkeys(recordings(logs)))
     if len(files) < 2:
         raise InputError(

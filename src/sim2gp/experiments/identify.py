@@ -22,11 +22,11 @@ from sim2gp.diagnose.importance import check_windows
 from sim2gp.diagnose.intervals import Corrected, corrected_windows
 from sim2gp.diagnose.residuals import misfit_of_windows
 from sim2gp.errors import InputError
+from sim2gp.experiments.configurations import told
 from sim2gp.experiments.prediction import (
     channels,
     cut_logs,
     drawn,
-    load,
     recordings,
     rows_for,
     trace_arrays,
@@ -62,7 +62,7 @@ def run(
     """
     started = time.perf_counter()
     found = load_project(project)
-    logs = load(found)
+    logs = found.load_logs()
     with new_run(out, "identify") as writer, progress.task("identify", 4) as task:
         windows, of = cut_logs(found, logs)
         task.advance(f"{len(windows)} windows")
@@ -71,11 +71,12 @@ def run(
         grid = evaluation_windows(logs, found.system, longest=CURVE[-1])
         compile_forecast(found.system, grid.windows)
         compile_linearise(found.system, windows)
-        belief = fit_windows(found.system, windows, key=key, robust=robust)
+        fitted = belief = fit_windows(found.system, windows, key=key, robust=robust)
         task.advance("posterior")
         band = band_of(belief, grid, logs)
         names = channels(found.system, windows)
         picture = drawn(found.system, belief.posterior, band, grid)
+        belief = belief.informed()
         honest = corrected_windows(belief, windows, of)
         arrays = _stored(belief, honest.posterior, band, seed)
         arrays |= trace_arrays(picture, grid, logs, names)
@@ -84,7 +85,7 @@ def run(
         line = f"sim2gp identify {project} --seed {seed}"
         if check:
             key = jax.random.fold_in(jax.random.key(seed), 2)
-            exact = check_windows(belief, windows, key=key)
+            exact = check_windows(fitted, windows, key=key)
             summary["check"] = exact.as_dict(found.system.parameters.names)
             line += " --check"
         folder = Path(os.path.abspath(project)).parent
@@ -265,6 +266,7 @@ def _summarise(
         "warnings": [str(note) for log in logs for note in log.notes],
         "trace_note": "Forecasts of half a second from causal starts, of the logs that "
         "were fitted; they know the recorded inputs and nothing else of the future.",
+        **told(system.parameters, logs, found["parameters"]),
         **found,
     }
 

@@ -30,19 +30,18 @@ _EVERY = 5  # of the windows, 0.1 s apart, are drawn
 
 
 def load(project: Project) -> tuple[Log, ...]:
-    """The project's logs; E160 for values fixed by group, which no fit takes yet."""
-    logs = project.load_logs()
+    """The logs of a project whose machine has one configuration (else E160)."""
     for group, spec in enumerate(project.spec.logs):
-        if spec.fixed:
+        if spec.fixed or spec.free:
             raise InputError(
                 "E160",
-                "values fixed for one group of logs are not supported yet",
-                where=project.source.where("logs", group, "fixed"),
-                got=", ".join(spec.fixed),
+                "several configurations, which only identify and evaluate take",
+                where=project.source.where("logs", group),
+                got=", ".join(project.spec.configurations),
                 expected="the same constants in all groups",
-                fix="identify the groups by a project file each",
+                fix="write a project file of one configuration's logs",
             )
-    return logs
+    return project.load_logs()
 
 
 def cut_logs(project: Project, logs: Sequence[Log]) -> tuple[Windows, np.ndarray]:

@@ -136,7 +136,8 @@ def assemble(
         spread[index] = 100.0 * quantum
     spread = np.where(spread > 0.0, spread, 1.0)
     sd = np.broadcast_to(spread, x0.shape)
-    return Windows(y, mask, span, knots, area, x0, sd, floor, outputs)
+    which = np.asarray([logs[k].group for k, _, _ in pieces], np.int32)
+    return Windows(y, mask, span, knots, area, x0, sd, floor, which, outputs)
 
 
 def inputs_since(

@@ -87,6 +87,7 @@ def evaluation_windows(
         start,
         np.zeros_like(start),
         np.asarray([resolution(logs, name) for name in measured]),
+        np.asarray([logs[k].group for k, _, _ in spans], np.int32),
         tuple(states.index(name) for name in measured),
     )
     return Grid(windows, which, np.asarray([s for _, s, _ in spans]), lag)

@@ -15,8 +15,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from sim2gp.arrowhead import Blocks, Noise
+from sim2gp.em import expectation
 from sim2gp.gaussian import LOG_2PI, Gaussian
-from sim2gp.laplace import AbstractLikelihood, Fit, expectation, multi_start
+from sim2gp.laplace import AbstractLikelihood, Fit, multi_start
 from sim2gp.least_squares import factor, gauss_newton_step, over, stack
 from sim2gp.linalg import triangular
 from sim2gp.models import linearized
@@ -194,22 +195,29 @@ class _OneStep(AbstractLikelihood):
         """Residuals ``f - y`` and their Jacobian in ``z``; masked rows are zero."""
         model, d = self.model, len(self.model.system.physical_states)
 
-        def one(s: Array, a: Array, s2: Array, valid: Array) -> tuple[Array, Array]:
+        def one(
+            s: Array, a: Array, s2: Array, valid: Array, which: Array | None
+        ) -> tuple[Array, Array]:
             def f(z: Array) -> Array:
                 tt = model.prior.mean + model.prior.scale @ z
-                return model.system.transition(tt, s, a, model.dt)[:d]
+                return model.system.transition(tt, s, a, model.dt, which)[:d]
 
             value, J = linearized.value_and_jacobian(f, z)
             return jnp.where(valid, value - s2[:d], 0.0), jnp.where(valid, J, 0.0)
 
         data = self.data
-        return jax.vmap(one)(data.state, data.action, data.next_state, data.mask)
+        rows = data.state, data.action, data.next_state, data.mask, data.configuration
+        return jax.vmap(one)(*rows)
 
     def blocks(self, z: Float[Array, " p"], e: Float[Array, "1 0"]) -> Blocks:
         """All data as one window; a step of exact states has no nuisances ``e``."""
         del e
         r, J = self.rows(z)
         return jax.vmap(factor, in_axes=1)(J, r)[None]
+
+    def known(self, z: Float[Array, " p"]) -> Float[Array, "q p1"]:
+        """Of sums that were weighed."""
+        return self.model.system.parameters.known(self.model.prior, z)
 
     def curvature(
         self, z: Float[Array, " p"], gradient: Float[Array, " p"]
@@ -322,7 +330,8 @@ def _hessian(belief: Sim2GPBelief, data: Transitions) -> Float[Array, "p p"]:
 
     def loss(z: Array) -> Scalar:
         r = likelihood.rows(z)[0] / belief.noise[None]
-        return 0.5 * jnp.sum(r**2) + 0.5 * z @ z
+        apart = likelihood.known(z)[:, -1]
+        return 0.5 * (jnp.sum(r**2) + z @ z + apart @ apart)
 
     offset = belief.posterior.mean - belief.prior.mean
     return jax.hessian(loss)(jnp.linalg.solve(belief.prior.scale, offset))

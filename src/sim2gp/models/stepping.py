@@ -35,6 +35,7 @@ from sim2gp.models.grid import (
 from sim2gp.models.windows import Windows, simulate
 from sim2gp.systems.actuator import Actuated
 from sim2gp.systems.base import AbstractSystem
+from sim2gp.systems.configured import Configured
 from sim2gp.transitions import Transitions
 from sim2gp.types import Action, Dynamics, Key, State, in_float64
 
@@ -46,6 +47,8 @@ def stepping(system: AbstractSystem, period: float) -> AbstractSystem:
 
     Its constants are the same, in the same order.
     """
+    if isinstance(system, Configured):
+        return Configured(stepping(system.system, period), system.parameters)
     if not (isinstance(system, Actuated) and system.longest_delay > 0.0):
         return system
     return Actuated(
@@ -135,6 +138,7 @@ def samples_of(logs: Sequence[Log], stepper: AbstractSystem, period: float) -> S
         start,
         np.zeros_like(start),
         np.zeros(len(measured)),
+        np.asarray([logs[k].group for k, _, _ in spans], np.int32),
         tuple(names.index(name) for name in measured),
     )
     return Samples(

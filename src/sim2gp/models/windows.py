@@ -20,13 +20,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp.ahead import ahead
 from sim2gp.arrowhead import Blocks, Noise, eliminate
+from sim2gp.em import expectation
 from sim2gp.gaussian import Gaussian
-from sim2gp.laplace import AbstractLikelihood, Fit, expectation, multi_start
+from sim2gp.laplace import AbstractLikelihood, Fit, multi_start
 from sim2gp.least_squares import factor
+from sim2gp.models.informed import informed
 from sim2gp.models.linearized import jacobian_by_columns, value_and_jacobian
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import AnyArray, Key, Scalar, in_float64
@@ -44,7 +46,8 @@ class Windows(eqx.Module):
     since the previous row, s. ``knots`` and ``area`` are the times and values at which
     the integral of the held input bends; between them it is straight, so its mean over
     any delayed interval is exact. ``outputs`` are the indices of the measured states,
-    ``floor`` the sensors' resolution.
+    ``floor`` the sensors' resolution. ``configuration`` is the machine's, an index into
+    its table's.
     """
 
     y: Float[AnyArray, "W L c"]
@@ -55,6 +58,7 @@ class Windows(eqx.Module):
     start: Float[AnyArray, "W n"]
     start_sd: Float[AnyArray, "W n"]
     floor: Float[AnyArray, " c"]
+    configuration: Int[AnyArray, " W"]
     outputs: tuple[int, ...] = eqx.field(static=True)
 
     def __len__(self) -> int:
@@ -153,6 +157,16 @@ class WindowsBelief(eqx.Module):
     starts: Float[Array, "W n"]
     log_evidence: Scalar
 
+    @in_float64
+    def informed(self) -> "WindowsBelief":
+        """The same belief, with what was weighed counted as prior."""
+        table, L0 = self.system.parameters, self.prior.scale
+        if not table.weighed:
+            return self
+        prior = informed(table, self.prior, self.posterior.mean)
+        factor = self.information @ jnp.linalg.solve(L0, prior.scale)
+        return eqx.tree_at(lambda b: (b.prior, b.information), self, (prior, factor))
+
 
 class _Windowed(AbstractLikelihood):
     """The likelihood as least squares: per-window functions, vmapped at the edge."""
@@ -165,7 +179,8 @@ class _Windowed(AbstractLikelihood):
         """``prediction - y`` of one window at ``x = (z, e)``, zero where masked."""
         p = self.prior.mean.size
         tt = self.prior.mean + self.prior.scale @ x[:p]
-        params = self.system.record(self.system.parameters.values(tt))
+        values = self.system.parameters.values(tt, window.configuration)
+        params = self.system.record(values)
         x0 = window.start + window.start_sd * x[p:]
         states = simulate(self.system, params, window, x0)
         r = states[:, np.asarray(window.outputs)] - window.y
@@ -182,6 +197,10 @@ class _Windowed(AbstractLikelihood):
 
         found: Array = self.windows.each(one, e)
         return found
+
+    def known(self, z: Float[Array, " p"]) -> Float[Array, "q p1"]:
+        """Of sums that were weighed."""
+        return self.system.parameters.known(self.prior, z)
 
     def curvature(
         self, z: Float[Array, " p"], gradient: Float[Array, " p"]
@@ -276,9 +295,11 @@ def _linearise(
     n = windows.start.shape[1]
 
     def rows(x: Array) -> tuple[Array, ...]:
-        params = system.record(system.parameters.values(tt + prior.scale @ x[:-n]))
+        own = tt + prior.scale @ x[:-n]
 
         def one(window: Windows, start: Array) -> tuple[Array, ...]:
+            values = system.parameters.values(own, window.configuration)
+            params = system.record(values)
             states = simulate(system, params, window, start + window.start_sd * x[-n:])
             r = states[:, np.asarray(window.outputs)] - window.y
             u = inputs_of(window, system.delays(params))
@@ -329,8 +350,9 @@ def fit_windows(
 ) -> WindowsBelief:
     """Posterior of the constants given windows of logs.
 
-    Noise by EM, one Student-t weight per window where ``robust``. Raises
-    `NotConverged`, `NotFinite` or `DeadParameters`.
+    Noise by EM, one Student-t weight per window where ``robust``. A ``prior`` is what
+    is believed but for what was weighed. Raises `NotConverged`, `NotFinite` or
+    `DeadParameters`.
     """
     prior = system.parameters.prior() if prior is None else prior
     p = prior.mean.size

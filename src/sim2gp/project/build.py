@@ -10,6 +10,7 @@ from typing import Any, get_type_hints
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
+from sim2gp.configurations import AT
 from sim2gp.errors import InputError, nearest
 from sim2gp.parameters import Parameter, Parameters, unknown_parameter
 from sim2gp.project.priors import located, prior
@@ -72,7 +73,8 @@ def build_system(
             expected=str(error),
             fix="correct the options",
         ) from error
-    table = _table(plain.parameters, dict(spec.parameters), source, ("parameters",))
+    shared = {k: v for k, v in spec.parameters.items() if AT not in k}
+    table = _table(plain.parameters, shared, source, ("parameters",))
     system: AbstractSystem = kind(parameters=table, **options)
     if spec.effects:
         system = _perturbed(system, spec.effects, source)

@@ -11,6 +11,7 @@ usual constants that are not zero in the model are open.
 
 from pathlib import Path
 
+from sim2gp.configurations import AT
 from sim2gp.errors import InputError
 from sim2gp.parameters import Parameter
 from sim2gp.project.build import actuated, unknown
@@ -41,6 +42,8 @@ def build_model(
     groups: list[list[str]] = []
     priors: dict[str, Parameter | float] = {}
     for pattern, stated in spec.parameters.items():
+        if AT in pattern:
+            continue  # a column of one configuration
         where = source.where("parameters", pattern)
         try:
             found = matching(known, pattern)

@@ -83,12 +83,22 @@ class Project:
             )
         return tuple(_uniquely_named(logs))
 
-    def read_logs(self, files: Iterable[Path | str]) -> tuple[Log, ...]:
-        """Other files, each read like the first group whose columns it has."""
+    def read_logs(
+        self, files: Iterable[Path | str], configuration: str | None = None
+    ) -> tuple[Log, ...]:
+        """Other files, each read like the first group whose columns it has.
+
+        Of the groups of one ``configuration``, where it is named.
+        """
         logs: list[Log] = []
+        groups = [
+            (group, spec)
+            for group, spec in enumerate(self.spec.logs)
+            if configuration in (None, self.spec.configuration(group))
+        ]
         for file in files:
             path, first = Path(file), None
-            for group, spec in enumerate(self.spec.logs):
+            for group, spec in groups:
                 try:
                     logs += self._read(path, group, spec)
                     break
@@ -139,7 +149,7 @@ class Project:
             keep_first=spec.keep_first,
             limits={name: (a, b) for name, (a, b) in self.spec.limits.items()},
             fixed=spec.fixed,
-            group=group,
+            group=self.spec.configurations.index(self.spec.configuration(group)),
         )
 
 
@@ -155,6 +165,7 @@ def load_project(
     source, spec = read_spec(path)
     # Imported late: a misspelt key is reported before the simulators are loaded.
     from sim2gp.project.build import build_system, check_names
+    from sim2gp.project.configure import in_configurations, weighed
 
     if is_model(spec.system):
         from sim2gp.project.model import build_model
@@ -164,6 +175,7 @@ def load_project(
     else:
         system = build_system(spec, source, system_class(spec.system))
     check_names(spec, source, system)
+    system = weighed(spec, source, in_configurations(spec, source, system))
     return Project(path, source, spec, system)
 
 

@@ -1,7 +1,7 @@
 """The shape of a project file, section by section, and its faults in one line each.
 
     system = "two_link"                           (or a model's file, "robot.xml")
-    [options]  [parameters.NAME]  [effects.CHANNEL.EFFECT]  [[logs]]
+    [options]  [parameters.NAME]  [effects.CHANNEL.EFFECT]  [[weighed]]  [[logs]]
     [actuators.INPUT]  [likelihood]  [task]  [limits]  [rates]  [model]  [planner]
 
 Types are strict: a number in quotes is text. A fault names the line of its key.
@@ -84,13 +84,16 @@ class ResampleSpec(Section):
 
 
 class LogSpec(Section):
-    """A group of files with the same columns and the same fixed values.
+    """A group of files with the same columns, of the machine in one configuration.
 
     ``time`` is a column (default "time"; in a bag "header" or "log"), or rows have a
-    fixed ``period``. ``episode`` is a column of episode numbers.
+    fixed ``period``. ``episode`` is a column of episode numbers. ``name`` is that of
+    the configuration (default the group's number): ``fixed`` are constants known in it
+    alone, ``free`` those that it does not share with the other groups.
     """
 
     files: Annotated[list[str], Field(min_length=1)]
+    name: Annotated[str, Field(pattern=r"^[^\s@]+$")] | None = None
     time: str | ColumnSpec | None = None
     period: Positive | None = None
     episode: str | None = None
@@ -99,7 +102,17 @@ class LogSpec(Section):
     exclude: list[Pair] = []
     columns: dict[str, str | FiniteFloat | ColumnSpec]
     fixed: dict[str, FiniteFloat] = {}
+    free: list[str] = []
     drop_nonfinite: bool = False
+
+
+class WeighedSpec(Section):
+    """A measured sum of constants, each times its weight (default 1)."""
+
+    of: Annotated[list[str], Field(min_length=1)]
+    weights: list[FiniteFloat] | None = None
+    value: FiniteFloat
+    sd: Positive
 
 
 class ActuatorSpec(Section):
@@ -157,6 +170,7 @@ class ProjectSpec(Section):
     options: dict[str, Any] = {}
     parameters: dict[str, FiniteFloat | PriorSpec] = {}
     effects: dict[str, dict[str, FiniteFloat | EffectSpec]] = {}
+    weighed: list[WeighedSpec] = []
     logs: list[LogSpec] = []
     actuators: dict[str, ActuatorSpec] = {}
     likelihood: LikelihoodSpec = LikelihoodSpec()
@@ -165,6 +179,16 @@ class ProjectSpec(Section):
     rates: dict[str, Positive] = {}
     model: ModelSpec = ModelSpec()
     planner: PlannerSpec = PlannerSpec()
+
+    def configuration(self, group: int) -> str:
+        """Name of the configuration that a group of logs recorded."""
+        return self.logs[group].name or str(group + 1)
+
+    @property
+    def configurations(self) -> tuple[str, ...]:
+        """All of them, in the order of the file."""
+        names = (self.configuration(i) for i in range(len(self.logs)))
+        return tuple(dict.fromkeys(names))
 
 
 def validated(source: Source) -> ProjectSpec:
@@ -211,6 +235,8 @@ def _keys_at(path: Path_) -> list[str]:
     elif section == "logs":
         inner = ResampleSpec if "resample" in path else ColumnSpec
         model = inner if len(path) > 2 else LogSpec
+    elif section == "weighed":
+        model = WeighedSpec
     elif section:
         model = type(ProjectSpec.model_fields[str(section)].default)
     return list(model.model_fields)
@@ -284,6 +310,7 @@ def _expected(error: dict[str, Any]) -> str:
         "finite_number": "a finite number",
         "int_type": "a whole number",
         "string_type": "text in quotes",
+        "string_pattern_mismatch": "a word without spaces and @",
         "bool_type": "true or false",
         "list_type": "a list in brackets",
         "dict_type": "a table",

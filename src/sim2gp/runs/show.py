@@ -13,7 +13,7 @@ LONGEST = 12  # numbers of a list that are still printed
 # of its own says some of it better.
 _HIDDEN = (
     *("warnings", "versions", "animation", "figure1", "units", "tables", "command"),
-    *("candidates", "misfit_as_it_is", "diff"),
+    *("configurations", "candidates", "misfit_as_it_is", "diff"),
 )
 _HIDDEN_COLUMNS = {
     "parameters": ("meaning", "note", "partners", "low", "high"),

@@ -1,5 +1,6 @@
 """Physics only: machines as differential equations, with published constants."""
 
+from sim2gp.configurations import Configuration
 from sim2gp.systems.actuator import Actuated, ActuatedParams, actuator_prior
 from sim2gp.systems.base import (
     AbstractMechanism,
@@ -13,6 +14,7 @@ from sim2gp.systems.base import (
 )
 from sim2gp.systems.black_box import BlackBox
 from sim2gp.systems.cartpole import CartPole, CartPoleParams
+from sim2gp.systems.configured import Configured, alone, configured
 from sim2gp.systems.effects import (
     AbstractEffect,
     BackEmf,
@@ -69,6 +71,8 @@ __all__ = [
     "CartPole",
     "CartPoleParams",
     "Channel",
+    "Configuration",
+    "Configured",
     "Coulomb",
     "DeadZone",
     "Drag",
@@ -95,7 +99,9 @@ __all__ = [
     "UniformRodParams",
     "Zeroed",
     "actuator_prior",
+    "alone",
     "catalogue",
+    "configured",
     "delayed_means",
     "effect",
     "lagged_means",

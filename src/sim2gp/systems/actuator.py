@@ -22,6 +22,7 @@ from jaxtyping import Array, Float
 from sim2gp.errors import InputError
 from sim2gp.parameters import Parameter, Parameters
 from sim2gp.systems.base import AbstractSystem, Channel, delayed_means
+from sim2gp.systems.configured import Configured
 from sim2gp.systems.zeros import Zeroed
 from sim2gp.types import Action, Scalar, State
 
@@ -77,7 +78,7 @@ class AbstractInputPath(AbstractSystem):
 
 def bare(system: AbstractSystem) -> AbstractSystem:
     """A system without what lies before its inputs and behind its states."""
-    while isinstance(system, AbstractInputPath | Zeroed):
+    while isinstance(system, AbstractInputPath | Zeroed | Configured):
         system = system.system
     return system
 

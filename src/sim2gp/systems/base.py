@@ -23,6 +23,7 @@ import jax.numpy as jnp
 from equinox import AbstractVar
 from jaxtyping import Array, Float
 
+from sim2gp.configurations import Which
 from sim2gp.errors import InputError, nearest
 from sim2gp.parameters import Parameter, Parameters, parameters_of, unknown_parameter
 from sim2gp.types import Action, Scalar, State
@@ -151,10 +152,16 @@ class AbstractSystem(eqx.Module):
         return Bound(self, params, dt)
 
     def transition(
-        self, tt: Float[Array, " p"], s: State, a: Action, dt: float
+        self,
+        tt: Float[Array, " p"],
+        s: State,
+        a: Action,
+        dt: float,
+        configuration: Which = None,
     ) -> State:
         """The step as a function of the virtual parameters, for inference."""
-        return self.step(self.record(self.parameters.values(tt)), s, a, dt)
+        values = self.parameters.values(tt, configuration)
+        return self.step(self.record(values), s, a, dt)
 
 
 class Bound(eqx.Module):

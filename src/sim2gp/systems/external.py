@@ -95,7 +95,9 @@ class AbstractSimulator(abc.ABC):
         K = p + n + m
         sides = np.eye(K)[:, None, :] * step[None]  # (K, B, K)
         points = np.concatenate([x[None], x + sides, x - sides])  # (1 + 2 K, B, K)
-        points[..., :p] = np.clip(points[..., :p], by.low, by.high)
+        # A value that is known may lie beyond the bounds of others: it stays.
+        low, high = np.minimum(by.low, theta), np.maximum(by.high, theta)
+        points[..., :p] = np.clip(points[..., :p], low, high)
         rows = points.reshape(-1, K)
         times = np.tile(h, len(points))
         out = self.flow(rows[:, :p], rows[:, p : p + n], rows[:, p + n :], times)

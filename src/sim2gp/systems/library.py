@@ -16,6 +16,7 @@ from sim2gp.parameters import Parameter
 from sim2gp.systems.actuator import Actuated
 from sim2gp.systems.base import AbstractMechanism, AbstractSystem
 from sim2gp.systems.cartpole import CartPole
+from sim2gp.systems.configured import Configured
 from sim2gp.systems.effects import (
     AbstractEffect,
     BackEmf,
@@ -90,6 +91,8 @@ class Candidate:
         ``period`` (s) of the control makes delays and lags carry past actions; without
         it a delay is left to the likelihood over windows.
         """
+        if isinstance(system, Configured):
+            return system.around(self.freed(system.system, period=period))
         if isinstance(self.effect, AbstractEffect):
             return with_effects(system, [self.effect])
         where, longest = self.effect.where, self.effect.magnitude
@@ -113,6 +116,8 @@ def with_effects(
     system: AbstractSystem, effects: list[AbstractEffect]
 ) -> AbstractSystem:
     """The machine with free effects inside, whatever actuators stand before it."""
+    if isinstance(system, Configured):
+        return system.around(with_effects(system.system, effects))
     if isinstance(system, Actuated):
         inner = with_effects(system.system, effects)
         return Actuated(inner, parameters=system.parameters)
@@ -127,7 +132,7 @@ def library(system: AbstractSystem, *, windows: bool = False) -> tuple[Candidate
     for a machine that no effects are registered for.
     """
     bare: Any = system
-    while isinstance(bare, Actuated | Perturbed):
+    while isinstance(bare, Actuated | Perturbed | Configured):
         bare = bare.system
     if isinstance(bare, Furuta):
         found = _furuta()
@@ -148,7 +153,9 @@ def library(system: AbstractSystem, *, windows: bool = False) -> tuple[Candidate
 
 
 def _held(system: Any) -> tuple[AbstractEffect, ...]:
-    inner = system.system if isinstance(system, Actuated) else system
+    inner = system
+    while isinstance(inner, Actuated | Configured):
+        inner = inner.system
     return inner.effects if isinstance(inner, Perturbed) else ()
 
 

@@ -1,0 +1,126 @@
+"""Groups of logs as configurations of one machine, and sums that were weighed.
+
+    [[logs]]                                  [[logs]]
+    name = "bare"                             name = "payload"
+    fixed = {"body/hand/mass" = 0.4}          free = ["body/hand/mass"]
+
+Constants that a group does not name are shared with all others. A column of its own has
+the prior of its constant, or of ``[parameters."body/hand/mass @ payload"]``.
+"""
+
+from collections.abc import Mapping
+
+from sim2gp.configurations import AT, Configuration
+from sim2gp.errors import InputError
+from sim2gp.parameters import Parameter, unknown_parameter
+from sim2gp.project.priors import located, prior
+from sim2gp.project.schema import PriorSpec, ProjectSpec
+from sim2gp.project.source import Source
+from sim2gp.systems import AbstractSystem, configured
+from sim2gp.systems.base import names_of
+from sim2gp.systems.configured import with_weighed
+from sim2gp.weighed import Weighed
+
+
+def in_configurations(
+    spec: ProjectSpec, source: Source, system: AbstractSystem
+) -> AbstractSystem:
+    """The machine in all configurations of the file; as it is, where there is one.
+
+    Raises `InputError` E141, E145 and E160.
+    """
+    places: dict[str, int] = {}
+    for i, group in enumerate(spec.logs):
+        first = spec.logs[places.setdefault(spec.configuration(i), i)]
+        if (group.fixed, sorted(group.free)) != (first.fixed, sorted(first.free)):
+            raise InputError(
+                "E160",
+                "one configuration stated in two ways",
+                where=source.where("logs", i, "name"),
+                got=spec.configuration(i),
+                expected="the same fixed and free in all groups of one name",
+                fix="give this group another name",
+            )
+    if not any(group.fixed or group.free for group in spec.logs):
+        for column in own_columns(spec.parameters):
+            known = names_of(system.parameters)
+            where = source.where("parameters", column)
+            raise located(unknown_parameter(column, known), where)
+        return system
+    found = []
+    for name, i in places.items():
+        group = spec.logs[i]
+        fixed = tuple(group.fixed.items())
+        found.append(Configuration(name, fixed, tuple(group.free)))
+        try:  # alone, so that a fault has its group's place
+            configured(system, found[-1:])
+        except InputError as error:
+            wrong = str(error.got).split(" ")[0]
+            if wrong in group.free or not group.fixed:
+                where = source.where("logs", i, "free")
+            else:
+                where = source.where("logs", i, "fixed", wrong)
+            raise located(error, where) from error
+    priors = _priors(spec, source, system, found)
+    return configured(system, found, priors)
+
+
+def weighed(
+    spec: ProjectSpec, source: Source, system: AbstractSystem
+) -> AbstractSystem:
+    """The machine with the sums that the file says were measured (E142 to E160)."""
+    for i, stated in enumerate(spec.weighed):
+        where = source.where("weighed", i, "of")
+        given = stated.weights
+        weights = tuple([1.0] * len(stated.of) if given is None else given)
+        if len(weights) != len(stated.of):
+            raise InputError(
+                "E160",
+                "weights of a sum",
+                where=source.where("weighed", i, "weights"),
+                got=f"{len(weights)} weights",
+                expected=f"{len(stated.of)}, one for each constant",
+                fix="state one for each, or leave weights out",
+            )
+        found = Weighed(tuple(stated.of), weights, stated.value, stated.sd)
+        try:
+            system = with_weighed(system, [found])
+        except InputError as error:
+            raise located(error, where) from error
+    return system
+
+
+def own_columns(parameters: Mapping[str, object]) -> list[str]:
+    """The names of ``[parameters]`` that speak of one configuration alone."""
+    return [name for name in parameters if AT in name]
+
+
+def _priors(
+    spec: ProjectSpec,
+    source: Source,
+    system: AbstractSystem,
+    configurations: list[Configuration],
+) -> dict[str, Parameter]:
+    """What the file says of columns of one configuration."""
+    table = system.parameters
+    columns = {c.column(name): name for c in configurations for name in c.own}
+    priors = {}
+    for column in own_columns(spec.parameters):
+        where = source.where("parameters", column)
+        if column not in columns:
+            raise located(unknown_parameter(column, [*columns, *table.names]), where)
+        stated = spec.parameters[column]
+        base = table[columns[column]]
+        found = prior(stated, base, where)
+        tied = isinstance(stated, PriorSpec) and stated.tie
+        if tied or not isinstance(found, Parameter):
+            raise InputError(
+                "E160",
+                f"no prior for {column}",
+                where=where,
+                got="tie" if tied else f"{found:g}",
+                expected="mean and sd, or low and high",
+                fix="or fix it in its group: fixed = {...} instead of free",
+            )
+        priors[column] = found
+    return priors

@@ -1,0 +1,63 @@
+"""What was measured of the machine itself: "both links together weigh 1.24 kg".
+
+    sum_k w_k theta_k = value + eps,     eps ~ N(0, sd^2)
+
+A sum of constants is linear in ``theta`` and not in their virtual values, so it is one
+more row of the least squares, not a change of the independent prior.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sim2gp.errors import InputError
+from sim2gp.types import Scalar
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """A measured sum of constants, each times its weight, and the scale's sd."""
+
+    of: tuple[str, ...]
+    weights: tuple[float, ...]
+    value: float
+    sd: float
+
+    def check(self, ranges: Mapping[str, tuple[float, float]]) -> None:
+        """That the constants can make up the sum, within ``ranges`` (E142, E144)."""
+        if not (math.isfinite(self.value) and 0.0 < self.sd < math.inf):
+            raise InputError(
+                "E144",
+                "a weighed sum",
+                where=" + ".join(self.of),
+                got=f"value = {self.value:g}, sd = {self.sd:g}",
+                expected="a finite value and a positive sd",
+            )
+        pairs = list(zip(self.of, self.weights, strict=True))
+        low, high = (
+            sum(pick(w * end for end in ranges[name]) for name, w in pairs if w != 0.0)
+            for pick in (min, max)
+        )
+        if not low < self.value < high:
+            raise InputError(
+                "E142",
+                "a weighed sum that the bounds rule out",
+                where=" + ".join(self.of),
+                got=f"{self.value:g}",
+                expected=f"more than {low:g} and less than {high:g}",
+                fix="widen the bounds of its constants, or correct the sum",
+            )
+
+
+def residuals(
+    weighed: Sequence[Weighed], values: Mapping[str, Scalar], like: Array
+) -> Float[Array, " q"]:
+    """How far each sum is from what was measured, in sd."""
+    rows = []
+    for x in weighed:
+        terms = zip(x.weights, x.of, strict=True)
+        rows.append((sum(w * values[name] for w, name in terms) - x.value) / x.sd)
+    return jnp.stack(rows) if rows else jnp.zeros(0, like.dtype)

@@ -1,0 +1,146 @@
+"""Mutants of joint fits of several configurations, and of weighed sums."""
+
+from mutant_list import Mutant
+
+GATHER, MACHINES = "configurations.py", "systems/configured.py"
+SUMS, INFORMED = "weighed.py", "models/informed.py"
+HERE, WEIGHED = "test_configurations.py", "test_weighed.py"
+CLOSED = (HERE, "closed_form")
+ROW = (WEIGHED, "one_more_row")
+
+CONFIGURATIONS = (
+    Mutant(
+        "configurations: everybody is the first",
+        GATHER,
+        "for c in configurations])[index]",
+        "for c in configurations])[0 * index]",
+        (HERE, "has_its_constants"),
+    ),
+    Mutant(
+        "configurations: a known value is shared",
+        GATHER,
+        "alone = constant in self.own or constant in dict(self.fixed)",
+        "alone = constant in self.own",
+        (HERE, "has_its_constants"),
+    ),
+    Mutant(
+        "configurations: windows of the wrong machine",
+        "models/windows.py",
+        "values = self.system.parameters.values(tt, window.configuration)",
+        "values = self.system.parameters.values(tt, 0 * window.configuration)",
+        CLOSED,
+    ),
+    Mutant(
+        "configurations: own columns without their priors",
+        MACHINES,
+        "prior = given.pop(column, p)",
+        "prior = given.pop(column, p) and p",
+        CLOSED,
+    ),
+    Mutant(
+        "configurations: one step of the wrong machine",
+        "models/sim2gp.py",
+        "return model.system.transition(tt, s, a, model.dt, which)[:d]",
+        "which = which if which is None else 0 * which\n"
+        "                return model.system.transition(tt, s, a, model.dt, which)[:d]",
+        (HERE, "one_step"),
+    ),
+    Mutant(
+        "configurations: a lone machine's belief out of order",
+        MACHINES,
+        "jnp.asarray(belief.scale)[at])",
+        "jnp.asarray(belief.scale)[at[::-1]])",
+        (HERE, "alone"),
+    ),
+    Mutant(
+        "configurations: delays beyond what is kept",
+        MACHINES,
+        "if not 0.0 <= low <= high <= system.longest_delay:",
+        "if not 0.0 <= low <= high:",
+        (HERE, "delay"),
+    ),
+    Mutant(
+        "configurations: a known value clipped to the bounds",
+        "systems/external.py",
+        "np.minimum(by.low, theta), np.maximum(by.high, theta)",
+        "np.minimum(by.low, np.inf), np.maximum(by.high, -np.inf)",
+        (HERE, "on_the_host"),
+    ),
+    Mutant(
+        "configurations: more rows forget whose they are",
+        "transitions.py",
+        "which[:count] = np.asarray(self.configuration)[:count]",
+        "which[:count] = 0",
+        (HERE, "one_step"),
+    ),
+    Mutant(
+        "configurations: a column for what nobody shares",
+        MACHINES,
+        "if column == p.name or column in own:",
+        "if column == p.name or column in own or column == columns:",
+        (HERE, "columns_are"),
+    ),
+    Mutant(
+        "weighed: an sd too narrow",
+        SUMS,
+        "for w, name in terms) - x.value) / x.sd",
+        "for w, name in terms) - x.value) / x.sd**2",
+        ROW,
+    ),
+    Mutant(
+        "weighed: no weights",
+        SUMS,
+        "sum(w * values[name] for",
+        "sum(values[name] + 0.0 * w for",
+        (WEIGHED, "keep_their_sum"),
+    ),
+    Mutant(
+        "weighed: not in the cost",
+        "laplace.py",
+        "z @ z + apart @ apart)",
+        "z @ z + 0.0 * apart @ apart)",
+        ROW,
+    ),
+    Mutant(
+        "weighed: not in the posterior",
+        "laplace.py",
+        "full = with_prior(arrow.data, best.z, best.known)",
+        "full = with_prior(arrow.data, best.z)",
+        ROW,
+    ),
+    Mutant(
+        "weighed: not in the gradient",
+        "laplace.py",
+        "+ z + known[:, :-1].T @ apart",
+        "+ z",
+        ROW,
+    ),
+    Mutant(
+        "weighed: linearised about the prior's mean",
+        INFORMED,
+        "about = rows.at[:, -1].add(-rows[:, :-1] @ z)",
+        "about = rows",
+        (WEIGHED, "prior_to_the_logs or keep_their_sum"),
+    ),
+    Mutant(
+        "weighed: information in the old prior's units",
+        "models/windows.py",
+        "factor = self.information @ jnp.linalg.solve(L0, prior.scale)",
+        "factor = self.information",
+        (WEIGHED, "prior_to_the_logs"),
+    ),
+    Mutant(
+        "weighed: lost when a candidate is tried",
+        MACHINES,
+        "return Configured(system, self.parameters.merge(more).replace(**freed))",
+        "return Configured(system, system.parameters)",
+        (WEIGHED, "candidate"),
+    ),
+    Mutant(
+        "weighed: bounds with the signs of the weights forgotten",
+        SUMS,
+        "pick(w * end for end in ranges[name])",
+        "abs(w) * pick(ranges[name])",
+        (WEIGHED, "says_what"),
+    ),
+)

@@ -1,0 +1,367 @@
+"""Several configurations of one machine in one fit: gathers, closed forms, payloads."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from linear_system import linear, windows_of
+from payload_arm import TRUTH, arm, log
+from sim2gp.arrowhead import Noise
+from sim2gp.configurations import Configuration
+from sim2gp.diagnose.residuals import misfit_of_windows
+from sim2gp.errors import InputError
+from sim2gp.gaussian import Gaussian
+from sim2gp.laplace import Fit, minimise
+from sim2gp.logs import Log
+from sim2gp.models import Sim2GP
+from sim2gp.models import windows as likelihood
+from sim2gp.models.cutting import cut
+from sim2gp.models.windows import Windows, WindowsBelief, fit_windows
+from sim2gp.parameters import Parameter
+from sim2gp.systems import (
+    ODE,
+    AbstractSystem,
+    Actuated,
+    BlackBox,
+    Channel,
+    alone,
+    configured,
+)
+from sim2gp.systems.actuator import actuator_prior
+from sim2gp.systems.configured import own_table
+from sim2gp.transitions import Transitions
+from sim2gp.types import in_float64
+
+KEY = jax.random.key(0)
+BARE = Configuration("bare", fixed=(("payload", 0.0),))
+LOADED = Configuration("loaded", own=("payload",))
+SHARED = ("inertia", "weight", "damping")
+
+
+def joint(*configurations: Configuration) -> Any:
+    return configured(arm(), configurations)
+
+
+@pytest.fixture(scope="module")
+def logs() -> tuple[Log, Log]:
+    return log(0, seed=1), log(1, seed=2)
+
+
+@in_float64
+def moments(belief: WindowsBelief) -> dict[str, tuple[float, float]]:
+    """Virtual mean and sd by column."""
+    mean, sd = np.asarray(belief.posterior.mean), np.asarray(belief.posterior.sd())
+    names = belief.system.parameters.names
+    return dict(zip(names, zip(mean.tolist(), sd.tolist(), strict=True), strict=True))
+
+
+# The table.
+
+
+def test_columns_are_the_shared_ones_and_each_own() -> None:
+    table = joint(BARE, LOADED).parameters
+    assert table.names == (*SHARED, "payload @ loaded")
+    assert table["payload @ loaded"].meaning == "mass at the tip"
+    both = (Configuration("a", own=("weight",)), Configuration("b"))
+    assert joint(*both).parameters.names == (
+        "inertia",
+        "weight @ a",
+        "weight",
+        "damping",
+        "payload",
+    )
+
+
+@in_float64
+def test_each_configuration_has_its_constants() -> None:
+    third = Configuration("third", fixed=(("damping", 0.7),))
+    table = joint(BARE, LOADED, third).parameters
+    names = ("inertia", "weight", "damping", "payload @ loaded", "payload")
+    assert table.names == names
+    tt = jnp.asarray([0.1, 0.2, 0.3, 0.4, 0.5])
+    theta = dict(zip(names, np.asarray(table.constrain(tt)), strict=True))
+    shared = {"inertia": theta["inertia"], "weight": theta["weight"]}
+    damping = theta["damping"]
+    expected = (
+        {"damping": damping, "payload": 0.0},
+        {"damping": damping, "payload": theta["payload @ loaded"]},
+        {"damping": 0.7, "payload": theta["payload"]},
+    )
+    traced = jax.jit(lambda i: table.values(tt, i))
+    for i, alone_ in enumerate(expected):
+        for found in (table.values(tt, i), traced(i)):
+            assert {k: float(v) for k, v in found.items()} == pytest.approx(
+                {k: float(v) for k, v in (shared | alone_).items()}, rel=1e-14
+            )
+    with pytest.raises(InputError, match=r"E152 which configuration.*bare, loaded"):
+        table.values(tt)
+
+
+def test_a_configuration_alone_is_an_ordinary_machine(float64: None) -> None:
+    system = joint(BARE, LOADED)
+    rng = np.random.default_rng(0)
+    belief = Gaussian(jnp.arange(4.0), jnp.asarray(rng.normal(size=(4, 6))))
+    for name, places in (("bare", [0, 1, 2]), ("loaded", [0, 1, 2, 3])):
+        machine, own = alone(system, belief, name)
+        table = machine.parameters
+        free = [n for n in arm().parameters.names if n != "payload" or len(places) > 3]
+        assert table.names == tuple(free)
+        assert dict(table.fixed) == ({"payload": 0.0} if name == "bare" else {})
+        whole = np.asarray(belief.covariance())[np.ix_(places, places)]
+        np.testing.assert_allclose(np.asarray(own.covariance()), whole, atol=1e-12)
+        assert own.scale.shape == (len(places), len(places))
+        values = table.values(own.mean)
+        joint_values = system.parameters.values(
+            belief.mean, ("bare", "loaded").index(name)
+        )
+        assert {k: float(v) for k, v in values.items()} == pytest.approx(
+            {k: float(v) for k, v in joint_values.items()}
+        )
+        s, a = jnp.asarray([0.3, 0.1]), jnp.asarray([0.4])
+        index = jnp.asarray(("bare", "loaded").index(name))
+        np.testing.assert_array_equal(
+            machine.transition(own.mean, s, a, 0.01),
+            system.transition(belief.mean, s, a, 0.01, index),
+        )
+    with pytest.raises(InputError, match=r"E152 unknown configuration.*loaded"):
+        own_table(system.parameters, "load")
+
+
+def test_what_makes_no_sense_is_refused() -> None:
+    def refused(*found: Configuration, **priors: Parameter) -> str:
+        with pytest.raises(InputError) as caught:
+            configured(arm(), found, priors)
+        return str(caught.value)
+
+    assert "E145 unknown parameter: got paylod" in refused(
+        Configuration("a", own=("paylod",))
+    )
+    twice = Configuration("a", (("payload", 0.1),), ("payload",))
+    assert "E145 a constant stated twice" in refused(twice)
+    assert "two configurations of one name" in refused(BARE, BARE)
+    unknown = refused(BARE, LOADED, **{"payload @ bare": arm().parameters["payload"]})
+    assert "E145 unknown parameter: got payload @ bare" in unknown
+    held = arm().parameters.replace(payload=0.2)
+    machine = ODE(arm().function, held, arm().channels, arm().inputs)
+    with pytest.raises(InputError, match=r"E145 a fixed .* got payload = 0\.2"):
+        configured(machine, [LOADED])
+
+
+def test_no_delay_is_longer_than_inputs_are_kept() -> None:
+    machine = Actuated(
+        arm(), {"torque.delay": actuator_prior(arm().actions[0], "delay")}
+    )
+    configured(machine, [Configuration("a", (("torque.delay", 0.02),))])
+    for wrong in (0.021, -0.001):
+        with pytest.raises(InputError, match=r"E141 torque\.delay of one"):
+            configured(machine, [Configuration("a", (("torque.delay", wrong),))])
+    long = {"torque.delay @ a": Parameter("", "", "", "box", 0.0, 0.03)}
+    with pytest.raises(InputError, match=r"from 0 to 0\.03 s"):
+        configured(machine, [Configuration("a", own=("torque.delay",))], long)
+
+
+# The fit.
+
+
+def test_a_linear_machine_has_the_closed_form() -> None:
+    """A dense regression: shared columns, own ones, known values on the right."""
+    rng = np.random.default_rng(3)
+    bare = linear(3, 2)
+    a = Configuration("a", (("k2", 0.5),), ("k1",))
+    prior = {"k1 @ b": Parameter("", "", "", "identity", mean=1.5, sd=0.3)}
+    system = configured(bare, [a, Configuration("b", own=("k1",))], prior)
+    assert system.parameters.names == ("k0", "k1 @ a", "k1 @ b", "k2")
+    truth = {"k0": 1.0, "k1 @ a": -1.0, "k1 @ b": 2.0, "k2": 0.3}
+    N, d = 40, 2
+    A = rng.normal(size=(N, d, 3))
+    group = rng.integers(0, 2, N)
+    X, known = np.zeros((N, d, 4)), np.zeros((N, d))
+    X[..., 0] = A[..., 0]
+    X[group == 0, :, 1], X[group == 1, :, 2] = A[group == 0, :, 1], A[group == 1, :, 1]
+    X[group == 1, :, 3] = A[group == 1, :, 2]
+    known[group == 0] = 0.5 * A[group == 0, :, 2]
+    y = X @ np.asarray([*truth.values()]) + known + 0.1 * rng.normal(size=(N, d))
+    belief = fit_windows(system, windows_of(A, y, group), key=KEY)
+    sd = np.asarray(belief.noise)
+    white = (X / sd[None, :, None]).reshape(-1, 4)
+    mu0, sd0 = np.asarray([0.0, 0.0, 1.5, 0.0]), np.asarray([1.0, 1.0, 0.3, 1.0])
+    precision = white.T @ white + np.diag(1.0 / sd0**2)
+    rhs = white.T @ ((y - known) / sd[None]).reshape(-1) + mu0 / sd0**2
+    scale = np.asarray(belief.posterior.scale)
+    np.testing.assert_allclose(scale @ scale.T, np.linalg.inv(precision), rtol=1e-8)
+    mean = np.linalg.solve(precision, rhs)
+    np.testing.assert_allclose(belief.posterior.mean, mean, rtol=1e-9)
+    # The evidence, of all rows at once.
+    X0 = white * sd0[None]
+    covariance = np.eye(len(X0)) + X0 @ X0.T
+    r = ((y - known) / sd[None]).reshape(-1) - white @ mu0
+    _, log_det = np.linalg.slogdet(covariance)
+    log_evidence = -0.5 * (r @ np.linalg.solve(covariance, r) + log_det)
+    log_evidence -= N * np.sum(np.log(sd)) + 0.5 * len(X0) * np.log(2.0 * np.pi)
+    np.testing.assert_allclose(belief.log_evidence, log_evidence, rtol=1e-10)
+
+
+@eqx.filter_jit
+def descend(system: AbstractSystem, windows: Windows) -> Fit:
+    prior = system.parameters.prior()
+    W, n = windows.start.shape
+    noise = Noise(jnp.asarray([1e-3]), jnp.ones(W))
+    model = likelihood.likelihood(system, prior, windows)
+    return minimise(model, jnp.zeros(prior.mean.size), jnp.zeros((W, n)), noise)
+
+
+@in_float64
+def test_sharing_nothing_is_two_fits(logs: tuple[Log, Log]) -> None:
+    machine = arm()
+    every = machine.parameters.names
+    system = joint(*(Configuration(n, own=every) for n in ("a", "b")))
+    whole, _ = cut(logs, system, window=0.2)
+    both = descend(system, jax.tree.map(jnp.asarray, whole))
+    order = [[f"{n} @ {c}" for n in every] for c in ("a", "b")]
+    cost = evidence = 0.0
+    for k, columns in enumerate(order):
+        mine = whole.configuration == k
+        part = jax.tree.map(lambda x, m=mine: x[m] if len(x) == len(m) else x, whole)
+        one = descend(machine, jax.tree.map(jnp.asarray, part))
+        at = [system.parameters.names.index(name) for name in columns]
+        scale = np.asarray(one.scale())
+        sd = np.sqrt(np.sum(scale**2, axis=1))
+        np.testing.assert_allclose(np.asarray(both.z)[at] / sd, one.z / sd, atol=1e-8)
+        ours = np.asarray(both.scale())[at]
+        np.testing.assert_allclose(ours @ ours.T, scale @ scale.T, rtol=1e-7)
+        cost, evidence = cost + one.cost, evidence + one.log_joint()
+    np.testing.assert_allclose(both.cost, cost, rtol=1e-10)
+    np.testing.assert_allclose(both.log_joint(), evidence, rtol=1e-10)
+
+
+@pytest.fixture(scope="module")
+def joined(logs: tuple[Log, Log]) -> tuple[WindowsBelief, Windows]:
+    system = joint(BARE, LOADED)
+    windows, _ = cut(logs, system, window=0.2)
+    return fit_windows(system, windows, key=KEY), windows
+
+
+def test_a_payload_is_found_and_the_arm_is_known_better(
+    joined: tuple[WindowsBelief, Windows],
+) -> None:
+    belief, windows = joined
+    found, table = moments(belief), belief.system.parameters
+    for name, (mean, sd) in found.items():
+        truth = table[name].unconstrain(TRUTH[name.split(" @ ")[0]])
+        assert abs(mean - truth) < 3.5 * sd, name
+    mean, sd = found["payload @ loaded"]
+    p = table["payload @ loaded"]
+    assert p.constrain(mean + sd) - p.constrain(mean - sd) < 0.02  # kg
+    # Each of the logs alone: the other one's windows are masked.
+    for k in (0, 1):
+        mask = windows.mask & (windows.configuration == k)[:, None, None]
+        part = dataclasses.replace(windows, mask=mask)
+        one = moments(fit_windows(belief.system, part, key=KEY))
+        for name in SHARED:
+            assert found[name][1] < one[name][1], name
+        mean, sd = one["payload @ loaded"]
+        if k:
+            assert found["payload @ loaded"][1] < sd
+        else:  # nothing was seen of it: its prior
+            assert (mean, sd) == pytest.approx((p.mean, p.sd))
+
+
+def test_a_value_that_is_wrong_is_seen(
+    joined: tuple[WindowsBelief, Windows],
+) -> None:
+    """0.15 kg were there; 0.05 are stated. The bare log says what the arm is."""
+    belief, windows = joined
+    assert not misfit_of_windows(belief, windows).alarm
+    known = Configuration("loaded", fixed=(("payload", 0.05),))
+    wrong = fit_windows(joint(BARE, known), windows, key=KEY)
+    assert wrong.system.parameters.names == SHARED
+    assert float(wrong.log_evidence) < float(belief.log_evidence) - 50.0
+    assert misfit_of_windows(wrong, windows).alarm
+
+
+@in_float64
+def test_the_program_does_not_grow_with_configurations(
+    logs: tuple[Log, Log],
+) -> None:
+    """The simulation is traced as often for three configurations as for one."""
+    traced: list[int] = []
+
+    def counted(k: Any, s: Any, a: Any) -> Any:
+        traced.append(1)
+        return arm().function(k, s, a)
+
+    machine = ODE(counted, arm().parameters, arm().channels, arm().inputs)
+    third = Configuration("third", own=("weight",))
+    windows, _ = cut(logs, machine, window=0.2)
+    counts = []
+    for system in (machine, configured(machine, [BARE, LOADED, third])):
+        prior = system.parameters.prior()
+        model = likelihood.likelihood(system, prior, jax.tree.map(jnp.asarray, windows))
+        nothing = jnp.zeros(prior.mean.size), jnp.zeros_like(windows.start)
+        traced.clear()
+        jax.make_jaxpr(model.blocks)(*nothing)
+        counts.append(len(traced))
+    assert counts[0] == counts[1] > 0
+
+
+@in_float64
+def test_one_step_is_fitted_jointly_as_well(getkey: Any) -> None:
+    """Of a linear machine: regression by configuration, rows in any order."""
+    a = Configuration("a", (("k1", 0.5),))
+    system = configured(linear(2, 1), [a, Configuration("b", own=("k1",))])
+    assert system.parameters.names == ("k0", "k1 @ b")
+    rng = np.random.default_rng(5)
+    A, group = rng.normal(size=(30, 1, 2)), rng.integers(0, 2, 30)
+    k1 = np.where(group == 0, 0.5, -1.0)
+    y = A[..., 0] * 1.5 + A[..., 1] * k1[:, None] + 0.1 * rng.normal(size=(30, 1))
+    data = Transitions.of(np.zeros_like(y), A.reshape(30, -1), y, group)
+    more = data.extend(data.state[:2], data.action[:2], data.next_state[:2])
+    assert more.configuration is not None
+    assert more.configuration[:32].tolist() == [*group, 0, 0]
+    model = Sim2GP(system, dt=1.0)
+    belief = model.fit(model.init(getkey()), data, key=getkey())
+    X = np.stack([A[:, 0, 0], A[:, 0, 1] * group], axis=1) / float(belief.noise[0])
+    right = (y[:, 0] - 0.5 * A[:, 0, 1] * (1 - group)) / float(belief.noise[0])
+    precision = X.T @ X + np.eye(2)
+    scale = np.asarray(belief.posterior.scale)
+    np.testing.assert_allclose(scale @ scale.T, np.linalg.inv(precision), rtol=1e-8)
+    mean = np.linalg.solve(precision, X.T @ right)
+    np.testing.assert_allclose(belief.posterior.mean, mean, rtol=1e-8)
+    with pytest.raises(InputError, match="E152"):  # a draw is of one configuration
+        belief.latent(jnp.zeros(1), jnp.zeros(2))
+
+
+def test_rows_on_the_host_have_constants_of_their_own() -> None:
+    """A known value beyond the prior's bounds is simulated as it is."""
+    inside = Parameter("k", "1", "gain", "box", 0.5, 2.0)
+    asked: list[float] = []
+
+    def step(params: Any, s: Any, a: Any, h: Any) -> Any:
+        asked.extend(np.atleast_1d(params["k"]).tolist())
+        return s + np.asarray(params["k"] * h)[..., None] * a
+
+    channel = Channel("x", "m")
+    machine = BlackBox(step, [inside], [channel], [Channel("u", "1")], batched=True)
+    known = Configuration("a", (("k", 5.0),))
+    system = configured(machine, [known, Configuration("b")])
+
+    @in_float64
+    def slopes() -> tuple[np.ndarray, np.ndarray]:
+        def f(tt: Any, which: Any) -> Any:
+            s, a = jnp.ones(1), 2.0 * jnp.ones(1)
+            return system.transition(tt, s, a, 0.1, which)
+
+        tt, which = jnp.zeros(1), jnp.asarray([0, 1])
+        value = jax.vmap(f, in_axes=(None, 0))(tt, which)
+        return value, jax.vmap(jax.jacfwd(f), in_axes=(None, 0))(tt, which)
+
+    value, J = slopes()
+    np.testing.assert_allclose(value[:, 0], [2.0, 1.25], rtol=1e-12)
+    # dk/dtt is a quarter of the box at its middle.
+    np.testing.assert_allclose(J[:, 0, 0], [0.0, 0.2 * 1.5 / 4.0], rtol=1e-7)
+    assert max(asked) <= 5.0 + 1e-3

@@ -1,0 +1,187 @@
+"""Sums of constants that were weighed: closed forms, bounds, project files."""
+
+import dataclasses
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.optimize
+
+from linear_system import linear, transitions, windows_of
+from sim2gp.errors import InputError
+from sim2gp.models import Sim2GP
+from sim2gp.models.informed import informed_prior
+from sim2gp.models.windows import WindowsBelief, fit_windows
+from sim2gp.parameters import Parameter, Parameters
+from sim2gp.project import load_project
+from sim2gp.systems import Candidate, Configuration, Coulomb, InputDelay, configured
+from sim2gp.systems.configured import Configured, with_weighed
+from sim2gp.systems.furuta import Furuta
+from sim2gp.types import in_float64
+from sim2gp.weighed import Weighed
+
+KEY = jax.random.key(0)
+SUM = Weighed(("k0", "k1"), (1.0, 1.0), 3.0, 0.01)
+BOXES = (
+    Parameter("a", "kg", "one", "box", 0.0, 2.0),
+    Parameter("b", "kg", "other", "log_box", 0.1, 1.0, mean=0.5),
+    Parameter("c", "kg", "third", "log", 0.0, sd=0.5),
+)
+
+
+def data(getkey: object = None) -> tuple[np.ndarray, np.ndarray]:
+    """Rows that tell ``k0 - k1`` and ``k2``, and nothing of ``k0 + k1``."""
+    rng = np.random.default_rng(2)
+    J = rng.normal(size=(25, 1, 3))
+    J[..., 1] = -J[..., 0]
+    return J, J @ np.asarray([2.0, 1.0, -0.5]) + 0.1 * rng.normal(size=(25, 1))
+
+
+@pytest.fixture(scope="module")
+def belief() -> WindowsBelief:
+    J, y = data()
+    system = with_weighed(linear(3, 1), [SUM])
+    return fit_windows(system, windows_of(J, y, np.zeros(25)), key=KEY)
+
+
+def dense(sd: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """Mean, covariance and log evidence by one regression, the sum a row of it."""
+    J, y = data()
+    X = np.concatenate([J[:, 0] / sd, np.asarray([[100.0, 100.0, 0.0]])])
+    right = np.append(y[:, 0] / sd, 300.0)
+    covariance = np.linalg.inv(X.T @ X + np.eye(3))
+    C = np.eye(len(X)) + X @ X.T
+    evidence = -0.5 * (right @ np.linalg.solve(C, right) + np.linalg.slogdet(C)[1])
+    # Of the rows; that of the sum is a constant of the file.
+    evidence -= len(y) * (np.log(sd) + 0.5 * np.log(2.0 * np.pi))
+    return covariance @ X.T @ right, covariance, float(evidence)
+
+
+def test_a_sum_is_one_more_row_of_a_regression(belief: WindowsBelief) -> None:
+    mean, covariance, evidence = dense(float(belief.noise[0]))
+    scale = np.asarray(belief.posterior.scale)
+    np.testing.assert_allclose(scale @ scale.T, covariance, rtol=1e-7)
+    np.testing.assert_allclose(belief.posterior.mean, mean, rtol=1e-8)
+    np.testing.assert_allclose(float(belief.log_evidence), evidence, rtol=1e-9)
+    # Without it the logs leave the sum to the prior, whose sd of it is sqrt(2).
+    u = np.asarray([1.0, 1.0, 0.0])
+    assert np.sqrt(u @ covariance @ u) == pytest.approx(0.01, rel=1e-3)
+    assert float(u @ np.asarray(belief.posterior.mean)) == pytest.approx(3.0, abs=0.01)
+
+
+@in_float64
+def test_one_step_data_know_it_too() -> None:
+    J, y = data()
+    system = with_weighed(linear(3, 1), [SUM])
+    model = Sim2GP(system, dt=1.0)
+    found = model.fit(model.init(KEY), transitions(J, y), key=KEY)
+    mean, covariance, _ = dense(float(found.noise[0]))
+    scale = np.asarray(found.posterior.scale)
+    np.testing.assert_allclose(scale @ scale.T, covariance, rtol=1e-7)
+    np.testing.assert_allclose(found.posterior.mean, mean, rtol=1e-8)
+
+
+@in_float64
+def test_what_was_weighed_is_prior_to_the_logs(belief: WindowsBelief) -> None:
+    """Prior and information of `informed` make the same posterior."""
+    told = belief.informed()
+    u = jnp.asarray([1.0, 1.0, 0.0])
+    assert float(jnp.linalg.norm(u @ belief.prior.scale)) == pytest.approx(np.sqrt(2.0))
+    assert float(jnp.linalg.norm(u @ told.prior.scale)) == pytest.approx(0.01, rel=1e-4)
+    assert float(u @ told.prior.mean) == pytest.approx(3.0, abs=1e-3)
+    A, L0 = np.asarray(told.information), np.asarray(told.prior.scale)
+    posterior = L0 @ np.linalg.inv(A.T @ A + np.eye(3)) @ L0.T
+    scale = np.asarray(belief.posterior.scale)
+    np.testing.assert_allclose(posterior, scale @ scale.T, rtol=1e-7)
+    plain = dataclasses.replace(belief, system=linear(3, 1))
+    assert plain.informed() is plain
+
+
+@in_float64
+def test_bounded_constants_keep_their_sum() -> None:
+    """The mode by scipy, the curvature by hand: the sum is not linear in ``tt``."""
+    x = Weighed(("a", "b", "c"), (1.0, 2.0, -1.0), 0.7, 0.02)
+    table = Parameters(BOXES, weighed=(x,))
+    prior, found = table.prior(), informed_prior(table)
+
+    def cost(z: jax.Array) -> jax.Array:
+        theta = table.constrain(prior.mean + prior.scale @ z)
+        r = (theta @ jnp.asarray([1.0, 2.0, -1.0]) - 0.7) / 0.02
+        return 0.5 * (z @ z + r**2)
+
+    z = np.linalg.solve(np.asarray(prior.scale), np.asarray(found.mean - prior.mean))
+    slope = jax.jit(jax.grad(cost))
+    best = scipy.optimize.root(slope, np.zeros(3), tol=1e-12)
+    np.testing.assert_allclose(z, best.x, atol=1e-6)
+    assert float(jnp.max(jnp.abs(slope(jnp.asarray(z))))) < 1e-6
+
+    def r(z: jax.Array) -> jax.Array:
+        theta = table.constrain(prior.mean + prior.scale @ z)
+        return (theta @ jnp.asarray([1.0, 2.0, -1.0])) / 0.02
+
+    K = np.asarray(jax.grad(r)(jnp.asarray(z)))
+    L0 = np.asarray(prior.scale)
+    covariance = L0 @ np.linalg.inv(np.eye(3) + np.outer(K, K)) @ L0.T
+    scale = np.asarray(found.scale)
+    np.testing.assert_allclose(scale @ scale.T, covariance, rtol=1e-6, atol=1e-12)
+
+
+def test_a_candidate_keeps_what_is_known() -> None:
+    """Explain tries machines with one constant more."""
+    x = Weighed(("arm_mass", "pendulum_mass"), (1.0, 1.0), 0.119, 0.001)
+    heavy = Configuration("heavy", own=("pendulum_mass",))
+    both = with_weighed(configured(Furuta(), [Configuration("bare"), heavy]), [x])
+    machine = both
+    for effect in (Coulomb("theta", 0.01), InputDelay("voltage", 0.02)):
+        candidate = Candidate(effect)
+        machine = candidate.freed(machine)
+        assert isinstance(machine, Configured)
+        assert machine.parameters.weighed == (x,)
+        assert machine.parameters.configurations == both.parameters.configurations
+        assert {*machine.parameters.names} >= {*both.parameters.names, candidate.name}
+    assert machine.longest_delay == 0.02
+    more = {"theta.coulomb", "voltage.delay"}
+    assert {*machine.parameters.names} == {*both.parameters.names, *more}
+
+
+ARM = """system = "uniform_rod_arm"
+[[weighed]]
+of = ["m1", "m2"]
+value = {value}
+sd = {sd}
+"""
+
+
+def test_a_project_file_says_what_was_weighed(tmp_path: Path) -> None:
+    path = tmp_path / "arm.toml"
+    path.write_text(ARM.format(value=1.24, sd=0.005))
+    found = load_project(path).system.parameters
+    assert found.weighed == (Weighed(("m1", "m2"), (1.0, 1.0), 1.24, 0.005),)
+    path.write_text(ARM.format(value=0.2, sd=0.005) + "weights = [1.0, -0.5]\n")
+    (x,) = load_project(path).system.parameters.weighed
+    assert x.weights == (1.0, -0.5)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("1.24", "-1.0", "E142 a weighed sum that the bounds rule out"),
+        ("0.005", "0.0", "E144"),
+        ('"m2"', '"mm2"', "did you mean m2"),
+        ('"m2"', '"m1"', "E145 a constant twice"),
+        ("sd =", "weights = [1.0]\nsd =", "E160 weights of a sum"),
+        ("sd =", "weight = 1.0\nsd =", "did you mean weights"),
+        ("[[weighed]]", "[parameters]\nm1 = 1.0\nm2 = 0.24\n[[weighed]]", "unknowns"),
+    ],
+)
+def test_a_wrong_sum_is_one_line(
+    tmp_path: Path, old: str, new: str, words: str
+) -> None:
+    path = tmp_path / "arm.toml"
+    path.write_text(ARM.format(value=1.24, sd=0.005).replace(old, new))
+    with pytest.raises(InputError) as caught:
+        load_project(path)
+    assert words in str(caught.value)
+    assert "arm.toml:line" in str(caught.value)
