@@ -65,8 +65,8 @@ def read(text: str) -> Page:
 
 
 EVERY_SECTION = [
-    "claims", "figure1", "machine", "returns", "parameters", "densities",
-    "directions", "correlation", "misfit", "traces", "heldout", "tables",
+    "claims", "figure1", "machine", "returns", "parameters", "directions", "misfit",
+    "heldout", "calibration", "traces", "densities", "correlation", "tables", "made",
 ]  # fmt: skip
 
 
@@ -96,6 +96,7 @@ def test_an_empty_run_is_a_page_without_sections() -> None:
         ("correlation", ["parameters/correlation"]),
         ("directions", ["directions", "base_parameters"]),
         ("misfit", ["noise", "misfit"]),
+        ("calibration", ["calibration/"]),
         ("traces", ["trace/"]),
         ("tables", ["tables"]),
     ],

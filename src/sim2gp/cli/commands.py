@@ -120,6 +120,8 @@ class Identify(Writes):
     """Draws the starts of the fit."""
     check: bool = False
     """Hold the posterior against the exact one (Pareto k); takes as long again."""
+    held_out: bool = True
+    """Fit once more without some of the data, to forecast it; takes as long again."""
 
     def run(self, progress: Progress) -> dict[str, Any]:
         out = _out(self.out, self.project.stem)
@@ -129,6 +131,7 @@ class Identify(Writes):
             out=out,
             seed=self.seed,
             check=self.check,
+            held_out=self.held_out,
             progress=progress,
         )
 

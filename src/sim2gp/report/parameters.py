@@ -108,7 +108,7 @@ def parameter_table(summary: Summary) -> Raw:
         ),
         _why(summary.get("intervals")),
         _checked(summary.get("check")),
-        table(columns, rows, words=(0, 1, last)),
+        table(columns, rows, words=(0, 1, last), cards=True),
     )
 
 
@@ -288,12 +288,18 @@ def directions(summary: Summary) -> Raw:
         )
         for entry in base
     ]
+    columns = ["combination", "value", "unit", "verdict"]
     return section(
         "directions",
         "Combinations",
         listing(_direction(entry) for entry in entries),
         Raw("<h3>Base parameters: what these data do determine</h3>\n" if rows else ""),
-        table(["combination", "value", "unit", "verdict"], rows, words=(0, 2, 3))
+        table(
+            ["combination", "value", "unit", "verdict"],
+            rows,
+            words=(0, 2, 3),
+            cards=True,
+        )
         if rows
         else "",
     )
