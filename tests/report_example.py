@@ -262,3 +262,60 @@ def full_run() -> Run:
         summary |= part[0]
         arrays |= part[1]
     return summary, arrays
+
+
+def a_film(pictures: bool = True) -> Run:
+    """A stick figure of two links: its forecast over what was recorded, in two pieces.
+
+    With pictures, as MuJoCo renders them, of another colour each.
+    """
+    import io
+
+    from PIL import Image
+
+    t = 0.01 * np.arange(100)
+    recorded = np.stack([np.sin(3 * t), np.cos(5 * t)], axis=1)
+    state = recorded + 0.2 * (t % 0.5)[:, None]
+
+    def points(q: np.ndarray) -> np.ndarray:
+        first, second = q[:, 0], q.sum(axis=1)
+        zero = np.zeros_like(first)
+        elbow = 0.4 * np.stack([np.sin(first), zero, -np.cos(first)], axis=1)
+        tip = elbow + 0.3 * np.stack([np.sin(second), zero, -np.cos(second)], axis=1)
+        return np.stack([np.zeros_like(elbow), elbow, tip], axis=1)
+
+    figure = {
+        "fixed": [[0.0, 0.0, 0.0]],
+        "rods": [[1, 2, "link"], [2, 3, "tip"]],
+        "balls": [[0, "base"], [1, "link"], [2, "link"], [3, "tip"]],
+    }
+    about: dict[str, Any] = {
+        "system": "figure", "figure": figure, "dt": 0.01, "title": "Forecasts",
+        "marks": [{"time": 0.0, "text": "run, from 0.1 s"},
+                  {"time": 0.5, "text": "run, from 0.6 s"}],
+        "strips": [[0, "shoulder", "deg", 57.3], [1, "elbow", "deg", 57.3]],
+        "inputs": [["shoulder_motor", ""]],
+    }  # fmt: skip
+    arrays = {
+        "animation/state": state,
+        "animation/recorded": recorded,
+        "animation/points": points(state),
+        "animation/recorded_points": points(recorded),
+        "animation/action": np.sign(np.sin(9 * t))[:, None],
+    }
+    if pictures:
+        files = []
+        for k in range(4):
+            image = Image.new("RGB", (480, 315), (60 * k, 200 - 40 * k, 90))
+            file = io.BytesIO()
+            image.save(file, format="WEBP")
+            files.append(file.getvalue())
+        about["frames"] = {"every": 25, "width": 480, "height": 315}
+        arrays["animation/frames"] = np.frombuffer(b"".join(files), np.uint8)
+        arrays["animation/frame_ends"] = np.cumsum([len(file) for file in files])
+    summary = {
+        "command": "identify", "title": "arm: what one log determines",
+        "headline": "6 of 6 constants are identified.", "animation": about,
+        "command_line": "sim2gp identify arm.toml", "versions": {"sim2gp": "0.1.0"},
+    }  # fmt: skip
+    return summary, arrays

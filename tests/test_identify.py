@@ -131,6 +131,45 @@ def test_identify_writes_a_report_with_traces(run: Path) -> None:
     assert arrays["trace/log1/low/theta"].shape == arrays["trace/log1/time"].shape
 
 
+def test_identify_forecasts_a_log_that_it_left_out(run: Path) -> None:
+    """Oracle: the same machine, so that errors stay far below those of standing still.
+
+    The fit of one log knows less: it is another fit, and its bands are wider.
+    """
+    stored = load_run(run)
+    about, x = stored.summary["held_out"], stored.arrays
+    assert about["left_out"] == "log2"
+    assert about["windows"] == 7  # every 0.1 s, half a second before the log's end
+    assert about["open_loop_rmse"]["alpha"] < 0.2 * about["hold_rmse"]["alpha"]
+    logs = {key.split("/")[1] for key in x if key.startswith("unseen/")}
+    assert logs == {"log2"}
+    width = [x[f"{kind}/log2/high/alpha"] - x[f"{kind}/log2/low/alpha"]
+             for kind in ("unseen", "trace")]  # fmt: skip
+    assert np.nanmean(width[0]) > np.nanmean(width[1])
+    text = (run / "report.html").read_text()
+    for words in ('id="heldout"', 'id="calibration"', 'id="machine"', "without log2"):
+        assert words in text
+    command = stored.summary["command_line"]
+    assert command == f"sim2gp identify {run.parent / 'machine.toml'} --out {run} " + (
+        "--seed 0 --check"
+    )
+    assert {"python", "sim2gp", "jax", "numpy"} <= set(stored.summary["versions"])
+
+
+def test_a_film_shows_what_was_recorded_and_forecast(run: Path) -> None:
+    stored = load_run(run)
+    about, x = stored.summary["animation"], stored.arrays
+    assert about["system"] == "furuta"
+    assert about["dt"] == pytest.approx(0.01)
+    starts = [round(mark["time"] / about["dt"]) for mark in about["marks"]]
+    assert starts[:3] == [0, 50, 100]
+    np.testing.assert_allclose(
+        x["animation/state"][starts], x["animation/recorded"][starts], atol=5e-3
+    )
+    off = x["animation/state"] - x["animation/recorded"]
+    assert 1e-4 < np.abs(off).max() < 0.3
+
+
 def test_evaluate_predicts_a_log_from_anywhere(
     run: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -161,6 +200,9 @@ def test_leave_one_out_predicts_every_log(folder: Path, tmp_path: Path) -> None:
     one, two, pooled = (float(row[2]) for row in rows)
     assert min(one, two) <= pooled <= max(one, two)
     assert [row[0] for row in summary["tables"][2]["rows"]] == ["log1", "log2"]
+    kept = load_run(out).arrays
+    assert {key.split("/")[1] for key in kept if "/low/" in key} == {"log1", "log2"}
+    assert "calibration/share/alpha" in kept
 
 
 def test_no_horizon_longer_than_the_log(run: Path, folder: Path) -> None:

@@ -185,7 +185,8 @@ tie = true
 delay = {low = 0.0, high = 0.02}
 """
     path = project(folder, text)
-    assert main(["identify", str(path), "--out", str(folder / "run"), "--quiet"]) == 0
+    words = ["identify", str(path), "--no-held-out", "--quiet"]
+    assert main([*words, "--out", str(folder / "run")]) == 0
     return folder / "run"
 
 

@@ -53,6 +53,7 @@ from sim2gp.runs.store import Run
 from sim2gp.types import in_float64
 
 PROJECT = "project.toml"  # the file's name in a run
+_SHORTEST = 4  # windows: a film of fewer held-out ones is not worth watching
 
 
 def run(
@@ -133,7 +134,7 @@ def _drawings(
     if other is not None:
         summary["held_out"] = other.summary
         arrays |= other.arrays
-        if other.fold is not None:
+        if other.fold is not None and len(other.picture["which"][0]) >= _SHORTEST:
             picture, data = other.picture, "held-out"
             posterior, shown = other.fold.posterior, other.fold.tested
     title = f"Forecasts of {data} data over what was recorded"

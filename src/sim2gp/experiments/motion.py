@@ -4,8 +4,9 @@ Windows follow each other: the recorded motion goes on, the forecast begins anew
 the measured state every half second.
 """
 
+import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +19,11 @@ from sim2gp.systems import CartPole, Furuta, MuJoCo, TwoLink, UniformRodArm
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import in_float64
 
+if TYPE_CHECKING:
+    from sim2gp.report.scenes import Scene
+
 MOST = 20  # windows: ten seconds
+FRAME = 8  # rows of the film between pictures of MuJoCo's own
 _STRIPS = 4
 _BUNDLED: tuple[tuple[type, str], ...] = (
     (Furuta, "furuta"),
@@ -125,7 +130,7 @@ def _drawing(
             return {"system": name, "params": params}, {}
     if not isinstance(machine, MuJoCo):
         return {}, {}
-    from sim2gp.report.skeleton import figure_entry
+    from sim2gp.report.skeleton import figure_entry, skeleton
     from sim2gp.systems.mujoco_figure import figure_of
 
     theta = np.asarray([values[name] for name in machine.names])
@@ -133,9 +138,42 @@ def _drawing(
     figure = figure_of(model, np.concatenate(motion))
     points = figure.moving.astype(np.float32)
     half = len(motion[0])
-    return {"system": "figure", "figure": figure_entry(figure)}, {
+    entry = figure_entry(figure)
+    frames = _frames(model, motion, skeleton(entry, points))
+    return {"system": "figure", "figure": entry} | frames[0], {
         "animation/points": points[:half],
         "animation/recorded_points": points[half:],
+        **frames[1],
+    }
+
+
+def _frames(
+    model: Any, motion: list[np.ndarray], scene: "Scene"
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """MuJoCo's own pictures, seen as the stick figure is; empty where it has none."""
+    from sim2gp.systems.mujoco_film import MOST, rendered
+
+    every = max(FRAME, -(-len(motion[0]) // MOST))
+    width, height = scene.width * 3 // 4, scene.height * 3 // 4
+    camera = scene.camera
+    found = rendered(
+        model,
+        motion[1][::every],
+        motion[0][::every],
+        lookat=np.asarray(camera.target),
+        view=(
+            math.degrees(camera.azimuth) + 180.0,
+            -math.degrees(camera.elevation),
+            camera.distance,
+            2.0 * math.degrees(math.atan(0.5 * scene.height / camera.focal)),
+        ),
+        size=(width, height),
+    )
+    if not found:
+        return {}, {}
+    return {"frames": {"every": every, "width": width, "height": height}}, {
+        "animation/frames": np.frombuffer(b"".join(found), np.uint8),
+        "animation/frame_ends": np.cumsum([len(frame) for frame in found]),
     }
 
 

@@ -195,7 +195,8 @@ def scores(
     }
     if found.regression is not None:
         summary["regression_rmse"] = named(_rms(found.regression, found.valid[:, at]))
-    curve = np.asarray([i for i in range(len(found.rows)) if i != one or at == one])
+    some = np.asarray(found.valid.any(axis=(0, 2)))
+    curve = np.asarray([i for i in np.flatnonzero(some) if i != one or at == one])
     seconds = found.rows[curve] * PERIOD
     summary["tables"] = [
         _by_horizon(found, names, curve, seconds, model, hold, share90, share95),

@@ -20,6 +20,7 @@ from sim2gp.report.markup import (
     percent,
     section,
     table,
+    unit_text,
 )
 from sim2gp.report.parameters import Arrays, Summary
 from sim2gp.report.traces import forecasts, unit_of
@@ -99,7 +100,13 @@ def noise_and_misfit(summary: Summary) -> Raw:
     noise, misfit = summary.get("noise"), summary.get("misfit")
     parts: list[str] = []
     if isinstance(noise, Mapping) and noise:
-        parts += [Raw("<h3>Noise</h3>\n"), records(noise, "channel")]
+        stated = {
+            name: sd
+            if isinstance(sd, Mapping)
+            else {"sd": sd, "unit": unit_text(unit_of(summary, name)) or "1"}
+            for name, sd in noise.items()
+        }
+        parts += [Raw("<h3>Noise</h3>\n"), records(stated, "channel")]
     if isinstance(misfit, Mapping):
         parts.append(Raw("<h3>Misfit</h3>\n"))
         if misfit.get("verdict"):
@@ -121,7 +128,7 @@ def calibration(summary: Summary, arrays: Arrays) -> Raw:
     if levels is None or not names:
         return Raw("")
     ends = (0.0, 1.0)
-    axes = svg.Axes(ends, ends, 400.0, 380.0, x_label="promised")
+    axes = svg.Axes(ends, ends, 520.0, 400.0, x_label="promised")
     levels = np.asarray(levels, float)
     marks = [
         svg.band(
@@ -131,10 +138,7 @@ def calibration(summary: Summary, arrays: Arrays) -> Raw:
     ]
     for index, name in enumerate(names):
         share, css = arrays[prefix + name], _COLOURS[index % 6]
-        marks += [
-            svg.line(axes, levels, share, css),
-            svg.dots(axes, levels, share, css),
-        ]
+        marks.append(svg.line(axes, levels, share, css))
     about = (summary.get("held_out") or summary).get("calibration") or {}
     counted = (
         f"{number(about.get('windows'))} forecasts over {number(about.get('horizon'))} "

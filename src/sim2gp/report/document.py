@@ -93,6 +93,30 @@ def _status(summary: Summary) -> Raw:
     )
 
 
+def _learned(summary: Summary) -> str:
+    """What was learned, whether to believe it, and how far it predicts."""
+    said = [str(summary["headline"])] if summary.get("headline") else []
+    misfit, unseen = summary.get("misfit"), summary.get("held_out")
+    if (
+        isinstance(misfit, Mapping)
+        and misfit.get("verdict")
+        and not misfit.get("alarm")
+    ):
+        said.append(str(misfit["verdict"]))
+    if isinstance(unseen, Mapping) and unseen.get("open_loop_rmse"):
+        units = summary.get("units") or {}
+        errors = [
+            f"{number(error, 2)} {units.get(name, '')} ({name})"
+            for name, error in unseen["open_loop_rmse"].items()
+        ]
+        ahead = number(unseen.get("horizon"), 2)
+        said.append(
+            f"A fit that had not seen {unseen.get('left_out')} forecasts it {ahead} s "
+            f"ahead with a root mean square error of {', '.join(errors)}."
+        )
+    return " ".join(filter(None, said))
+
+
 def _made(summary: Summary) -> Raw:
     """Command line, size, time and versions."""
     rows: list[tuple[str, object]] = []
@@ -210,12 +234,12 @@ def write_report(summary: Summary, arrays: Arrays) -> str:
         _made(summary),
     ]
     name = f"sim2gp {summary.get('command') or 'run'}"
-    headline = summary.get("headline")
+    learned = _learned(summary)
     body = "".join(
         [
             f"<header>\n<h1>{esc(summary.get('title') or name)}</h1>\n",
             _status(summary),
-            paragraph(headline, "lead") if headline else "",
+            paragraph(learned, "lead") if learned else "",
             _contents(sections),
             "</header>\n",
             *sections,

@@ -267,9 +267,7 @@ def _direction(entry: Mapping[str, Any]) -> Raw:
     if combination and str(combination) not in str(text):
         parts.append(f"<code>{esc(combination)}</code>")
     if is_number(entry.get("information")):
-        parts.append(
-            f'<span class="soft">information {number(entry["information"])}</span>'
-        )
+        parts.append(f'<span class="soft">({number(entry["information"])} nats)</span>')
     if entry.get("flat"):
         parts.append('<span class="chip warn">flat</span>')
     return Raw(" ".join(part for part in parts if part))
@@ -294,12 +292,5 @@ def directions(summary: Summary) -> Raw:
         "Combinations",
         listing(_direction(entry) for entry in entries),
         Raw("<h3>Base parameters: what these data do determine</h3>\n" if rows else ""),
-        table(
-            ["combination", "value", "unit", "verdict"],
-            rows,
-            words=(0, 2, 3),
-            cards=True,
-        )
-        if rows
-        else "",
+        table(columns, rows, words=(0, 2, 3), cards=True) if rows else "",
     )

@@ -9,6 +9,7 @@ from sim2gp.report.markup import Raw, cards, esc, legend, number, paragraph, sec
 from sim2gp.report.parameters import Arrays, Summary
 
 _MOST_TRACES = 40  # drawings; more would make the page heavy, not clearer
+_ROOM = 0.4  # of the signal's own range: that much of the band is shown beyond it
 _CLOSE = 1.5  # s of the closer look
 
 
@@ -50,7 +51,11 @@ def _trace(
     }
     # The band may be far wider than the signal: it must not set the scale alone.
     lines = [curves[k] for k in ("measured", "predicted") if k in curves]
-    axes = svg.Axes(svg.span(time, margin=0.0), svg.span(*lines), 440.0, x_label="s")
+    low, high = svg.span(*lines)
+    wide = svg.span(*curves.values())
+    room = low - _ROOM * (high - low), high + _ROOM * (high - low)
+    ends = max(wide[0], room[0]), min(wide[1], room[1])
+    axes = svg.Axes(svg.span(time, margin=0.0), ends, 440.0, x_label="s")
     marks = []
     if "low" in curves and "high" in curves:
         marks.append(svg.band(axes, time, curves["low"], curves["high"], "c1"))
