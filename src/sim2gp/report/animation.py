@@ -4,7 +4,6 @@ On the page the first frame is an SVG that needs no script; with scripts its sha
 move (player.js). The GIF is drawn by Pillow from the same scene.
 """
 
-import base64
 import io
 import json
 import math
@@ -14,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from sim2gp.report import svg
+from sim2gp.report import frames, svg
 from sim2gp.report.markup import Raw, cards, esc, legend
 from sim2gp.report.scenes import Scene, Shape, keep_frames, project, scene_of
 from sim2gp.report.skeleton import overlaid, skeleton
@@ -216,26 +215,6 @@ def _signals(
     return strips
 
 
-def _pictures(about: Mapping[str, Any], arrays: Arrays) -> str:
-    """The frames that MuJoCo rendered, as more of the film's JSON."""
-    frames, ends = arrays.get("animation/frames"), arrays.get("animation/frame_ends")
-    if "frames" not in about or frames is None or ends is None:
-        return ""
-    parts = np.split(np.asarray(frames, np.uint8), np.asarray(ends)[:-1])
-    coded = [base64.b64encode(part.tobytes()).decode("ascii") for part in parts]
-    apart = float(about["dt"]) * int(about["frames"]["every"])
-    return f',"apart":{apart:.6g},"frames":{json.dumps(coded, separators=(",", ":"))}'
-
-
-def _canvas(about: Mapping[str, Any]) -> str:
-    """Where the frames are shown, once they are there."""
-    size = about.get("frames")
-    if not size:
-        return ""
-    width, height = int(size["width"]), int(size["height"])
-    return f'<canvas class="stage" width="{width}" height="{height}" hidden></canvas>\n'
-
-
 def player(about: Mapping[str, Any], arrays: Arrays) -> Raw:
     """The machine on the page: a picture that plays, and its signals below.
 
@@ -257,18 +236,22 @@ def player(about: Mapping[str, Any], arrays: Arrays) -> Raw:
     title = str(about.get("title") or "The machine")
     scene = keep_frames(scene, index)
     film = _film(scene, dt * stride, marks, [math.ceil(r / stride) for r in rows])
-    film = film[:-1] + _pictures(about, arrays) + "}"
+    film = film[:-1] + frames.pictures(about, arrays) + "}"
     words = marks[0][1] if marks and marks[0][0] <= 0 else ""
     hint = " Drag the picture to look from another side." if scene.camera.turns else ""
     colours = [("quiet", "recorded"), ("c1", "forecast")]
+    shown = " The pale shadow is the recording." if other is not None else ""
+    if "frames" in about:
+        shown += " In MuJoCo's picture the forecast is orange."
     return Raw(
-        f'<div class="player">\n<div>{_still(scene, title, words)}\n{_canvas(about)}'
+        f'<div class="player">\n<div>{_still(scene, title, words)}\n'
+        f"{frames.canvas(about)}"
         '<div class="controls" hidden><button type="button" class="play">Play</button>'
         '<input type="range" min="0" value="0" step="any" aria-label="time">'
         '<output>0 s</output><button type="button" class="pace">1×</button>'
         '<button type="button" class="look" hidden>Figure</button></div>\n'
         f'<script type="application/json">{film}</script>\n'
-        f'<p class="soft">{esc(title)}.{hint}</p></div>\n'
+        f'<p class="soft">{esc(title)}.{shown}{hint}</p></div>\n'
         f"<div>{legend(colours) if other is not None else ''}"
         f"{cards(strips, 'strips')}</div></div>\n"
     )
