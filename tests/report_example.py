@@ -235,6 +235,21 @@ def two_data_sets() -> Run:
     return summary, arrays
 
 
+def planned() -> Run:
+    """An experiment of five seconds, near a limit of one joint."""
+    time = 0.02 * np.arange(251)
+    sweep = np.sin(time**1.5)
+    arrays = {"design/time": time, "design/command/voltage": 3 * sweep[:-1]}
+    for name, size in (("theta", 0.8), ("theta.velocity", 6.0)):
+        arrays[f"design/state/{name}"] = size * sweep
+        arrays[f"design/low/{name}"] = size * (sweep - 0.1 * time / 5)
+        arrays[f"design/high/{name}"] = size * (sweep + 0.1 * time / 5)
+    arrays["design/limit/theta"] = np.array([-1.0, 1.0])
+    arrays["design/limit/voltage"] = np.array([-5.0, 5.0])
+    units = {"voltage": "V", "theta": "rad", "theta.velocity": "rad/s"}
+    return {"units": units, "violations": 0.012, "draws_checked": 500}, arrays
+
+
 def full_run() -> Run:
     """A run that has everything a report can show."""
     rng = np.random.default_rng(0)
@@ -258,8 +273,10 @@ def full_run() -> Run:
         ],
     }  # fmt: skip
     arrays: dict[str, np.ndarray] = {}
-    for part in (parameters(rng), logs(rng), evaluation(), swing_up(), two_data_sets()):
-        summary |= part[0]
+    parts = [parameters(rng), logs(rng), evaluation(), swing_up(), two_data_sets()]
+    for part in (*parts, planned()):
+        units = summary.get("units", {}) | part[0].get("units", {})
+        summary |= part[0] | {"units": units}
         arrays |= part[1]
     return summary, arrays
 

@@ -1,16 +1,23 @@
 """What is held out of a fit, and what is said of bands: by counting."""
 
 import math
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import jax
 import numpy as np
 import pytest
 
+from sim2gp.experiments import folds
 from sim2gp.experiments.calibration import LEVELS, calibration
-from sim2gp.experiments.folds import held_out
+from sim2gp.experiments.folds import fold, held_out
 from sim2gp.experiments.prediction import Judged
 from sim2gp.logs import Log
 from sim2gp.models.cutting import cut
+from sim2gp.models.forecast import Band, Forecast
 from sim2gp.models.grid import evaluation_windows
+from sim2gp.project import load_project
 from sim2gp.systems import CartPole
 
 
@@ -109,3 +116,52 @@ def test_a_channel_that_was_not_measured_has_no_curve() -> None:
     assert "calibration/share/unseen" not in arrays
     assert "unseen" not in about["text"]
     assert about["windows"] == 20
+
+
+def test_neither_fit_nor_band_sees_what_is_held_out(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Whatever `fit_windows` and `fit_band` are given ends before the split."""
+    given: dict[str, Any] = {}
+    logs = (log("a.csv", 8.0),)
+    windows, places = cut(logs, CartPole(), window=0.2)
+    grid = evaluation_windows(logs, CartPole(), longest=1.0)
+    part = held_out(logs, windows, places, grid)
+    assert part is not None
+
+    def fitted(system: Any, kept: Any, **_: Any) -> Any:
+        given["kept"] = kept
+        return SimpleNamespace(posterior=None)
+
+    def forecasts(system: Any, posterior: Any, some: Any, rows: np.ndarray) -> Any:
+        valid = np.asarray(some.mask)[:, rows]
+        none = np.zeros(valid.shape)
+        slopes = [np.zeros((*valid.shape, k)) for k in (4, 1)]
+        return Forecast(none, none, valid, *slopes, none, tuple(rows.tolist()))
+
+    def band(found: Forecast, known: Any, recordings: int) -> Band:
+        given["found"], given["known"], given["recordings"] = found, known, recordings
+        one = np.ones(2)
+        return Band(np.ones(4), np.ones(1), one, np.array([0.0]), one[None], 1.0)
+
+    for name, stub in (("fit_windows", fitted), ("forecast", forecasts)):
+        monkeypatch.setattr(folds, name, stub)
+    monkeypatch.setattr(folds, "fit_band", band)
+    path = tmp_path / "cart.toml"
+    path.write_text('system = "cartpole"\n[[logs]]\nfiles = ["a.csv"]\n'
+                    '[logs.columns]\nx = "x"\ntheta = "theta"\n'
+                    'voltage = "u"\n')  # fmt: skip
+    found = fold(
+        load_project(path), windows, grid, part, 0.5, key=jax.random.key(0), starts=2
+    )
+    assert len(given["kept"]) == len(windows)  # masked, not removed
+    seen = np.asarray(given["kept"].mask).any(axis=(1, 2))
+    np.testing.assert_array_equal(seen, part.train)
+    result, known = given["found"], given["known"]
+    at = known.since[:, None] + 2e-3 * np.asarray(result.rows)
+    used = result.valid.any(axis=2)
+    assert at[used].max() <= part.until
+    assert used[at <= part.until].all()  # and all of what comes before
+    assert given["recordings"] == 1
+    assert found.tested.since.min() >= part.until
+    assert found.judged.valid.shape[0] == part.test.sum()

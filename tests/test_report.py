@@ -65,8 +65,9 @@ def read(text: str) -> Page:
 
 
 EVERY_SECTION = [
-    "claims", "figure1", "machine", "returns", "parameters", "directions", "misfit",
-    "heldout", "calibration", "traces", "densities", "correlation", "tables", "made",
+    "claims", "figure1", "machine", "returns", "experiment", "parameters", "directions",
+    "misfit", "heldout", "calibration", "traces", "densities", "correlation", "tables",
+    "made",
 ]  # fmt: skip
 
 
@@ -92,6 +93,7 @@ def test_an_empty_run_is_a_page_without_sections() -> None:
         ("machine", ["animation"]),
         ("machine", ["animation/"]),
         ("returns", ["returns/"]),
+        ("experiment", ["design/"]),
         ("densities", ["parameters/samples"]),
         ("correlation", ["parameters/correlation"]),
         ("directions", ["directions", "base_parameters"]),
