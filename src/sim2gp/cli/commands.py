@@ -121,7 +121,7 @@ class Identify(Writes):
     check: bool = False
     """Hold the posterior against the exact one (Pareto k); takes as long again."""
     held_out: bool = True
-    """Fit once more without some of the data, to forecast it; takes as long again."""
+    """Fit once more without some of the data, to forecast it (a second fit's time)."""
 
     def run(self, progress: Progress) -> dict[str, Any]:
         out = _out(self.out, self.project.stem)

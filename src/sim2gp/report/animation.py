@@ -19,7 +19,7 @@ from sim2gp.report.scenes import Scene, Shape, keep_frames, project, scene_of
 from sim2gp.report.skeleton import overlaid, skeleton
 
 _MOST_FRAMES = 1500
-_MOST_POINTS = 60_000  # of all frames: about a megabyte
+_MOST_POINTS = 40_000  # of all frames: some 700 kB
 _SLOWEST = 0.02  # s between frames; the player interpolates
 _GRAIN = 1e-4  # m; the resolution of the positions on the page
 _TRAIL_SECONDS = 0.6

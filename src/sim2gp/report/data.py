@@ -160,6 +160,12 @@ def calibration(summary: Summary, arrays: Arrays) -> Raw:
     )
 
 
+def _with_unit(summary: Summary, channel: str) -> Raw:
+    """A channel's name and the unit of its errors."""
+    unit = unit_text(unit_of(summary, channel))
+    return Raw(f'{name_text(channel)} <span class="soft">{esc(unit)}</span>')
+
+
 def _by_channel(summary: Summary) -> Raw:
     """Errors and coverage with a row per channel and a line for the pooled ones."""
     known = {
@@ -182,7 +188,7 @@ def _by_channel(summary: Summary) -> Raw:
     used = [w for w in known.values() if any(w in row for row in rows.values())]
     return table(
         ["channel", *used],
-        [[name_text(c), *(row.get(w, "") for w in used)]
+        [[_with_unit(summary, c), *(row.get(w, "") for w in used)]
          for c, row in rows.items()],
         words=(0,),
         cards=True,
@@ -225,7 +231,7 @@ def held_out(summary: Summary, arrays: Arrays) -> Raw:
         methods = list(dict.fromkeys(method for method, _ in pairs))
         channels = list(dict.fromkeys(channel for _, channel in pairs))
         figures = [_curve(summary, arrays, channel, methods) for channel in channels]
-    numbers = _by_channel(about)
+    numbers = _by_channel({"units": summary.get("units")} | dict(about))
     horizon = about.get("horizon")
     windows = about.get("windows")
     unseen = forecasts(summary, arrays, "unseen")

@@ -51,7 +51,7 @@ def _remaining(entry: Mapping[str, Any]) -> Raw:
     if not (is_number(sd) and is_number(before)) or not float(before) > 0:  # type: ignore[arg-type]
         return Raw(MISSING)
     share = float(sd) / float(before)  # type: ignore[arg-type]
-    text = f"{100 * share:.1f} %" if share < 0.1 else f"{100 * share:.0f} %"
+    text = f"{number(100 * share, 2)} %" if share < 0.1 else f"{100 * share:.0f} %"
     width = f"{100 * min(share, 1.0):.0f}%"
     return Raw(f'<span class="bar"><i style="width:{width}"></i></span>{text}')
 

@@ -8,7 +8,8 @@ from sim2gp.report import svg
 from sim2gp.report.markup import Raw, cards, esc, legend, number, paragraph, section
 from sim2gp.report.parameters import Arrays, Summary
 
-_MOST_TRACES = 40  # drawings; more would make the page heavy, not clearer
+#: Drawings; more would make the page heavy, not clearer.
+_MOST = {"trace": 40, "unseen": 16}
 _ROOM = 0.4  # of the signal's own range: that much of the band is shown beyond it
 _CLOSE = 1.5  # s of the closer look
 
@@ -110,7 +111,7 @@ def forecasts(summary: Summary, arrays: Arrays, prefix: str) -> Raw:
         channels = [k[len(measured) :] for k in arrays if k.startswith(measured)]
         close = _closest_look(arrays, base, channels)
         looks = [(slice(None), "")] + ([] if close is None else [(close, ", closer")])
-        if drawn + len(looks) * len(channels) > _MOST_TRACES and drawn:
+        if drawn + len(looks) * len(channels) > _MOST[prefix] and drawn:
             left += 1
             continue
         drawn += len(looks) * len(channels)

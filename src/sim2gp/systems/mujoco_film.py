@@ -18,7 +18,7 @@ from jaxtyping import Float
 from sim2gp.systems.mjcf_load import in_child
 
 MOST = 125  # frames
-BYTES = 900_000  # of all of them
+BYTES = 500_000  # of all of them
 SECONDS = 60
 _OFF = ("disable", "disabled", "off", "false", "0")
 _CHILD = os.path.join(os.path.dirname(__file__), "mujoco_render.py")
