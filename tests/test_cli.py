@@ -257,7 +257,7 @@ def test_identify_of_a_small_project(
     assert main(words) == 0
     said = json.loads(capsys.readouterr().out)
     assert (said["check"], said["held_out"]) == (True, True)
-    words = ["identify", "arm.toml", "--no-held-out", "--json", "--quiet"]
+    words = ["identify", "arm.toml", "--quick", "--json", "--quiet"]
     assert main([*words, "--out", "three"]) == 0
     assert not json.loads(capsys.readouterr().out)["held_out"]
 

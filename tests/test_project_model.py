@@ -185,7 +185,7 @@ tie = true
 delay = {low = 0.0, high = 0.02}
 """
     path = project(folder, text)
-    words = ["identify", str(path), "--no-held-out", "--quiet"]
+    words = ["identify", str(path), "--quick", "--quiet"]
     assert main([*words, "--out", str(folder / "run")]) == 0
     return folder / "run"
 

@@ -120,8 +120,8 @@ class Identify(Writes):
     """Draws the starts of the fit."""
     check: bool = False
     """Hold the posterior against the exact one (Pareto k); takes as long again."""
-    held_out: bool = True
-    """Fit once more without some of the data, to forecast it (a second fit's time)."""
+    quick: bool = False
+    """No second fit, which forecasts data that it has not seen."""
 
     def run(self, progress: Progress) -> dict[str, Any]:
         out = _out(self.out, self.project.stem)
@@ -131,7 +131,7 @@ class Identify(Writes):
             out=out,
             seed=self.seed,
             check=self.check,
-            held_out=self.held_out,
+            held_out=not self.quick,
             progress=progress,
         )
 

@@ -96,7 +96,7 @@ def run(
         said, drawings = _drawings(found, logs, belief, band, grid, other)
         summary, arrays = summary | said, arrays | drawings
         task.advance("forecasts")
-        options = ["--out", out, "--seed", seed, "" if held_out else "--no-held-out"]
+        options = ["--out", out, "--seed", seed, "" if held_out else "--quick"]
         line = command("sim2gp", "identify", project, *options, "--check" * check)
         if check:
             key = jax.random.fold_in(jax.random.key(seed), 2)

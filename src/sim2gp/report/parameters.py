@@ -69,6 +69,8 @@ def _interval(entry: Mapping[str, Any]) -> Raw:
 def _row(name: str, entry: Mapping[str, Any], truth: bool) -> list[object]:
     verdict = entry.get("verdict")
     why = entry.get("note") or VERDICTS.get(str(verdict), ("", ""))[1]
+    if verdict == "identified":  # its note says by how much, as "spread left" does
+        why = VERDICTS["identified"][1]
     meaning = entry.get("meaning") or ""
     below = f'<span class="why">{esc(meaning)}</span>' if meaning else ""
     row: list[object] = [

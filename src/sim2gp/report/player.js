@@ -62,6 +62,9 @@ document.querySelectorAll(".player").forEach(function (player) {
     pen.drawImage(frames[i], 0, 0);
     pen.font = canvas.width > 2 * canvas.clientWidth ? "24px sans-serif" : "15px sans-serif";
     pen.fillStyle = getComputedStyle(said).fill;
+    pen.strokeStyle = getComputedStyle(document.body).backgroundColor;
+    pen.lineWidth = 3;
+    pen.strokeText(said.textContent, 12, 26);
     pen.fillText(said.textContent, 12, 26);
   }
   function draw() {
@@ -155,10 +158,14 @@ document.querySelectorAll(".player").forEach(function (player) {
   }
   draw();
   if (canvas && film.frames) {
+    // Decoded when they are drawn: all of them at once are much for a phone.
     Promise.all(film.frames.map(function (code) {
-      const image = new Image();
-      image.src = "data:image/webp;base64," + code;
-      return image.decode().then(function () { return image; });
+      return new Promise(function (done, failed) {
+        const image = new Image();
+        image.onload = function () { done(image); };
+        image.onerror = failed;
+        image.src = "data:image/webp;base64," + code;
+      });
     })).then(function (all) {
       frames = all;
       look.hidden = false;

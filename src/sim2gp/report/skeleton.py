@@ -54,7 +54,7 @@ def skeleton(about: Mapping[str, Any], moving: Moving) -> Scene:
     balls = [
         Shape(
             "ball", (int(a),), "red" if part == "tip" else "hub",
-            size[part] * _ROD / metre, 1 if part == "base" else 3, int(a),
+            size[part] * _ROD / metre, layer.get(part, 2), int(a),
         )
         for a, part in about["balls"]
     ]  # fmt: skip
@@ -75,14 +75,19 @@ def overlaid(scene: Scene, recorded: Moving) -> Scene:
             anchor=moved(shape.anchor),
             colour="ghost",
             size=_GHOST * shape.size,
-            layer=max(shape.layer - 1, 0) if shape.kind == "ball" else shape.layer,
+            layer=2 * shape.layer,
         )
         for shape in scene.shapes
         if shape.kind in ("rod", "ball")
         and shape.colour != "shadow"
         and any(point >= first for point in shape.points)
     ]
-    kept = [shape for shape in scene.shapes if shape.kind != "trail"]
+    # A layer's shadows lie just below it, wherever they are in space.
+    kept = [
+        replace(shape, layer=2 * shape.layer + 1)
+        for shape in scene.shapes
+        if shape.kind != "trail"
+    ]
     moving = np.concatenate([scene.moving, recorded], axis=1)
     return replace(scene, shapes=(*ghosts, *kept), moving=moving)
 
