@@ -12,7 +12,8 @@ import pytest
 from sim2gp.experiments import folds
 from sim2gp.experiments.calibration import LEVELS, calibration
 from sim2gp.experiments.folds import fold, held_out
-from sim2gp.experiments.prediction import Judged
+from sim2gp.experiments.motion import film
+from sim2gp.experiments.prediction import Judged, drawn, trace_arrays
 from sim2gp.logs import Log
 from sim2gp.models.cutting import cut
 from sim2gp.models.forecast import Band, Forecast
@@ -165,3 +166,16 @@ def test_neither_fit_nor_band_sees_what_is_held_out(
     assert given["recordings"] == 1
     assert found.tested.since.min() >= part.until
     assert found.judged.valid.shape[0] == part.test.sum()
+
+
+def test_windows_too_short_to_be_drawn_are_not() -> None:
+    """A log of less than half a second has scores, and no picture."""
+    short = (log("a.csv", 0.45),)
+    grid = evaluation_windows(short, CartPole(), longest=1.0)
+    assert len(grid.windows) > 0
+    one = np.ones(2)
+    band = Band(np.ones(4), np.ones(1), one, np.array([0.0]), one[None], 1.0)
+    prior = CartPole().parameters.prior()
+    picture = drawn(CartPole(), prior, band, grid)
+    assert trace_arrays(picture, grid, short, ["x", "theta"]) == {}
+    assert film(CartPole(), prior, picture, grid, short, "none") == ({}, {})

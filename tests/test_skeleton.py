@@ -1,10 +1,12 @@
 """Stick figures: posed as closed forms say, seen in the plane they move in."""
 
 import base64
+import io
 import json
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from report_example import a_film
 from sim2gp import report
@@ -29,6 +31,15 @@ CART = """
   <geom type="box" size=".1 .06 .04" mass="1"/>
   <body name="pole"><joint name="theta" axis="0 -1 0"/>
     <geom type="box" size=".01 .01 .2" pos="0 0 -.2" mass=".2"/></body>
+</body></worldbody></mujoco>"""
+
+
+SPATIAL = """
+<mujoco><worldbody><body name="turret">
+  <joint name="yaw" axis="0 0 1"/>
+  <geom type="capsule" size=".03" fromto="0 0 0 0 0 .2" mass="1"/>
+  <body name="upper" pos="0 0 .2"><joint name="shoulder" axis="0 1 0"/>
+    <geom type="capsule" size=".02" fromto="0 0 0 .4 0 0" mass="1"/></body>
 </body></worldbody></mujoco>"""
 
 
@@ -227,3 +238,36 @@ def test_no_back_end_is_no_picture_and_no_noise(
         )  # fmt: skip
         assert found == []
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("text", [ARM, SPATIAL])
+def test_mujoco_sees_the_machine_where_the_figure_is(text: str) -> None:
+    """Every joint of the figure lies on the machine that MuJoCo drew."""
+    mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is absent")
+    from sim2gp.experiments.motion import _frames
+    from sim2gp.systems.mujoco_figure import figure_of
+
+    model = mujoco.MjModel.from_xml_string(text)
+    q = swing(33)
+    figure = figure_of(model, q)
+    scene = skeleton(figure_entry(figure), figure.moving)
+    about, arrays = _frames(model, [q + 0.3, q], scene)
+    if not about:
+        pytest.skip("MuJoCo has no graphics back end here")
+    every, size = (
+        about["frames"]["every"],
+        (scene.width * 3 // 4, scene.height * 3 // 4),
+    )
+    parts = np.split(arrays["animation/frames"], arrays["animation/frame_ends"][:-1])
+    assert len(parts) == len(range(0, len(q), every))
+    for k, part in enumerate(parts):
+        with Image.open(io.BytesIO(part.tobytes())) as image:
+            assert image.size == size
+            seen = np.asarray(image.convert("RGBA")).astype(int)
+        pixels, _ = scenes.project(scene, figure.moving[k * every])
+        for u, v in np.rint(0.75 * pixels).astype(int):
+            assert seen[v - 2 : v + 3, u - 2 : u + 3, 3].max() == 255
+        orange = (seen[..., 0] > seen[..., 2] + 60) & (seen[..., 3] == 255)
+        assert orange.sum() > 200  # the forecast, which is elsewhere
+        assert (seen[..., 3] == 255).mean() < 0.5

@@ -280,6 +280,9 @@ def drawn(
 ) -> dict[str, tuple[np.ndarray, ...]]:
     """Forecasts of half a second, for pictures: (which, time, measured, mean, half)."""
     which = _pictured(grid)
+    if not len(which):  # all windows are shorter
+        none = np.zeros((0, len(_TRACE_ROWS), len(grid.windows.outputs)))
+        return {"which": (which,), "trace": (none[..., 0], none, none, none)}
     windows = _some(grid.windows, which)
     found = forecast(system, posterior, windows, _TRACE_ROWS)
     half = band.half_width(0.9) * band.scale(found)
