@@ -133,6 +133,18 @@ def evaluation() -> Run:
         "nll": -3.21,
         "windows": 1423,
         "horizon": 1.0,
+        "calibration": {
+            "horizon": 1.0, "windows": 1423, "independent": 142,
+            "text": "The 90 % band of q1 held 91 % of the measurements.",
+        },
+    }  # fmt: skip
+    level = np.linspace(0.05, 0.99, 20)
+    arrays |= {
+        "calibration/level": level,
+        "calibration/low": level - 0.1 * np.sqrt(level * (1 - level)),
+        "calibration/high": level + 0.1 * np.sqrt(level * (1 - level)),
+        "calibration/share/q1": level**0.9,
+        "calibration/share/q2": level**1.3,
     }
     return summary, arrays
 
@@ -223,6 +235,21 @@ def two_data_sets() -> Run:
     return summary, arrays
 
 
+def planned() -> Run:
+    """An experiment of five seconds, near a limit of one joint."""
+    time = 0.02 * np.arange(251)
+    sweep = np.sin(time**1.5)
+    arrays = {"design/time": time, "design/command/voltage": 3 * sweep[:-1]}
+    for name, size in (("theta", 0.8), ("theta.velocity", 6.0)):
+        arrays[f"design/state/{name}"] = size * sweep
+        arrays[f"design/low/{name}"] = size * (sweep - 0.1 * time / 5)
+        arrays[f"design/high/{name}"] = size * (sweep + 0.1 * time / 5)
+    arrays["design/limit/theta"] = np.array([-1.0, 1.0])
+    arrays["design/limit/voltage"] = np.array([-5.0, 5.0])
+    units = {"voltage": "V", "theta": "rad", "theta.velocity": "rad/s"}
+    return {"units": units, "violations": 0.012, "draws_checked": 500}, arrays
+
+
 def full_run() -> Run:
     """A run that has everything a report can show."""
     rng = np.random.default_rng(0)
@@ -246,7 +273,66 @@ def full_run() -> Run:
         ],
     }  # fmt: skip
     arrays: dict[str, np.ndarray] = {}
-    for part in (parameters(rng), logs(rng), evaluation(), swing_up(), two_data_sets()):
-        summary |= part[0]
+    parts = [parameters(rng), logs(rng), evaluation(), swing_up(), two_data_sets()]
+    for part in (*parts, planned()):
+        units = summary.get("units", {}) | part[0].get("units", {})
+        summary |= part[0] | {"units": units}
         arrays |= part[1]
+    return summary, arrays
+
+
+def a_film(pictures: bool = True) -> Run:
+    """A stick figure of two links: its forecast over what was recorded, in two pieces.
+
+    With pictures, as MuJoCo renders them, of another colour each.
+    """
+    import io
+
+    from PIL import Image
+
+    t = 0.01 * np.arange(100)
+    recorded = np.stack([np.sin(3 * t), np.cos(5 * t)], axis=1)
+    state = recorded + 0.2 * (t % 0.5)[:, None]
+
+    def points(q: np.ndarray) -> np.ndarray:
+        first, second = q[:, 0], q.sum(axis=1)
+        zero = np.zeros_like(first)
+        elbow = 0.4 * np.stack([np.sin(first), zero, -np.cos(first)], axis=1)
+        tip = elbow + 0.3 * np.stack([np.sin(second), zero, -np.cos(second)], axis=1)
+        return np.stack([np.zeros_like(elbow), elbow, tip], axis=1)
+
+    figure = {
+        "fixed": [[0.0, 0.0, 0.0]],
+        "rods": [[1, 2, "link"], [2, 3, "tip"]],
+        "balls": [[0, "base"], [1, "link"], [2, "link"], [3, "tip"]],
+    }
+    about: dict[str, Any] = {
+        "system": "figure", "figure": figure, "dt": 0.01, "title": "Forecasts",
+        "marks": [{"time": 0.0, "text": "run, from 0.1 s"},
+                  {"time": 0.5, "text": "run, from 0.6 s"}],
+        "strips": [[0, "shoulder", "deg", 57.3], [1, "elbow", "deg", 57.3]],
+        "inputs": [["shoulder_motor", ""]],
+    }  # fmt: skip
+    arrays = {
+        "animation/state": state,
+        "animation/recorded": recorded,
+        "animation/points": points(state),
+        "animation/recorded_points": points(recorded),
+        "animation/action": np.sign(np.sin(9 * t))[:, None],
+    }
+    if pictures:
+        files = []
+        for k in range(4):
+            image = Image.new("RGB", (480, 315), (60 * k, 200 - 40 * k, 90))
+            file = io.BytesIO()
+            image.save(file, format="WEBP")
+            files.append(file.getvalue())
+        about["frames"] = {"every": 25, "width": 480, "height": 315}
+        arrays["animation/frames"] = np.frombuffer(b"".join(files), np.uint8)
+        arrays["animation/frame_ends"] = np.cumsum([len(file) for file in files])
+    summary = {
+        "command": "identify", "title": "arm: what one log determines",
+        "headline": "6 of 6 constants are identified.", "animation": about,
+        "command_line": "sim2gp identify arm.toml", "versions": {"sim2gp": "0.1.0"},
+    }  # fmt: skip
     return summary, arrays

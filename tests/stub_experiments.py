@@ -26,7 +26,13 @@ def install(
 
 
 def identify(
-    project: Path, *, out: Path, seed: int, progress: Progress, check: bool = False
+    project: Path,
+    *,
+    out: Path,
+    seed: int,
+    progress: Progress,
+    check: bool = False,
+    held_out: bool = True,
 ) -> dict[str, Any]:
     """Everything of an identification that reads input, and no fit."""
     found = load_project(project)
@@ -36,6 +42,7 @@ def identify(
         "parameters": {p.name: {"sd": p.sd} for p in found.system.parameters.free},
         "seed": seed,
         "check": check,
+        "held_out": held_out,
         "warnings": [str(note) for log in logs for note in log.notes],
     }
     with new_run(out, "identify") as run, progress.task("fit", 2) as task:

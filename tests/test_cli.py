@@ -255,7 +255,11 @@ def test_identify_of_a_small_project(
     assert not json.loads(stored)["check"]
     words = ["identify", "arm.toml", "--check", "--json", "--quiet", "--out", "two"]
     assert main(words) == 0
-    assert json.loads(capsys.readouterr().out)["check"]
+    said = json.loads(capsys.readouterr().out)
+    assert (said["check"], said["held_out"]) == (True, True)
+    words = ["identify", "arm.toml", "--quick", "--json", "--quiet"]
+    assert main([*words, "--out", "three"]) == 0
+    assert not json.loads(capsys.readouterr().out)["held_out"]
 
 
 @pytest.mark.parametrize("unbuffered", ["", "1"])

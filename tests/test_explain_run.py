@@ -42,7 +42,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for seed in (1, 2):
         log = simulated(seconds=1.3, seed=seed, noise=5e-4, effects=(SPRING,))
         write(log, folder / "logs" / f"log{seed}.csv")
-    identify.run(project_in(folder), out=folder / "run", seed=0, progress=QUIET)
+    out = folder / "run"
+    identify.run(project_in(folder), out=out, seed=0, progress=QUIET, held_out=False)
     return folder / "run"
 
 

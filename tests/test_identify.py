@@ -131,6 +131,45 @@ def test_identify_writes_a_report_with_traces(run: Path) -> None:
     assert arrays["trace/log1/low/theta"].shape == arrays["trace/log1/time"].shape
 
 
+def test_identify_forecasts_a_log_that_it_left_out(run: Path) -> None:
+    """Oracle: the same machine, whose errors are far below those of standing still."""
+    stored = load_run(run)
+    about, x = stored.summary["held_out"], stored.arrays
+    assert about["left_out"] == "log2"
+    assert about["windows"] == 7  # every 0.1 s, half a second before the log's end
+    assert about["open_loop_rmse"]["alpha"] < 0.2 * about["hold_rmse"]["alpha"]
+    logs = {key.split("/")[1] for key in x if key.startswith("unseen/")}
+    assert logs == {"log2"}
+    both = [x[f"{kind}/log2/predicted/alpha"] for kind in ("unseen", "trace")]
+    assert 1e-6 < np.nanmax(np.abs(both[0] - both[1])) < 0.1  # by another fit
+    text = (run / "report.html").read_text()
+    for words in ('id="heldout"', 'id="calibration"', 'id="machine"', "without log2"):
+        assert words in text
+    command = stored.summary["command_line"]
+    assert command == f"sim2gp identify {run.parent / 'machine.toml'} --out {run} " + (
+        "--seed 0 --check"
+    )
+    assert {"python", "sim2gp", "jax", "numpy"} <= set(stored.summary["versions"])
+
+
+def test_a_film_shows_what_was_recorded_and_forecast(run: Path) -> None:
+    stored = load_run(run)
+    about, x = stored.summary["animation"], stored.arrays
+    assert about["system"] == "furuta"
+    assert about["dt"] == pytest.approx(0.01)
+    starts = [round(mark["time"] / about["dt"]) for mark in about["marks"]]
+    assert starts[:3] == [0, 50, 100]
+    np.testing.assert_allclose(
+        x["animation/state"][starts], x["animation/recorded"][starts], atol=5e-3
+    )
+    pairs = ("state", "predicted"), ("recorded", "measured")
+    for row, name in enumerate(("theta", "alpha")):
+        for kind, curve in pairs:  # the windows that are drawn, each without its end
+            logs = [x[f"trace/log{k}/{curve}/{name}"] for k in (1, 2)]
+            drawn = np.concatenate(logs).reshape(-1, 52)[:, :50].ravel()
+            np.testing.assert_allclose(x[f"animation/{kind}"][:, row], drawn, atol=1e-6)
+
+
 def test_evaluate_predicts_a_log_from_anywhere(
     run: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -161,6 +200,9 @@ def test_leave_one_out_predicts_every_log(folder: Path, tmp_path: Path) -> None:
     one, two, pooled = (float(row[2]) for row in rows)
     assert min(one, two) <= pooled <= max(one, two)
     assert [row[0] for row in summary["tables"][2]["rows"]] == ["log1", "log2"]
+    kept = load_run(out).arrays
+    assert {key.split("/")[1] for key in kept if "/low/" in key} == {"log1", "log2"}
+    assert "calibration/share/alpha" in kept
 
 
 def test_no_horizon_longer_than_the_log(run: Path, folder: Path) -> None:

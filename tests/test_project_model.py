@@ -12,6 +12,7 @@ from sim2gp.errors import InputError
 from sim2gp.experiments import apply
 from sim2gp.experiments.identify import restored
 from sim2gp.project import load_project
+from sim2gp.runs import load_run
 from sim2gp.systems.mjcf_load import compiled_all
 
 mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is not installed")
@@ -185,7 +186,10 @@ tie = true
 delay = {low = 0.0, high = 0.02}
 """
     path = project(folder, text)
-    assert main(["identify", str(path), "--out", str(folder / "run"), "--quiet"]) == 0
+    words = ["identify", str(path), "--quick", "--quiet"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MUJOCO_GL", "disable")
+        assert main([*words, "--out", str(folder / "run")]) == 0
     return folder / "run"
 
 
@@ -197,6 +201,26 @@ def test_identify_from_a_file_and_logs(identified: Path) -> None:
         assert abs(found["mean"] - value) < 4.0 * found["sd"], name
         assert found["verdict"] == "identified"
         assert found["sd"] < 0.1 * value
+
+
+def test_its_report_has_a_stick_figure(identified: Path) -> None:
+    """Posed by MuJoCo: as the closed form of two links says, at what was recorded."""
+    stored = load_run(identified)
+    about, x = stored.summary["animation"], stored.arrays
+    assert about["title"].startswith("Forecasts of fitted data")
+    assert [strip[1] for strip in about["strips"]] == ["shoulder", "elbow"]
+    model = mujoco.MjModel.from_xml_string(MODEL)
+    data = mujoco.MjData(model)
+    for row in (0, 60, 120):
+        data.qpos[:] = x["animation/recorded"][row]
+        mujoco.mj_kinematics(model, data)
+        found = x["animation/recorded_points"][row]
+        np.testing.assert_allclose(found[:2], data.xanchor, atol=1e-5)
+    assert "mujoco" in stored.summary["versions"]
+    assert "held_out" not in stored.summary
+    assert stored.summary["command_line"].endswith("--quick")
+    assert "animation/frames" not in x
+    assert "<polyline data-i=" in (identified / "report.html").read_text()
 
 
 def test_its_constants_go_into_the_file(identified: Path, capsys) -> None:

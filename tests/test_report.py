@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from report_example import Run, full_run
+from report_example import Run, a_film, full_run
 from sim2gp import report
 from sim2gp.errors import InputError
 from sim2gp.report import markup
 from sim2gp.runs import store
+from sim2gp.systems.mujoco_film import BYTES
 
 
 @pytest.fixture(scope="module")
@@ -65,8 +66,9 @@ def read(text: str) -> Page:
 
 
 EVERY_SECTION = [
-    "claims", "figure1", "machine", "returns", "parameters", "densities",
-    "directions", "correlation", "misfit", "traces", "heldout", "tables",
+    "claims", "figure1", "machine", "returns", "experiment", "parameters", "directions",
+    "misfit", "heldout", "calibration", "traces", "densities", "correlation", "tables",
+    "made",
 ]  # fmt: skip
 
 
@@ -92,10 +94,12 @@ def test_an_empty_run_is_a_page_without_sections() -> None:
         ("machine", ["animation"]),
         ("machine", ["animation/"]),
         ("returns", ["returns/"]),
+        ("experiment", ["design/"]),
         ("densities", ["parameters/samples"]),
         ("correlation", ["parameters/correlation"]),
         ("directions", ["directions", "base_parameters"]),
         ("misfit", ["noise", "misfit"]),
+        ("calibration", ["calibration/"]),
         ("traces", ["trace/"]),
         ("tables", ["tables"]),
     ],
@@ -132,6 +136,33 @@ def test_long_logs_do_not_make_a_heavy_page() -> None:
     text = report.write_report({"command": "identify"}, arrays)
     assert len(text.encode()) < 3_000_000
     assert "40 more logs" in text
+    assert 'name="viewport" content="width=device-width, initial-scale=1"' in text
+
+
+def test_the_heaviest_page_is_small_enough(run: Run) -> None:
+    """Everything at once, each as large as it may be; random bytes for pictures."""
+    rng = np.random.default_rng(3)
+    summary, arrays = a_film()
+    rods = [[k, k + 1, "link"] for k in range(60)]
+    figure = {"fixed": [], "rods": rods, "balls": []}
+    summary = run[0] | summary
+    summary["animation"] = summary["animation"] | {"figure": figure, "marks": []}
+    for name in ("points", "recorded_points"):
+        arrays[f"animation/{name}"] = rng.standard_normal((1000, 61, 3))
+    for name in ("state", "recorded"):
+        arrays[f"animation/{name}"] = rng.standard_normal((1000, 2))
+    arrays["animation/frames"] = rng.integers(0, 256, BYTES, np.uint8)
+    arrays["animation/frame_ends"] = np.linspace(0, BYTES, 126).astype(int)[1:]
+    logs = {key: x for key, x in run[1].items() if not key.startswith("animation/")}
+    time = np.arange(3000) * 1e-2
+    for log in range(30):
+        for base in (f"trace/{log}", f"unseen/{log}"):
+            logs[f"{base}/time"] = time
+            for kind in ("measured", "predicted", "low", "high"):
+                logs[f"{base}/{kind}/q1"] = rng.standard_normal(3000)
+    text = report.write_report(summary, logs | arrays)
+    read(text)
+    assert len(text.encode()) < 3_000_000
 
 
 def test_the_same_run_gives_the_same_bytes(run: Run) -> None:

@@ -128,6 +128,8 @@ class Identify(Writes):
     """Draws the starts of the fit."""
     check: bool = False
     """Hold the posterior against the exact one (Pareto k); takes as long again."""
+    quick: bool = False
+    """No second fit, which forecasts data that it has not seen."""
 
     def run(self, progress: Progress) -> dict[str, Any]:
         out = _out(self.out, self.project.stem)
@@ -137,6 +139,7 @@ class Identify(Writes):
             out=out,
             seed=self.seed,
             check=self.check,
+            held_out=not self.quick,
             progress=progress,
         )
 

@@ -23,7 +23,7 @@ from sim2gp.experiments import scoring
 from sim2gp.experiments.compare_summary import Held, summarise
 from sim2gp.experiments.evaluate import check_horizon, windows_for
 from sim2gp.experiments.prediction import channels, cut_logs, load, recordings
-from sim2gp.experiments.record import provenance
+from sim2gp.experiments.record import command, provenance
 from sim2gp.logs import Log
 from sim2gp.models import NLM, FunctionSpace, Residual, ResidualFunctionSpace, Sim2GP
 from sim2gp.models.auto import log_scores
@@ -120,8 +120,8 @@ def run(
             np.random.default_rng(seed),
         )
         summary["models"]["SIM2GP"]["log_evidence"] = float(whole.log_evidence)
-        asked = " ".join(f"{h:g}" for h in horizons)
-        line = f"sim2gp compare {project} --seed {seed} --horizon {asked}"
+        asked = "--horizon", *(f"{h:g}" for h in horizons), "--seed", seed
+        line = command("sim2gp", "compare", project, *asked, "--out", out)
         summary |= {
             "command": "compare",
             "title": f"{found.name}: which model its logs support",

@@ -35,7 +35,7 @@ from sim2gp.diagnose.words import digits, listed
 from sim2gp.errors import InputError
 from sim2gp.experiments.identify import restored
 from sim2gp.experiments.prediction import units
-from sim2gp.experiments.record import provenance
+from sim2gp.experiments.record import command, provenance
 from sim2gp.models.features import Encoding
 from sim2gp.models.informed import informed_prior
 from sim2gp.models.sim2gp import PRIOR_NOISE
@@ -119,7 +119,8 @@ def run(
         task.advance(f"{found.nats:.1f} nats")
         summary = _summarise(source, asked, experiment, goal, found, seed)
         summary["warnings"] = notes
-        line = f"sim2gp design {source} {asked.words()} --seed {seed}"
+        line = command("sim2gp", "design", source, *asked.words().split())
+        line += " " + command("--seed", seed, "--out", out)
         summary |= provenance(line, started)
         arrays = _arrays(experiment, limits, found)
         from sim2gp.report import write_report

@@ -13,14 +13,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from sim2gp.configurations import index_of
 from sim2gp.errors import InputError
+from sim2gp.experiments.calibration import calibration
+from sim2gp.experiments.folds import fold, without
 from sim2gp.experiments.identify import PROJECT, restored
+from sim2gp.experiments.motion import film
 from sim2gp.experiments.prediction import (
     Judged,
     channels,
@@ -32,16 +33,15 @@ from sim2gp.experiments.prediction import (
     regression_errors,
     rows_for,
     scores,
-    subset,
     trace_arrays,
     units,
 )
-from sim2gp.experiments.record import provenance
+from sim2gp.experiments.record import command, provenance
 from sim2gp.gaussian import Gaussian
 from sim2gp.logs import Log
-from sim2gp.models.forecast import fit_band, forecast
+from sim2gp.models.forecast import forecast
 from sim2gp.models.grid import CURVE, Grid, evaluation_windows, steps_of
-from sim2gp.models.windows import Windows, fit_windows
+from sim2gp.models.windows import Windows
 from sim2gp.project import Project, load_project
 from sim2gp.runs import Progress, new_run
 from sim2gp.types import in_float64
@@ -79,14 +79,23 @@ def run(
         names = channels(system, grid.windows)
         whole = judged(rows, grid, result, fit.band, linear)
         summary, arrays = scores(whole, names, tested, horizon)
+        summary["calibration"], shares = calibration(whole, names, horizon)
+        arrays |= shares
         picture = drawn(system, fit.posterior, fit.band, grid)
         arrays |= trace_arrays(picture, grid, tested, names)
         notes = [str(note) for log in tested for note in log.notes]
         if train is None:
             notes.append("the training logs were not found: no regression beside")
-        listed = " ".join(map(str, logs))
-        line = f"sim2gp evaluate {run} --logs {listed} --horizon {horizon:g}"
-        line += f" --configuration {configuration}" if configuration else ""
+        about, moves = film(
+            system, fit.posterior, picture, grid, tested,
+            "Forecasts over what was recorded",
+        )  # fmt: skip
+        if about:
+            summary["animation"] = about
+            arrays |= moves
+        asked = ["--logs", *logs, "--horizon", f"{horizon:g}", "--out", out]
+        asked += ["--configuration", configuration] if configuration else []
+        line = command("sim2gp", "evaluate", run, *asked)
         summary |= {
             "command": "evaluate",
             "title": f"{run.name}: prediction of logs it was not fitted to",
@@ -129,7 +138,10 @@ def leave_one_out(
             arrays |= traced
             constants.append(values)
             task.advance(f"without {logs[left[0]].name}")
-        summary, curves = scores(joined(parts), names, logs, horizon)
+        whole = joined(parts)
+        summary, curves = scores(whole, names, logs, horizon)
+        summary["calibration"], shares = calibration(whole, names, horizon)
+        arrays |= shares
         summary["tables"].append(_constants_table(found, files, logs, constants))
         summary |= {
             "command": "evaluate",
@@ -137,7 +149,8 @@ def leave_one_out(
             "folds": len(files),
             "warnings": [str(note) for log in logs for note in log.notes],
         }
-        line = f"sim2gp evaluate {project} --horizon {horizon:g}"
+        asked = "--horizon", f"{horizon:g}", "--out", out
+        line = command("sim2gp", "evaluate", project, *asked)
         _write(writer, summary, curves | arrays, found, line, started)
     return summary
 
@@ -151,35 +164,15 @@ def _fold(
     left: Sequence[int],
     horizon: float,
 ) -> tuple[Judged, dict[str, np.ndarray], np.ndarray]:
-    """One fold: forecasts, traces and constants of the fit without logs ``left``.
-
-    Its windows are masked, not removed, so that all folds share one compiled fit.
-    """
-    system, rows = project.system, rows_for(horizon)
-    mask = np.asarray(windows.mask) & ~np.isin(of, left)[:, None, None]
-    kept = eqx.tree_at(lambda w: w.mask, windows, mask)
-    robust = project.spec.likelihood.robust
+    """One fold: forecasts, traces and constants of the fit without logs ``left``."""
+    part = without(left, logs, of, grid)
     # One start: the folds are small changes of one problem.
-    belief = fit_windows(system, kept, key=jax.random.key(0), robust=robust, starts=1)
-    result = forecast(system, belief.posterior, grid.windows, rows)
-    test = np.isin(grid.log, left)
-    train, tested = subset(grid, ~test), subset(grid, test)
-    others = {source for k, source in enumerate(recordings(logs)) if k not in left}
-    curve = np.isin(rows, [steps_of(h) for h in CURVE])
-    band = fit_band(result.of(~test).only(curve), train, len(others))
-    linear = regression_errors(train, tested, horizon)
-    part = judged(rows, tested, result.of(test), band, linear)
-    picture = drawn(system, belief.posterior, band, grid)
-    names = channels(system, windows)
-    traced: dict[str, np.ndarray] = {}
-    for k in left:
-        traced |= trace_arrays(picture, grid, logs, names, only=k)
-    return part, traced, _constrain(system, belief.posterior)
-
-
-@in_float64
-def _gaussian(mean: np.ndarray, scale: np.ndarray) -> Gaussian:
-    return Gaussian(jnp.asarray(mean), jnp.asarray(scale))
+    key = jax.random.key(0)
+    found = fold(project, windows, grid, part, horizon, key=key, starts=1)
+    picture = drawn(project.system, found.posterior, found.band, found.tested)
+    names = channels(project.system, windows)
+    traced = trace_arrays(picture, found.tested, logs, names)
+    return found.judged, traced, _constrain(project.system, found.posterior)
 
 
 @in_float64

@@ -18,7 +18,7 @@ from sim2gp.errors import InputError
 from sim2gp.experiments.explain_words import candidate_rows, headline, table
 from sim2gp.experiments.identify import PROJECT, project_of, stood
 from sim2gp.experiments.prediction import cut_logs, load
-from sim2gp.experiments.record import provenance
+from sim2gp.experiments.record import command, provenance
 from sim2gp.project import Project, load_project
 from sim2gp.project.amend import amend
 from sim2gp.runs import Progress, load_run, new_run
@@ -57,7 +57,7 @@ def run(run: Path, *, add: bool, out: Path, progress: Progress) -> dict[str, Any
             "warnings": [f"no fit with {name}" for name in found.search.failed],
             "tables": [table(found, candidates)],
         }
-        line = f"sim2gp explain {run}" + (" --add" if add else "")
+        line = command("sim2gp", "explain", run, "--add" * add, "--out", out)
         summary |= provenance(line, started)
         best = found.search.best
         if add and file is not None:

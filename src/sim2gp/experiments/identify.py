@@ -23,16 +23,18 @@ from sim2gp.diagnose.intervals import Corrected, corrected_windows
 from sim2gp.diagnose.residuals import misfit_of_windows
 from sim2gp.errors import InputError
 from sim2gp.experiments.configurations import told
+from sim2gp.experiments.motion import film
 from sim2gp.experiments.prediction import (
     channels,
-    cut_logs,
+    cut_places,
     drawn,
     recordings,
     rows_for,
     trace_arrays,
     units,
 )
-from sim2gp.experiments.record import provenance
+from sim2gp.experiments.record import command, provenance
+from sim2gp.experiments.unseen import Unseen, unseen
 from sim2gp.gaussian import Gaussian
 from sim2gp.logs import Log
 from sim2gp.models.forecast import Band, compile_forecast, fit_band, forecast
@@ -51,20 +53,29 @@ from sim2gp.runs.store import Run
 from sim2gp.types import in_float64
 
 PROJECT = "project.toml"  # the file's name in a run
+_SHORTEST = 4  # windows: a film of fewer held-out ones is not worth watching
 
 
 def run(
-    project: Path, *, out: Path, seed: int, progress: Progress, check: bool = False
+    project: Path,
+    *,
+    out: Path,
+    seed: int,
+    progress: Progress,
+    check: bool = False,
+    held_out: bool = True,
 ) -> dict[str, Any]:
     """Fit the logs of a project file and write the run; returns its summary.
 
-    ``check`` holds Laplace's posterior against the exact one by importance sampling.
+    ``check`` holds Laplace's posterior against the exact one by importance sampling;
+    ``held_out`` fits once more without some of the data, and forecasts those.
     """
     started = time.perf_counter()
     found = load_project(project)
     logs = found.load_logs()
     with new_run(out, "identify") as writer, progress.task("identify", 4) as task:
-        windows, of = cut_logs(found, logs)
+        windows, places = cut_places(found, logs)
+        of = np.asarray([k for k, _ in places])
         task.advance(f"{len(windows)} windows")
         key = jax.random.key(seed)
         robust = found.spec.likelihood.robust
@@ -74,20 +85,22 @@ def run(
         fitted = belief = fit_windows(found.system, windows, key=key, robust=robust)
         task.advance("posterior")
         band = band_of(belief, grid, logs)
-        names = channels(found.system, windows)
-        picture = drawn(found.system, belief.posterior, band, grid)
         belief = belief.informed()
         honest = corrected_windows(belief, windows, of)
-        arrays = _stored(belief, honest.posterior, band, seed)
-        arrays |= trace_arrays(picture, grid, logs, names)
-        task.advance("forecasts")
         summary = _summarise(found, logs, windows, belief, honest, band, seed)
-        line = f"sim2gp identify {project} --seed {seed}"
+        arrays = _stored(belief, honest.posterior, band, seed)
+        other = (
+            unseen(found, logs, windows, places, grid, key=key) if held_out else None
+        )
+        said, drawings = _drawings(found, logs, belief, band, grid, other)
+        summary, arrays = summary | said, arrays | drawings
+        task.advance("forecasts")
+        options = ["--out", out, "--seed", seed, "" if held_out else "--quick"]
+        line = command("sim2gp", "identify", project, *options, "--check" * check)
         if check:
             key = jax.random.fold_in(jax.random.key(seed), 2)
             exact = check_windows(fitted, windows, key=key)
             summary["check"] = exact.as_dict(found.system.parameters.names)
-            line += " --check"
         folder = Path(os.path.abspath(project)).parent
         summary["project"] = {
             "file": project.name,
@@ -102,6 +115,30 @@ def run(
         writer.write_text("report.html", write_report(summary, arrays))
         task.advance("report")
     return summary
+
+
+def _drawings(
+    project: Project,
+    logs: Sequence[Log],
+    belief: WindowsBelief,
+    band: Band,
+    grid: Grid,
+    other: Unseen | None,
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Forecasts of the fitted logs and of held-out data, and a film of the latter."""
+    picture = drawn(project.system, belief.posterior, band, grid)
+    arrays = trace_arrays(picture, grid, logs, channels(project.system, grid.windows))
+    posterior, shown, data = belief.posterior, grid, "fitted"
+    summary: dict[str, Any] = {}
+    if other is not None:
+        summary["held_out"] = other.summary
+        arrays |= other.arrays
+        if other.fold is not None and len(other.picture["which"][0]) >= _SHORTEST:
+            picture, data = other.picture, "held-out"
+            posterior, shown = other.fold.posterior, other.fold.tested
+    title = f"Forecasts of {data} data over what was recorded"
+    about, moves = film(project.system, posterior, picture, shown, logs, title)
+    return summary | ({"animation": about} if about else {}), arrays | moves
 
 
 def band_of(belief: WindowsBelief, grid: Grid, logs: Sequence[Log]) -> Band:
@@ -242,7 +279,7 @@ def _summarise(
     actions = [channel.name for channel in system.actions]
     return {
         "command": "identify",
-        "title": f"{project.name}: what {_count(logs)} determine",
+        "title": f"{project.name}: what {_count(logs)}",
         "headline": headline(found["parameters"]),
         "seed": seed,
         "converged": True,
@@ -299,7 +336,7 @@ def headline(parameters: dict[str, dict[str, Any]]) -> str:
 
 def _count(logs: Sequence[Log]) -> str:
     count = len(set(recordings(logs)))
-    return "one log" if count == 1 else f"{count} logs"
+    return "one log determines" if count == 1 else f"{count} logs determine"
 
 
 def _noise_words(

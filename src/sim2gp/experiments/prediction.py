@@ -46,10 +46,18 @@ def load(project: Project) -> tuple[Log, ...]:
 
 def cut_logs(project: Project, logs: Sequence[Log]) -> tuple[Windows, np.ndarray]:
     """Training windows as the project states them, and the log of each."""
+    windows, places = cut_places(project, logs)
+    return windows, np.asarray([k for k, _ in places])
+
+
+def cut_places(
+    project: Project, logs: Sequence[Log]
+) -> tuple[Windows, list[tuple[int, int]]]:
+    """Training windows as the project states them, and log and first row of each."""
     stated = project.spec.likelihood
     names = [channel.name for channel in project.system.physical_states]
     measured = [n for n in names if any(n in log.channels for log in logs)]
-    windows, places = cut(
+    return cut(
         logs,
         project.system,
         window=stated.window,
@@ -57,7 +65,6 @@ def cut_logs(project: Project, logs: Sequence[Log]) -> tuple[Windows, np.ndarray
         floor=_each(stated.noise_floor, measured),
         start=stated.start,
     )
-    return windows, np.asarray([k for k, _ in places])
 
 
 def recordings(logs: Sequence[Log]) -> list[str]:
@@ -187,7 +194,8 @@ def scores(
     }
     if found.regression is not None:
         summary["regression_rmse"] = named(_rms(found.regression, found.valid[:, at]))
-    curve = np.asarray([i for i in range(len(found.rows)) if i != one or at == one])
+    some = np.asarray(found.valid.any(axis=(0, 2)))
+    curve = np.asarray([i for i in np.flatnonzero(some) if i != one or at == one])
     seconds = found.rows[curve] * PERIOD
     summary["tables"] = [
         _by_horizon(found, names, curve, seconds, model, hold, share90, share95),
@@ -271,6 +279,9 @@ def drawn(
 ) -> dict[str, tuple[np.ndarray, ...]]:
     """Forecasts of half a second, for pictures: (which, time, measured, mean, half)."""
     which = _pictured(grid)
+    if not len(which):  # all windows are shorter
+        none = np.zeros((0, len(_TRACE_ROWS), len(grid.windows.outputs)))
+        return {"which": (which,), "trace": (none[..., 0], none, none, none)}
     windows = _some(grid.windows, which)
     found = forecast(system, posterior, windows, _TRACE_ROWS)
     half = band.half_width(0.9) * band.scale(found)
@@ -284,16 +295,16 @@ def trace_arrays(
     grid: Grid,
     logs: Sequence[Log],
     names: Sequence[str],
-    only: int | None = None,
+    prefix: str = "trace",
 ) -> dict[str, np.ndarray]:
     """The report's ``trace/...`` arrays; windows are parted by a NaN."""
     (which,), (time, y, mean, half) = picture["which"], picture["trace"]
     arrays = {}
     for k, log in enumerate(logs):
         rows = grid.log[which] == k
-        if (only is not None and k != only) or not rows.any():
+        if not rows.any():
             continue
-        base = f"trace/{log.name}"
+        base = f"{prefix}/{log.name}"
         arrays[f"{base}/time"] = _flat(time[rows])
         for c, name in enumerate(names):
             curves = {

@@ -1,6 +1,8 @@
 """What every run says of itself: its command, its versions, how long it took."""
 
 import platform
+import shlex
+import sys
 import time
 from importlib.metadata import version
 from typing import Any
@@ -8,6 +10,12 @@ from typing import Any
 import jax
 
 PACKAGES = ("sim2gp", "jax", "jaxlib", "equinox", "numpy", "scipy")
+OPTIONAL = ("mujoco",)  # named where a run has used them
+
+
+def command(*words: object) -> str:
+    """A command as it can be typed again; empty words are left out."""
+    return shlex.join(str(word) for word in words if str(word))
 
 
 def provenance(command_line: str, started: float) -> dict[str, Any]:
@@ -15,7 +23,8 @@ def provenance(command_line: str, started: float) -> dict[str, Any]:
     return {
         "command_line": command_line,
         "versions": {"python": platform.python_version()}
-        | {name: version(name) for name in PACKAGES},
+        | {name: version(name) for name in PACKAGES}
+        | {name: version(name) for name in OPTIONAL if name in sys.modules},
         "device": jax.devices()[0].platform,
         "wall_seconds": time.perf_counter() - started,
     }

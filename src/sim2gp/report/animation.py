@@ -13,11 +13,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from sim2gp.report import svg
-from sim2gp.report.markup import Raw, cards, esc
+from sim2gp.report import frames, svg
+from sim2gp.report.markup import Raw, cards, esc, legend
 from sim2gp.report.scenes import Scene, Shape, keep_frames, project, scene_of
+from sim2gp.report.skeleton import overlaid, skeleton
 
 _MOST_FRAMES = 1500
+_MOST_POINTS = 40_000  # of all frames: some 700 kB
 _SLOWEST = 0.02  # s between frames; the player interpolates
 _GRAIN = 1e-4  # m; the resolution of the positions on the page
 _TRAIL_SECONDS = 0.6
@@ -25,10 +27,11 @@ _TRAIL_SECONDS = 0.6
 _INK = {
     "floor": "#eceff2", "shadow": "#c9ced5", "steel": "#6b7683", "hub": "#343b43",
     "steel-top": "#98a2ae", "steel-side": "#58626e", "red": "#d55e00",
-    "blue": "#0072b2", "quiet": "#8b949e",
+    "blue": "#0072b2", "quiet": "#8b949e", "ghost": "#c3c9d0",
 }  # fmt: skip
 
 States = Float[np.ndarray, "T n"]
+Arrays = Mapping[str, np.ndarray]
 
 
 def _front(corners: np.ndarray) -> bool:
@@ -128,12 +131,17 @@ def _film(
 
 
 def _strip(
-    time: np.ndarray, values: np.ndarray, name: str, unit: str, starts: list[int]
+    time: np.ndarray,
+    values: np.ndarray,
+    name: str,
+    unit: str,
+    starts: list[int],
+    recorded: np.ndarray | None = None,
 ) -> Raw:
     """One signal against time with the cursor that follows the player."""
     lines = np.array(values, dtype=float)
     lines[[s for s in starts if 0 < s < len(lines)]] = np.nan
-    low, high = svg.span(values)
+    low, high = svg.span(values, *([] if recorded is None else [recorded]))
     axes = svg.Axes(
         (0.0, max(float(time[-1]), 1e-9)), (low, high), 400.0, 112.0, x_label="s"
     )
@@ -144,17 +152,21 @@ def _strip(
         for turn in turns if len(turns) < 8 else ():  # a spinning pole passes many
             if turn % 2:
                 marks.append(svg.level(axes, 180.0 * turn, "quiet", "upright"))
-    marks.append(svg.line(axes, time, lines, "c0"))
+    if recorded is not None:
+        marks.append(svg.line(axes, time, recorded, "quiet"))
+    marks.append(svg.line(axes, time, lines, "c0" if recorded is None else "c1"))
+    css = "c1" if recorded is None else "truth"
     marks.append(
-        f'<line class="rule c1 cursor" x1="0" x2="0" y1="0" y2="{axes.size[1]:.1f}" '
+        f'<line class="rule {css} cursor" x1="0" x2="0" y1="0" y2="{axes.size[1]:.1f}" '
         f'data-width="{axes.size[0]:.1f}"/>'
     )
     return svg.chart(axes, marks, title=name, unit=unit)
 
 
-def _frames(count: int, dt: float) -> np.ndarray:
+def _frames(count: int, dt: float, points: int) -> np.ndarray:
     """Which rows are shown: no finer than needed, never too many."""
-    stride = max(1, math.floor(_SLOWEST / dt + 1e-9), math.ceil(count / _MOST_FRAMES))
+    most = min(_MOST_FRAMES, max(_MOST_POINTS // max(points, 1), 2))
+    stride = max(1, math.floor(_SLOWEST / dt + 1e-9), math.ceil(count / most))
     return np.arange(0, count, stride)
 
 
@@ -165,43 +177,83 @@ def _marks(about: Mapping[str, Any]) -> list[tuple[float, str]]:
     ]
 
 
-def player(
-    about: Mapping[str, Any], state: States, action: np.ndarray | None = None
-) -> Raw:
+def _scene(about: Mapping[str, Any], arrays: Arrays) -> tuple[Scene, Scene | None]:
+    """The machine, and the machine as it was recorded where that is known."""
+
+    def scene(kind: str) -> Scene:
+        if "figure" in about:
+            points = "points" if kind == "state" else f"{kind}_points"
+            return skeleton(about["figure"], arrays[f"animation/{points}"])
+        return scene_of(about, arrays[f"animation/{kind}"])
+
+    both = "animation/recorded" in arrays
+    return scene("state"), scene("recorded") if both else None
+
+
+def _signals(
+    about: Mapping[str, Any], scene: Scene, arrays: Arrays, starts: list[int]
+) -> list[Raw]:
+    """Positions, over what was recorded, then inputs."""
+    state = np.asarray(arrays["animation/state"], dtype=float)
+    recorded, action = arrays.get("animation/recorded"), arrays.get("animation/action")
+    time = float(about["dt"]) * np.arange(len(state))
+    stated = [
+        (int(r), str(n), str(u), float(f)) for r, n, u, f in about.get("strips") or ()
+    ]
+    strips = [
+        _strip(
+            time, factor * state[:, row], name, unit, starts,
+            None if recorded is None else factor * recorded[:, row],
+        )
+        for row, name, unit, factor in stated or scene.strips
+    ]  # fmt: skip
+    inputs = [(str(n), str(u)) for n, u in about.get("inputs") or scene.inputs]
+    for column, (name, unit) in enumerate(inputs):
+        if action is not None and action.ndim == 2 and column < action.shape[1]:
+            held = np.asarray(action[: len(state), column], dtype=float)
+            strips.append(_strip(time[: len(held)], held, name, unit, starts))
+    return strips
+
+
+def player(about: Mapping[str, Any], arrays: Arrays) -> Raw:
     """The machine on the page: a picture that plays, and its signals below.
 
-    `about` is the summary's entry "animation": system, dt (s), params, title, and
-    optional marks (a list of {time, text}) where a new episode starts.
+    `about` is the summary's entry "animation": dt (s), title, optional marks (a list of
+    {time, text}) where a new episode starts, and either system and params or a stick
+    figure. `arrays` are the run's: ``animation/state``, and of a forecast the
+    ``recorded`` motion.
     """
-    state = np.asarray(state, dtype=float)
     dt = float(about["dt"])
-    whole = scene_of(about, state)
-    index = _frames(len(state), dt)
+    scene, other = _scene(about, arrays)
+    count = len(scene.moving)
+    if other is not None:
+        scene = overlaid(scene, other.moving)
+    index = _frames(count, dt, scene.moving.shape[1])
     stride = int(index[1] - index[0]) if len(index) > 1 else 1
     marks = _marks(about)
     rows = sorted({round(time / dt) for time, _ in marks} - {0})
-    scene = keep_frames(whole, index)
+    strips = _signals(about, scene, arrays, rows)
     title = str(about.get("title") or "The machine")
-    time = dt * np.arange(len(state))
-    strips = [
-        _strip(time, factor * state[:, row], name, unit, rows)
-        for row, name, unit, factor in whole.strips
-    ]
-    for column, (name, unit) in enumerate(whole.inputs):
-        if action is not None and action.ndim == 2 and column < action.shape[1]:
-            held = np.asarray(action[: len(state), column], dtype=float)
-            strips.append(_strip(time[: len(held)], held, name, unit, rows))
+    scene = keep_frames(scene, index)
     film = _film(scene, dt * stride, marks, [math.ceil(r / stride) for r in rows])
+    film = film[:-1] + frames.pictures(about, arrays) + "}"
     words = marks[0][1] if marks and marks[0][0] <= 0 else ""
     hint = " Drag the picture to look from another side." if scene.camera.turns else ""
+    colours = [("quiet", "recorded"), ("c1", "forecast")]
+    shown = " The pale shadow is the recording." if other is not None else ""
+    if "frames" in about:
+        shown += " In MuJoCo's picture the forecast is orange."
     return Raw(
         f'<div class="player">\n<div>{_still(scene, title, words)}\n'
+        f"{frames.canvas(about)}"
         '<div class="controls" hidden><button type="button" class="play">Play</button>'
         '<input type="range" min="0" value="0" step="any" aria-label="time">'
-        '<output>0 s</output><button type="button" class="pace">1×</button></div>\n'
+        '<output>0 s</output><button type="button" class="pace">1×</button>'
+        '<button type="button" class="look" hidden>Figure</button></div>\n'
         f'<script type="application/json">{film}</script>\n'
-        f'<p class="soft">{esc(title)}.{hint}</p></div>\n'
-        f"{cards(strips, 'strips')}</div>\n"
+        f'<p class="soft">{esc(title)}.{shown}{hint}</p></div>\n'
+        f"<div>{legend(colours) if other is not None else ''}"
+        f"{cards(strips, 'strips')}</div></div>\n"
     )
 
 

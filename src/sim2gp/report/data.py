@@ -20,12 +20,12 @@ from sim2gp.report.markup import (
     percent,
     section,
     table,
+    unit_text,
 )
 from sim2gp.report.parameters import Arrays, Summary
+from sim2gp.report.traces import forecasts, unit_of
 
 _COLOURS = ("c0", "c1", "c2", "c3", "c4", "c5")
-_MOST_TRACES = 40  # drawings; more would make the page heavy, not clearer
-_CLOSE = 1.5  # s of the closer look
 _SHARES = ("coverage90", "coverage95", "coverage")
 
 
@@ -91,6 +91,7 @@ def _tests(tests: Mapping[str, Any]) -> Raw:
         ["what is asked of the residuals", "statistic", "p", "verdict", "in words"],
         [row(name, test) for name, test in tests.items()],
         words=(0, 3, 4),
+        cards=True,
     )
 
 
@@ -99,7 +100,13 @@ def noise_and_misfit(summary: Summary) -> Raw:
     noise, misfit = summary.get("noise"), summary.get("misfit")
     parts: list[str] = []
     if isinstance(noise, Mapping) and noise:
-        parts += [Raw("<h3>Noise</h3>\n"), records(noise, "channel")]
+        stated = {
+            name: sd
+            if isinstance(sd, Mapping)
+            else {"sd": sd, "unit": unit_text(unit_of(summary, name)) or "1"}
+            for name, sd in noise.items()
+        }
+        parts += [Raw("<h3>Noise</h3>\n"), records(stated, "channel")]
     if isinstance(misfit, Mapping):
         parts.append(Raw("<h3>Misfit</h3>\n"))
         if misfit.get("verdict"):
@@ -113,127 +120,50 @@ def noise_and_misfit(summary: Summary) -> Raw:
     return section("misfit", "Noise and misfit", *parts)
 
 
-def _under(arrays: Arrays, prefix: str) -> list[str]:
-    """The next parts of all keys below a prefix, each once, in their order.
-
-    A log's name may be a path, so it is everything up to the part that names what
-    is stored.
-    """
-    stems = ("/time", "/measured/", "/predicted/", "/low/", "/high/")
-    found: dict[str, None] = {}
-    for key in arrays:
-        if not key.startswith(prefix):
-            continue
-        rest = key[len(prefix) :]
-        ends = [rest.find(stem) for stem in stems if stem in rest]
-        if ends:
-            found[rest[: min(ends)]] = None
-    return list(found)
-
-
-def _unit(summary: Summary, channel: str) -> str:
-    """The unit of a channel, where the summary tells it."""
-    units = summary.get("units") or {}
-    if channel in units:
-        return str(units[channel])
-    noise = (summary.get("noise") or {}).get(channel)
-    return str(noise.get("unit") or "") if isinstance(noise, Mapping) else ""
-
-
-def _trace(
-    arrays: Arrays, log: str, channel: str, unit: str, rows: slice, title: str
-) -> Raw:
-    base = f"trace/{log}"
-    time = arrays[f"{base}/time"][rows]
-    curves = {
-        kind: np.asarray(arrays[f"{base}/{kind}/{channel}"][rows], dtype=float)
-        for kind in ("measured", "predicted", "low", "high")
-        if f"{base}/{kind}/{channel}" in arrays
-    }
-    # The band may be far wider than the signal: it must not set the scale alone.
-    lines = [curves[k] for k in ("measured", "predicted") if k in curves]
-    axes = svg.Axes(svg.span(time, margin=0.0), svg.span(*lines), 440.0, x_label="s")
-    marks = []
-    if "low" in curves and "high" in curves:
-        marks.append(svg.band(axes, time, curves["low"], curves["high"], "c1"))
-    if "measured" in curves:
-        marks.append(svg.line(axes, time, curves["measured"], "quiet"))
-    if "predicted" in curves:
-        marks.append(svg.line(axes, time, curves["predicted"], "c1"))
-    remark = ""
-    if {"measured", "predicted"} <= curves.keys():
-        gap = curves["predicted"] - curves["measured"]
-        if np.isfinite(gap).any():
-            remark = f"rms difference {number(float(np.sqrt(np.nanmean(gap**2))))}"
-    return svg.chart(axes, marks, title=title, unit=unit, remark=f"{remark} {unit}")
-
-
-def _closest_look(arrays: Arrays, log: str, channels: list[str]) -> slice | None:
-    """The rows of the short stretch in which the simulation is worst, if long."""
-    time = np.asarray(arrays[f"trace/{log}/time"], dtype=float)
-    if time.size < 10 or np.nanmax(time) - np.nanmin(time) < 4 * _CLOSE:
-        return None
-    score = np.zeros(time.size)
-    for channel in channels:
-        both = [
-            arrays.get(f"trace/{log}/{k}/{channel}") for k in ("measured", "predicted")
-        ]
-        if both[0] is None or both[1] is None:
-            return None
-        scale = float(np.nanstd(both[0])) or 1.0
-        # A gap between windows has no error; it must not end the sum.
-        gap = ((both[1] - both[0]) / scale) ** 2
-        score += np.where(np.isfinite(gap), gap, 0.0)
-    total = np.concatenate([[0.0], np.cumsum(score)])
-    filled = np.interp(
-        np.arange(time.size),
-        np.flatnonzero(np.isfinite(time)),
-        time[np.isfinite(time)],
-    )
-    ends = np.searchsorted(filled, filled + _CLOSE)
-    inside = filled + _CLOSE <= filled[-1]
-    start = int(np.argmax(np.where(inside, total[ends] - total[:-1], -1.0)))
-    return slice(start, int(ends[start]))
-
-
-def traces(summary: Summary, arrays: Arrays) -> Raw:
-    """Every log against the simulation, and a closer look where they differ most."""
-    parts: list[str] = []
-    drawn, left = 0, 0
-    banded = False
-    for log in _under(arrays, "trace/"):
-        if f"trace/{log}/time" not in arrays:
-            continue
-        prefix = f"trace/{log}/measured/"
-        channels = [key[len(prefix) :] for key in arrays if key.startswith(prefix)]
-        close = _closest_look(arrays, log, channels)
-        looks = [(slice(None), "")] + ([] if close is None else [(close, ", closer")])
-        if drawn + len(looks) * len(channels) > _MOST_TRACES and drawn:
-            left += 1
-            continue
-        drawn += len(looks) * len(channels)
-        banded = banded or any(key.startswith(f"trace/{log}/low/") for key in arrays)
-        figures = [
-            _trace(arrays, log, c, _unit(summary, c), rows, c + suffix)
-            for c in channels
-            for rows, suffix in looks
-        ]
-        parts.append(Raw(f"<h3>{esc(log)}</h3>\n"))
-        parts.append(cards(figures, "wide"))
-    if not parts:
+def calibration(summary: Summary, arrays: Arrays) -> Raw:
+    """How many held-out measurements lie in the bands, level by level."""
+    levels = arrays.get("calibration/level")
+    prefix = "calibration/share/"
+    names = [key[len(prefix) :] for key in arrays if key.startswith(prefix)]
+    if levels is None or not names:
         return Raw("")
-    keys = [("quiet", "measured"), ("c1", "simulated")]
-    text = f"{left} more logs are in arrays.npz and not drawn." if left else ""
-    note = summary.get("trace_note")
-    return section(
-        "traces",
-        "Measured against simulated",
-        legend(keys),
-        paragraph(note, "soft") if note else "",
-        paragraph("The shade is the predicted band.", "soft") if banded else "",
-        *parts,
-        paragraph(text, "soft") if text else "",
+    ends = (0.0, 1.0)
+    axes = svg.Axes(ends, ends, 520.0, 400.0, x_label="promised")
+    levels = np.asarray(levels, float)
+    marks = [
+        svg.band(
+            axes, levels, arrays["calibration/low"], arrays["calibration/high"], "quiet"
+        ),
+        svg.line(axes, np.array(ends), np.array(ends), "quiet"),
+    ]
+    for index, name in enumerate(names):
+        share, css = arrays[prefix + name], _COLOURS[index % 6]
+        marks.append(svg.line(axes, levels, share, css))
+    about = (summary.get("held_out") or summary).get("calibration") or {}
+    counted = (
+        f"{number(about.get('windows'))} forecasts over {number(about.get('horizon'))} "
+        f"s, as good as {number(about.get('independent'))} that do not overlap"
     )
+    drawing = svg.chart(axes, marks, title="share inside the band")
+    return section(
+        "calibration",
+        "Calibration",
+        paragraph(about.get("text") or ""),
+        legend([(_COLOURS[i % 6], name) for i, name in enumerate(names)]),
+        Raw(f'<figure class="solo">{drawing}</figure>\n'),
+        paragraph(
+            "How often a band held the measurement, against how often it should: on "
+            "the line it tells the truth, below it is too narrow, above too wide. "
+            f"{counted}; in the shade nine in ten honest curves lie at a level.",
+            "soft",
+        ),
+    )
+
+
+def _with_unit(summary: Summary, channel: str) -> Raw:
+    """A channel's name and the unit of its errors."""
+    unit = unit_text(unit_of(summary, channel))
+    return Raw(f'{name_text(channel)} <span class="soft">{esc(unit)}</span>')
 
 
 def _by_channel(summary: Summary) -> Raw:
@@ -258,9 +188,10 @@ def _by_channel(summary: Summary) -> Raw:
     used = [w for w in known.values() if any(w in row for row in rows.values())]
     return table(
         ["channel", *used],
-        [[name_text(c), *(row.get(w, "") for w in used)]
+        [[_with_unit(summary, c), *(row.get(w, "") for w in used)]
          for c, row in rows.items()],
         words=(0,),
+        cards=True,
     )  # fmt: skip
 
 
@@ -279,12 +210,17 @@ def _curve(summary: Summary, arrays: Arrays, channel: str, methods: list[str]) -
         svg.line(axes, horizon, curve, _COLOURS[methods.index(method) % 6])
         for method, curve in reversed(curves.items())
     ]
-    unit = _unit(summary, channel)
+    unit = unit_of(summary, channel)
     return svg.chart(axes, marks, title=channel, unit=unit)
 
 
 def held_out(summary: Summary, arrays: Arrays) -> Raw:
-    """Prediction of what the model was not shown."""
+    """Prediction of what the model was not shown.
+
+    Of a run that was fitted, its own section "held_out"; else the run is about nothing
+    else.
+    """
+    about = summary.get("held_out") or summary
     figures: list[str] = []
     methods: list[str] = []
     if "curve/horizon" in arrays:
@@ -295,9 +231,10 @@ def held_out(summary: Summary, arrays: Arrays) -> Raw:
         methods = list(dict.fromkeys(method for method, _ in pairs))
         channels = list(dict.fromkeys(channel for _, channel in pairs))
         figures = [_curve(summary, arrays, channel, methods) for channel in channels]
-    numbers = _by_channel(summary)
-    horizon = summary.get("horizon")
-    windows = summary.get("windows")
+    numbers = _by_channel({"units": summary.get("units")} | dict(about))
+    horizon = about.get("horizon")
+    windows = about.get("windows")
+    unseen = forecasts(summary, arrays, "unseen")
     facts = []
     if is_number(horizon):
         facts.append(f"horizon {number(horizon)} s")
@@ -306,6 +243,7 @@ def held_out(summary: Summary, arrays: Arrays) -> Raw:
     return section(
         "heldout",
         "Prediction of held-out data",
+        paragraph(about["text"]) if about.get("text") else "",
         paragraph(", ".join(facts), "soft") if facts and numbers else "",
         numbers,
         Raw("<h3>Error against horizon</h3>\n" if figures else ""),
@@ -313,6 +251,7 @@ def held_out(summary: Summary, arrays: Arrays) -> Raw:
         if figures
         else "",
         cards(figures, "wide"),
+        Raw("<h3>Forecasts</h3>\n") + unseen if unseen else "",
     )
 
 
@@ -350,5 +289,7 @@ def claims(summary: Summary) -> Raw:
     if not rows:
         return Raw("")
     return section(
-        "claims", "Claims", table(["claim", "", "figure", ""], rows, words=(0, 1, 3))
+        "claims",
+        "Claims",
+        table(["claim", "", "figure", ""], rows, words=(0, 1, 3), cards=True),
     )

@@ -21,6 +21,7 @@ from sim2gp.report.markup import (
 )
 from sim2gp.report.parameters import Arrays, Summary
 from sim2gp.report.returns import returns
+from sim2gp.report.traces import traces
 
 #: Plain numbers of the summary that belong at the top, where present.
 _FACTS = {
@@ -92,13 +93,37 @@ def _status(summary: Summary) -> Raw:
     )
 
 
-def _facts(summary: Summary) -> Raw:
+def _learned(summary: Summary) -> str:
+    """What was learned, whether to believe it, and how far it predicts."""
+    said = [str(summary["headline"])] if summary.get("headline") else []
+    misfit, unseen = summary.get("misfit"), summary.get("held_out")
+    if (
+        isinstance(misfit, Mapping)
+        and misfit.get("verdict")
+        and not misfit.get("alarm")
+    ):
+        said.append(str(misfit["verdict"]))
+    if isinstance(unseen, Mapping) and unseen.get("open_loop_rmse"):
+        units = summary.get("units") or {}
+        errors = [
+            f"{number(error, 2)} {units.get(name, '')} ({name})"
+            for name, error in unseen["open_loop_rmse"].items()
+        ]
+        ahead = number(unseen.get("horizon"), 2)
+        said.append(
+            f"A fit that had not seen {unseen.get('left_out')} forecasts it {ahead} s "
+            f"ahead with a root mean square error of {', '.join(errors)}."
+        )
+    return " ".join(filter(None, said))
+
+
+def _made(summary: Summary) -> Raw:
     """Command line, size, time and versions."""
     rows: list[tuple[str, object]] = []
     line = summary.get("command_line")
     if line:
         text = line if isinstance(line, str) else shlex.join(map(str, line))
-        rows.append(("command line", Raw(f"<code>{esc(text)}</code>")))
+        rows.append(("command", Raw(f"<code>{esc(text)}</code>")))
     for key, words in _FACTS.items():
         if is_number(summary.get(key)):
             rows.append((words, number(summary[key], 4)))
@@ -112,20 +137,21 @@ def _facts(summary: Summary) -> Raw:
         rows.append(("wall time", duration(summary["wall_seconds"])))
     if summary.get("seed") is not None:
         rows.append(("seed", summary["seed"]))
+    if summary.get("device"):
+        rows.append(("device", summary["device"]))
     versions = summary.get("versions") or {}
     if versions:
         rows.append(("versions", ", ".join(f"{n} {v}" for n, v in versions.items())))
     inner = "".join(f"<dt>{esc(k)}</dt><dd>{esc(v)}</dd>\n" for k, v in rows)
-    return Raw(f'<dl class="facts">\n{inner}</dl>\n' if inner else "")
+    facts = Raw(f'<dl class="facts">\n{inner}</dl>\n' if inner else "")
+    return section("made", "How this was made", facts)
 
 
 def _machine(summary: Summary, arrays: Arrays) -> Raw:
     about, state = summary.get("animation"), arrays.get("animation/state")
     if not about or state is None or len(state) < 2:
         return Raw("")
-    return section(
-        "machine", "The machine", player(about, state, arrays.get("animation/action"))
-    )
+    return section("machine", "The machine", player(about, arrays))
 
 
 def _figure(summary: Summary, arrays: Arrays) -> Raw:
@@ -189,29 +215,31 @@ def write_report(summary: Summary, arrays: Arrays) -> str:
 
     A section is drawn only if its data are there; the same input gives the same bytes.
     """
+    moved, flown = _machine(summary, arrays), returns(summary, arrays)
     sections = [
         data.claims(summary),
         _figure(summary, arrays),
-        _machine(summary, arrays),
-        returns(summary, arrays),
+        *((moved, flown) if flown else ()),
         experiment(summary, arrays),
         parameters.parameter_table(summary),
-        parameters.parameter_densities(summary, arrays),
         parameters.directions(summary),
-        parameters.correlations(summary, arrays),
         data.noise_and_misfit(summary),
-        data.traces(summary, arrays),
         data.held_out(summary, arrays),
+        data.calibration(summary, arrays),
+        *(() if flown else (moved,)),
+        traces(summary, arrays),
+        parameters.parameter_densities(summary, arrays),
+        parameters.correlations(summary, arrays),
         data.extra_tables(summary),
+        _made(summary),
     ]
     name = f"sim2gp {summary.get('command') or 'run'}"
-    headline = summary.get("headline")
+    learned = _learned(summary)
     body = "".join(
         [
             f"<header>\n<h1>{esc(summary.get('title') or name)}</h1>\n",
             _status(summary),
-            paragraph(headline, "lead") if headline else "",
-            _facts(summary),
+            paragraph(learned, "lead") if learned else "",
             _contents(sections),
             "</header>\n",
             *sections,

@@ -138,22 +138,42 @@ def duration(seconds: object) -> str:
 
 
 def table(
-    columns: Sequence[str], rows: Iterable[Sequence[object]], *, words: Sequence[int]
+    columns: Sequence[str],
+    rows: Iterable[Sequence[object]],
+    *,
+    words: Sequence[int],
+    cards: bool = False,
 ) -> Raw:
-    """A table that scrolls sideways where it does not fit; `words`: text columns."""
+    """A table that scrolls sideways where it does not fit; `words`: text columns.
 
-    def cells(tag: str, row: Sequence[object]) -> str:
-        return "".join(
-            f"<{tag}>{esc(cell)}</{tag}>"
-            if index in words
-            else f'<{tag} class="n">{esc(cell)}</{tag}>'
-            for index, cell in enumerate(row)
-        )
+    With `cards` every row becomes a card of its own on a narrow screen.
+    """
 
-    body = "".join(f"<tr>{cells('td', row)}</tr>\n" for row in rows)
+    right = "", ' class="n"'
+
+    def cell(index: int, text: str) -> str:
+        css = [] if index in words else ["n"]
+        if not cards:
+            return f"<td{right[index not in words]}>{text}</td>"
+        # A card begins with the first column and its words, without their titles.
+        if index and index == len(columns) - 1 and index in words:
+            css.append("said")
+        css += [] if text else ["void"]
+        title = f' data-name="{esc(columns[index])}"' if columns[index] else ""
+        return f'<td class="{" ".join(css)}"{title}><div>{text}</div></td>'
+
+    head = "".join(
+        f"<th>{esc(title)}</th>"
+        if index in words
+        else f'<th class="n">{esc(title)}</th>'
+        for index, title in enumerate(columns)
+    )
+    lines = ("".join(cell(i, esc(x)) for i, x in enumerate(row)) for row in rows)
+    body = "".join(f"<tr>{line}</tr>\n" for line in lines)
+    css = ' class="as-cards"' if cards else ""
     return Raw(
-        '<div class="scroll"><table>\n'
-        f"<thead><tr>{cells('th', columns)}</tr></thead>\n"
+        f'<div class="scroll"><table{css}>\n'
+        f"<thead><tr>{head}</tr></thead>\n"
         f"<tbody>\n{body}</tbody></table></div>\n"
     )
 

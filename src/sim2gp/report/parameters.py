@@ -51,7 +51,7 @@ def _remaining(entry: Mapping[str, Any]) -> Raw:
     if not (is_number(sd) and is_number(before)) or not float(before) > 0:  # type: ignore[arg-type]
         return Raw(MISSING)
     share = float(sd) / float(before)  # type: ignore[arg-type]
-    text = f"{100 * share:.1f} %" if share < 0.1 else f"{100 * share:.0f} %"
+    text = f"{number(100 * share, 2)} %" if share < 0.1 else f"{100 * share:.0f} %"
     width = f"{100 * min(share, 1.0):.0f}%"
     return Raw(f'<span class="bar"><i style="width:{width}"></i></span>{text}')
 
@@ -69,6 +69,8 @@ def _interval(entry: Mapping[str, Any]) -> Raw:
 def _row(name: str, entry: Mapping[str, Any], truth: bool) -> list[object]:
     verdict = entry.get("verdict")
     why = entry.get("note") or VERDICTS.get(str(verdict), ("", ""))[1]
+    if verdict == "identified":  # its note says by how much, as "spread left" does
+        why = VERDICTS["identified"][1]
     meaning = entry.get("meaning") or ""
     below = f'<span class="why">{esc(meaning)}</span>' if meaning else ""
     row: list[object] = [
@@ -108,7 +110,7 @@ def parameter_table(summary: Summary) -> Raw:
         ),
         _why(summary.get("intervals")),
         _checked(summary.get("check")),
-        table(columns, rows, words=(0, 1, last)),
+        table(columns, rows, words=(0, 1, last), cards=True),
     )
 
 
@@ -267,9 +269,7 @@ def _direction(entry: Mapping[str, Any]) -> Raw:
     if combination and str(combination) not in str(text):
         parts.append(f"<code>{esc(combination)}</code>")
     if is_number(entry.get("information")):
-        parts.append(
-            f'<span class="soft">information {number(entry["information"])}</span>'
-        )
+        parts.append(f'<span class="soft">({number(entry["information"])} nats)</span>')
     if entry.get("flat"):
         parts.append('<span class="chip warn">flat</span>')
     return Raw(" ".join(part for part in parts if part))
@@ -288,12 +288,11 @@ def directions(summary: Summary) -> Raw:
         )
         for entry in base
     ]
+    columns = ["combination", "value", "unit", "verdict"]
     return section(
         "directions",
         "Combinations",
         listing(_direction(entry) for entry in entries),
         Raw("<h3>Base parameters: what these data do determine</h3>\n" if rows else ""),
-        table(["combination", "value", "unit", "verdict"], rows, words=(0, 2, 3))
-        if rows
-        else "",
+        table(columns, rows, words=(0, 2, 3), cards=True) if rows else "",
     )

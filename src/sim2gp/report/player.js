@@ -4,7 +4,7 @@
 document.querySelectorAll(".player").forEach(function (player) {
   const film = JSON.parse(player.querySelector("script").textContent);
   const bodies = player.querySelector(".bodies");
-  const stage = player.querySelector(".stage");
+  const stage = player.querySelector("svg.stage");
   const shapes = Array.from(bodies.children).map(function (node) {
     return { node: node, spec: film.shapes[+node.dataset.i] };
   });
@@ -17,6 +17,9 @@ document.querySelectorAll(".player").forEach(function (player) {
   const last = film.moving.length - 1;
   const paces = [1, 0.5, 0.25];
   const camera = Object.assign({}, film.camera);
+  const canvas = player.querySelector("canvas.stage");
+  const look = player.querySelector("button.look");
+  let frames = [], modelled = false;
   let at = 0, playing = false, before = null, speed = 1;
 
   function lens() {
@@ -51,6 +54,18 @@ document.querySelectorAll(".player").forEach(function (player) {
     }
     points.push(see(moving(at)[j]));
     return points;
+  }
+  function paint() {  // the frame that MuJoCo rendered for this time
+    const i = Math.min(frames.length - 1, Math.floor(at * film.dt / film.apart + 1e-6));
+    const pen = canvas.getContext("2d");
+    pen.clearRect(0, 0, canvas.width, canvas.height);
+    pen.drawImage(frames[i], 0, 0);
+    pen.font = canvas.width > 2 * canvas.clientWidth ? "24px sans-serif" : "15px sans-serif";
+    pen.fillStyle = getComputedStyle(said).fill;
+    pen.strokeStyle = getComputedStyle(document.body).backgroundColor;
+    pen.lineWidth = 3;
+    pen.strokeText(said.textContent, 12, 26);
+    pen.fillText(said.textContent, 12, 26);
   }
   function draw() {
     const see = lens();
@@ -93,6 +108,14 @@ document.querySelectorAll(".player").forEach(function (player) {
       line.setAttribute("x1", x);
       line.setAttribute("x2", x);
     });
+    if (modelled) paint();
+  }
+  function show(model) {
+    modelled = model;
+    canvas.hidden = !model;
+    stage.style.display = model ? "none" : "";
+    look.textContent = model ? "Lines" : "Model";
+    draw();
   }
   function tick(now) {
     if (!playing) return;
@@ -134,10 +157,26 @@ document.querySelectorAll(".player").forEach(function (player) {
     });
   }
   draw();
+  if (canvas && film.frames) {
+    // Decoded when they are drawn: all of them at once are much for a phone.
+    Promise.all(film.frames.map(function (code) {
+      return new Promise(function (done, failed) {
+        const image = new Image();
+        image.onload = function () { done(image); };
+        image.onerror = failed;
+        image.src = "data:image/webp;base64," + code;
+      });
+    })).then(function (all) {
+      frames = all;
+      look.hidden = false;
+      look.addEventListener("click", function () { show(!modelled); });
+      show(true);
+    }, function () { /* a browser without WebP shows the figure */ });
+  }
   if (window.matchMedia("(prefers-reduced-motion: no-preference)").matches && "IntersectionObserver" in window) {
     const watch = new IntersectionObserver(function (seen) {
       if (seen.some(function (entry) { return entry.isIntersecting; })) { watch.disconnect(); play(true); }
-    }, { threshold: 0.6 });
-    watch.observe(stage);
+    }, { threshold: 0.9 });
+    watch.observe(player.querySelector(".controls"));
   }
 });

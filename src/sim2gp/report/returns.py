@@ -87,7 +87,7 @@ def _methods(summary: Summary, series: Mapping[str, np.ndarray]) -> Raw:
         reached = _episodes_to_95(summary, method, len(series) == 1)
         rows.append((Raw(f"<b>{method_name(method)}</b>"), reached, best, last, score))
     columns = ["method", "episodes to 95 %", "best return", "last return", "score"]
-    return table(columns, rows, words=(0,))
+    return table(columns, rows, words=(0,), cards=True)
 
 
 def method_name(method: str) -> str:

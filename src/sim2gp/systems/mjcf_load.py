@@ -11,7 +11,7 @@ import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -53,19 +53,12 @@ def as_mjcf(path: Path) -> str:
 def _made(paths: Sequence[Path], folder: str, form: str) -> list[Path]:
     """What the child makes of each file."""
     seconds = SECONDS * len(paths)
-    command = [sys.executable, "-I", _CHILD, str(seconds), folder, form]
     where = str(paths[0])
-    try:
-        done = subprocess.run(
-            [*command, *(str(path.resolve()) for path in paths)],
-            cwd=folder,  # where MuJoCo leaves its log
-            capture_output=True,
-            text=True,
-            timeout=2 * seconds,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
-        raise _died(where, f"no answer in {2 * seconds} s") from None
+    files = [str(path.resolve()) for path in paths]
+    # In that folder MuJoCo leaves its log.
+    done = in_child(_CHILD, [str(seconds), folder, form, *files], folder, 2 * seconds)
+    if done is None:
+        raise _died(where, f"no answer in {2 * seconds} s")
     if done.returncode == 3:
         said = " ".join(done.stderr.split("REFUSED ", 1)[-1].split())
         raise InputError("E170", "no model", where=where, got=said)
@@ -73,6 +66,29 @@ def _made(paths: Sequence[Path], folder: str, form: str) -> list[Path]:
         last = done.stderr.strip().splitlines()[-1:] or ["no words"]
         raise _died(where, f"exit {done.returncode}, {last[0]}")
     return [Path(folder, f"{i}.{form}") for i in range(len(paths))]
+
+
+def in_child(
+    script: str,
+    arguments: Sequence[str],
+    folder: str,
+    seconds: int,
+    environment: Mapping[str, str] | None = None,
+) -> subprocess.CompletedProcess[str] | None:
+    """Run a script of this room apart, in a folder; None where it took too long."""
+    try:
+        return subprocess.run(
+            [sys.executable, "-I", script, *arguments],
+            cwd=folder,
+            env=environment,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=seconds,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return None
 
 
 def check_paths(path: Path, root: Path) -> None:

@@ -1,0 +1,190 @@
+"""A film of forecasts over what was recorded, for the report.
+
+Windows follow each other: the recorded motion goes on, the forecast begins anew from
+the measured state every half second.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from sim2gp.gaussian import Gaussian
+from sim2gp.logs import Log
+from sim2gp.models.grid import Grid
+from sim2gp.systems import CartPole, Furuta, MuJoCo, TwoLink, UniformRodArm
+from sim2gp.systems.base import AbstractSystem
+from sim2gp.types import in_float64
+
+if TYPE_CHECKING:
+    from sim2gp.report.scenes import Scene
+
+MOST = 20  # windows: ten seconds
+FRAME = 8  # rows of the film between pictures of MuJoCo's own
+_STRIPS = 4
+_BUNDLED: tuple[tuple[type, str], ...] = (
+    (Furuta, "furuta"),
+    (CartPole, "cartpole"),
+    (TwoLink, "two_link"),
+    (UniformRodArm, "two_link"),
+)
+Picture = dict[str, tuple[np.ndarray, ...]]
+
+
+def film(
+    system: AbstractSystem,
+    posterior: Gaussian,
+    picture: Picture,
+    grid: Grid,
+    logs: Sequence[Log],
+    title: str,
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Summary entry "animation" and its arrays; both empty for an unknown machine.
+
+    ``picture`` is what `sim2gp.experiments.prediction.drawn` made of ``grid``.
+    """
+    machine = system
+    while hasattr(machine, "system"):
+        machine = machine.system
+    which = picture["which"][0][:MOST]
+    if not len(which):
+        return {}, {}
+    time, y, mean, _ = (x[:MOST, :-1] for x in picture["trace"])
+    names = [c.name for c in system.physical_states]
+    joints = [n for n in names if not n.endswith((".velocity", ".activation"))]
+    columns = {names[i]: c for c, i in enumerate(grid.windows.outputs)}
+    motion = [_motion(x, y, columns, joints) for x in (mean, y)]
+    about, arrays = _drawing(machine, _constants(system, posterior), motion)
+    if not about:
+        return {}, {}
+    unseen = [n for n in joints if n not in columns]
+    if unseen:
+        title = f"{title}; {', '.join(unseen)} was not measured and is drawn at zero"
+    dt = float(time[0, 1] - time[0, 0])
+    actions = [c.name for c in system.actions][:2]
+    held = [
+        logs[k].commanded([c.name for c in system.actions])[
+            np.searchsorted(logs[k].time, t + 1e-9, side="right") - 1, :2
+        ]
+        for k, t in zip(grid.log[which], time, strict=True)
+    ]
+    starts = enumerate(zip(grid.log[which], time[:, 0], strict=True))
+    marks = [
+        {"time": n * dt * time.shape[1], "text": f"{logs[k].name}, from {t:.1f} s"}
+        for n, (k, t) in starts
+    ]
+    units = {c.name: c.unit for c in (*system.physical_states, *system.actions)}
+    about |= {
+        "dt": dt,
+        "title": title,
+        "marks": marks,
+        "strips": _strips(joints, motion[1], units),
+        "inputs": [[n, units[n] if units[n] != "1" else ""] for n in actions],
+    }
+    return about, arrays | {
+        "animation/state": motion[0].astype(np.float32),
+        "animation/recorded": motion[1].astype(np.float32),
+        "animation/action": np.concatenate(held).astype(np.float32),
+    }
+
+
+@in_float64
+def _constants(system: AbstractSystem, posterior: Gaussian) -> dict[str, float]:
+    values = system.parameters.values(jnp.asarray(posterior.mean, float))
+    return {name: float(value) for name, value in values.items()}
+
+
+def _motion(
+    x: Float[np.ndarray, "W R c"],
+    y: Float[np.ndarray, "W R c"],
+    columns: dict[str, int],
+    joints: Sequence[str],
+) -> Float[np.ndarray, "T q"]:
+    """Joint positions of all windows in a row; what was not measured is bridged."""
+    flat = np.zeros((x.shape[0] * x.shape[1], len(joints)))
+    for j, name in enumerate(joints):
+        if name in columns:
+            values = x[..., columns[name]].ravel()
+            good = np.isfinite(values)
+            if good.any():
+                at = np.arange(len(values))
+                flat[:, j] = np.interp(at, at[good], values[good])
+    return flat
+
+
+def _drawing(
+    machine: Any, values: dict[str, float], motion: list[np.ndarray]
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """How the machine looks: a scene of the report's own, or a stick figure."""
+    for kind, name in _BUNDLED:
+        if isinstance(machine, kind):
+            params = {n: v for n, v in values.items() if "." not in n}
+            for field in ("gravity", "length1"):
+                if hasattr(machine, field):
+                    params.setdefault(field, float(getattr(machine, field)))
+            params.setdefault("length1", params.get("l1", 0.5))
+            params.setdefault("length2", params.get("l2", 0.8 * params["length1"]))
+            return {"system": name, "params": params}, {}
+    if not isinstance(machine, MuJoCo):
+        return {}, {}
+    from sim2gp.report.skeleton import figure_entry, skeleton
+    from sim2gp.systems.mujoco_figure import figure_of
+
+    theta = np.asarray([values[name] for name in machine.names])
+    model = machine.engine.with_values(theta)
+    figure = figure_of(model, np.concatenate(motion))
+    points = figure.moving.astype(np.float32)
+    half = len(motion[0])
+    entry = figure_entry(figure)
+    frames = _frames(model, motion, skeleton(entry, points))
+    return {"system": "figure", "figure": entry} | frames[0], {
+        "animation/points": points[:half],
+        "animation/recorded_points": points[half:],
+        **frames[1],
+    }
+
+
+def _frames(
+    model: Any, motion: list[np.ndarray], scene: "Scene"
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """MuJoCo's own pictures, seen as the stick figure is; empty where it has none."""
+    from sim2gp.systems.mujoco_film import MOST, rendered
+
+    every = max(FRAME, -(-len(motion[0]) // MOST))
+    width, height = scene.width * 3 // 4, scene.height * 3 // 4
+    camera = scene.camera
+    found = rendered(
+        model,
+        motion[1][::every],
+        motion[0][::every],
+        lookat=np.asarray(camera.target),
+        view=(
+            math.degrees(camera.azimuth) + 180.0,
+            -math.degrees(camera.elevation),
+            camera.distance,
+            2.0 * math.degrees(math.atan(0.5 * scene.height / camera.focal)),
+        ),
+        size=(width, height),
+    )
+    if not found:
+        return {}, {}
+    return {"frames": {"every": every, "width": width, "height": height}}, {
+        "animation/frames": np.frombuffer(b"".join(found), np.uint8),
+        "animation/frame_ends": np.cumsum([len(frame) for frame in found]),
+    }
+
+
+def _strips(
+    joints: Sequence[str], motion: np.ndarray, units: dict[str, str]
+) -> list[list[Any]]:
+    """The joints that move most, in their order: row, name, unit, factor."""
+    far = np.argsort(-np.ptp(motion, axis=0))[:_STRIPS]
+    found = []
+    for j in sorted(far.tolist()):
+        turns = units[joints[j]] == "rad"
+        unit, factor = ("deg", 180.0 / np.pi) if turns else (units[joints[j]], 1.0)
+        found.append([j, joints[j], unit, float(factor)])
+    return found

@@ -1,0 +1,83 @@
+"""Forecasts of data that a fit has not seen, for the report of `identify`.
+
+The constants of a run rest on all of its logs. Here they are fitted once more without
+the last recording (or the end of the only one), which is then forecast.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sim2gp.errors import DeadParameters, NotConverged, NotFinite
+from sim2gp.experiments.calibration import calibration
+from sim2gp.experiments.folds import Fold, fold, held_out
+from sim2gp.experiments.prediction import TRACE, channels, drawn, scores, trace_arrays
+from sim2gp.logs import Log
+from sim2gp.models.grid import CURVE, Grid, steps_of
+from sim2gp.models.windows import Windows
+from sim2gp.project import Project
+from sim2gp.types import Key
+
+PREFIX = "unseen"  # of the traces
+Picture = dict[str, tuple[np.ndarray, ...]]
+
+
+class Unseen(NamedTuple):
+    """What is said of held-out data, what is drawn, and the windows of a film."""
+
+    summary: dict[str, Any]
+    arrays: dict[str, np.ndarray]
+    fold: Fold | None
+    picture: Picture
+
+
+def unseen(
+    project: Project,
+    logs: Sequence[Log],
+    windows: Windows,
+    places: Sequence[tuple[int, int]],
+    grid: Grid,
+    *,
+    key: Key,
+) -> Unseen:
+    """A second fit, of a part of the windows, and its forecasts of the rest.
+
+    As many starts as `identify` has: the two fits share their compilation.
+    """
+    part = held_out(logs, windows, places, grid)
+    if part is None:
+        return _none("too little was recorded to hold some of it out.")
+    horizon = _horizon(grid, part.test)
+    try:
+        found = fold(project, windows, grid, part, horizon, key=key, starts=2)
+    except (NotConverged, NotFinite, DeadParameters) as error:
+        return _none(f"a fit without {part.words} failed ({error}).")
+    names = channels(project.system, windows)
+    summary, arrays = scores(found.judged, names, logs, horizon)
+    summary["calibration"], shares = calibration(found.judged, names, horizon)
+    del summary["tables"]
+    picture = drawn(project.system, found.posterior, found.band, found.tested)
+    traces = trace_arrays(picture, found.tested, logs, names, PREFIX)
+    summary["left_out"] = part.words
+    summary["text"] = (
+        f"The constants were fitted once more without {part.words}, which that fit "
+        "then forecast, knowing its inputs. The other sections rest on all of the data."
+    )
+    if part.recordings == 1:
+        summary["text"] += (
+            " One recording says nothing of how others differ: the bands are twice as "
+            "wide as its own errors ask for."
+        )
+    return Unseen(summary, arrays | shares | traces, found, picture)
+
+
+def _none(why: str) -> Unseen:
+    return Unseen({"text": f"No forecasts of unseen data: {why}"}, {}, None, {})
+
+
+def _horizon(grid: Grid, test: np.ndarray) -> float:
+    """Half a second, or as long as a held-out window is."""
+    measured = np.asarray(grid.windows.mask)[test].any(axis=(0, 2))
+    whole = [h for h in CURVE if h <= TRACE and measured[steps_of(h)]]
+    return max(whole, default=CURVE[0])

@@ -1,0 +1,181 @@
+"""What is held out of a fit, and what is said of bands: by counting."""
+
+import math
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from sim2gp.experiments import folds
+from sim2gp.experiments.calibration import LEVELS, calibration
+from sim2gp.experiments.folds import fold, held_out
+from sim2gp.experiments.motion import film
+from sim2gp.experiments.prediction import Judged, drawn, trace_arrays
+from sim2gp.logs import Log
+from sim2gp.models.cutting import cut
+from sim2gp.models.forecast import Band, Forecast
+from sim2gp.models.grid import evaluation_windows
+from sim2gp.project import load_project
+from sim2gp.systems import CartPole
+
+
+def log(source: str, seconds: float, start: float = 0.0) -> Log:
+    """A recording of a cart at 100 Hz; its clock may begin late."""
+    t = start + 0.01 * np.arange(round(100 * seconds))
+    channels = {"x": 0.1 * np.sin(t), "theta": np.cos(t)}
+    every = {name: np.ones(len(t), bool) for name in channels}
+    return Log(source.removesuffix(".csv"), source, t, channels, {"voltage": t}, every)
+
+
+def parts(*logs: Log):
+    """What `held_out` makes of them, with windows and grid."""
+    windows, places = cut(logs, CartPole(), window=0.2)
+    grid = evaluation_windows(logs, CartPole(), longest=1.0)
+    return held_out(logs, windows, places, grid), places, grid
+
+
+def test_the_last_recording_is_left_out_with_all_its_pieces() -> None:
+    pieces = log("b.csv", 2.0), log("b.csv", 2.0, start=3.0)
+    part, places, grid = parts(log("a.csv", 3.0), *pieces)
+    assert part is not None
+    of = np.asarray([k for k, _ in places])
+    np.testing.assert_array_equal(part.train, of == 0)
+    np.testing.assert_array_equal(part.known, grid.log == 0)
+    np.testing.assert_array_equal(part.test, grid.log > 0)
+    assert (part.recordings, part.words, part.until) == (1, "b", math.inf)
+
+
+def test_the_end_of_the_only_recording_is_left_out() -> None:
+    part, places, grid = parts(log("a.csv", 8.0, start=5.0))
+    assert part is not None
+    split = 5.0 + 0.75 * 7.99
+    since = 5.0 + 0.01 * np.asarray([row for _, row in places])
+    np.testing.assert_array_equal(part.train, since + 0.19 <= split)
+    np.testing.assert_array_equal(part.test, grid.since >= split)
+    assert not (part.known & part.test).any()
+    assert grid.since[part.known].max() + 0.1 <= split
+    assert part.until == pytest.approx(split)
+    assert part.words == "the last 25 % of a"
+
+
+def test_too_short_a_recording_holds_nothing_out() -> None:
+    assert parts(log("a.csv", 0.45))[0] is None
+
+
+def judged(z: np.ndarray) -> Judged:
+    """Forecasts at the horizons .1 and .5 s whose standardised errors are ``z``."""
+    both = np.stack([0.0 * z, z], axis=1)
+    valid = np.isfinite(both)
+    none = np.zeros_like(both)
+    scale = np.full_like(both, 0.2)
+    return Judged(
+        np.array([50, 250]), valid, 0.2 * np.where(valid, both, 0.0), scale, none, none,
+        None, np.zeros(len(z), int), valid, valid,
+    )  # fmt: skip
+
+
+def quantiles(count: int) -> np.ndarray:
+    """Standardised errors that are exactly Gaussian."""
+    from statistics import NormalDist
+
+    return np.asarray([NormalDist().inv_cdf((k + 0.5) / count) for k in range(count)])
+
+
+def test_honest_bands_lie_on_the_diagonal() -> None:
+    z = np.stack([quantiles(2000), 2.0 * quantiles(2000), 0.5 * quantiles(2000)], 1)
+    about, arrays = calibration(judged(z), ["right", "narrow", "wide"], 0.5)
+    np.testing.assert_allclose(
+        arrays["calibration/share/right"], np.asarray(LEVELS), atol=1e-3
+    )
+    at = LEVELS.index(0.9)
+    # Within 1.645 sd of a forecast that is off by twice, or half of, what it says.
+    assert arrays["calibration/share/narrow"][at] == pytest.approx(0.589, abs=2e-3)
+    assert arrays["calibration/share/wide"][at] == pytest.approx(0.999, abs=1e-3)
+    assert (about["windows"], about["independent"]) == (2000, 400)
+    low, high = (arrays[f"calibration/{end}"][at] for end in ("low", "high"))
+    assert high - low == pytest.approx(2 * 1.6449 * math.sqrt(0.09 / 400), rel=1e-3)
+    said = about["text"].split("The 90 % band of ")
+    assert "90 % of the measurements, as it should" in said[1]
+    assert "too narrow" in said[2]
+    assert "wider than it need be" in said[3]
+
+
+def test_few_windows_accuse_nobody() -> None:
+    z = np.stack([np.full(6, 0.1), np.array([0.1, 0.2, np.nan, 0.3, 0.4, 2.5])], 1)
+    about, arrays = calibration(judged(z), ["all", "some"], 0.5)
+    assert about["independent"] == 1
+    assert "100 % of the measurements, as it should" in about["text"]
+    assert arrays["calibration/share/some"][LEVELS.index(0.9)] == pytest.approx(0.8)
+
+
+def test_a_channel_that_was_not_measured_has_no_curve() -> None:
+    z = np.stack([quantiles(20), np.full(20, np.nan)], axis=1)
+    about, arrays = calibration(judged(z), ["seen", "unseen"], 0.5)
+    assert "calibration/share/unseen" not in arrays
+    assert "unseen" not in about["text"]
+    assert about["windows"] == 20
+
+
+def test_neither_fit_nor_band_sees_what_is_held_out(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Whatever `fit_windows` and `fit_band` are given ends before the split."""
+    given: dict[str, Any] = {}
+    logs = (log("a.csv", 8.0),)
+    windows, places = cut(logs, CartPole(), window=0.2)
+    grid = evaluation_windows(logs, CartPole(), longest=1.0)
+    part = held_out(logs, windows, places, grid)
+    assert part is not None
+
+    def fitted(system: Any, kept: Any, **_: Any) -> Any:
+        given["kept"] = kept
+        return SimpleNamespace(posterior=None)
+
+    def forecasts(system: Any, posterior: Any, some: Any, rows: np.ndarray) -> Any:
+        valid = np.asarray(some.mask)[:, rows]
+        none = np.zeros(valid.shape)
+        slopes = [np.zeros((*valid.shape, k)) for k in (4, 1)]
+        return Forecast(none, none, valid, *slopes, none, tuple(rows.tolist()))
+
+    def band(found: Forecast, known: Any, recordings: int) -> Band:
+        given["found"], given["known"], given["recordings"] = found, known, recordings
+        one = np.ones(2)
+        return Band(np.ones(4), np.ones(1), one, np.array([0.0]), one[None], 1.0)
+
+    for name, stub in (("fit_windows", fitted), ("forecast", forecasts)):
+        monkeypatch.setattr(folds, name, stub)
+    monkeypatch.setattr(folds, "fit_band", band)
+    path = tmp_path / "cart.toml"
+    path.write_text('system = "cartpole"\n[[logs]]\nfiles = ["a.csv"]\n'
+                    '[logs.columns]\nx = "x"\ntheta = "theta"\n'
+                    'voltage = "u"\n')  # fmt: skip
+    found = fold(
+        load_project(path), windows, grid, part, 0.5, key=jax.random.key(0), starts=2
+    )
+    assert len(given["kept"]) == len(windows)  # masked, not removed
+    seen = np.asarray(given["kept"].mask).any(axis=(1, 2))
+    np.testing.assert_array_equal(seen, part.train)
+    result, known = given["found"], given["known"]
+    at = known.since[:, None] + 2e-3 * np.asarray(result.rows)
+    used = result.valid.any(axis=2)
+    assert at[used].max() <= part.until
+    assert used[at <= part.until].all()  # and all of what comes before
+    assert given["recordings"] == 1
+    assert found.tested.since.min() >= part.until
+    assert found.judged.valid.shape[0] == part.test.sum()
+
+
+def test_windows_too_short_to_be_drawn_are_not() -> None:
+    """A log of less than half a second has scores, and no picture."""
+    short = (log("a.csv", 0.45),)
+    grid = evaluation_windows(short, CartPole(), longest=1.0)
+    assert len(grid.windows) > 0
+    one = np.ones(2)
+    band = Band(np.ones(4), np.ones(1), one, np.array([0.0]), one[None], 1.0)
+    prior = CartPole().parameters.prior()
+    picture = drawn(CartPole(), prior, band, grid)
+    assert trace_arrays(picture, grid, short, ["x", "theta"]) == {}
+    assert film(CartPole(), prior, picture, grid, short, "none") == ({}, {})
