@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from sim2gp.experiments.prediction import load
 from sim2gp.project import load_project
 from sim2gp.runs import Progress, new_run
 
@@ -26,11 +27,17 @@ def install(
 
 
 def identify(
-    project: Path, *, out: Path, seed: int, progress: Progress, check: bool = False
+    project: Path,
+    *,
+    out: Path,
+    seed: int,
+    progress: Progress,
+    check: bool = False,
+    strict: bool = False,
 ) -> dict[str, Any]:
     """Everything of an identification that reads input, and no fit."""
     found = load_project(project)
-    logs = found.load_logs()
+    logs = load(found, strict=strict)
     summary = {
         "n_transitions": sum(len(log) - 1 for log in logs),
         "parameters": {p.name: {"sd": p.sd} for p in found.system.parameters.free},

@@ -43,7 +43,8 @@ def read(path: Path, columns: object = None, **options: object) -> tuple[Log, ..
 
 
 def codes(log: Log) -> list[str]:
-    return [note.code for note in log.notes]
+    """What is said of a log, but for columns that a test leaves unused."""
+    return [note.code for note in log.notes if note.code != "W105"]
 
 
 def test_values_come_back_bit_by_bit(tmp_path: Path) -> None:

@@ -48,6 +48,14 @@ class Writes(Common):
 
 
 @dataclass(kw_only=True)
+class Reads(Writes):
+    """Options of a command that reads logs."""
+
+    strict: bool = False
+    """Refuse logs with columns that nothing takes."""
+
+
+@dataclass(kw_only=True)
 class Demo(Writes):
     """Learn to swing up a pendulum whose constants are unknown, in a few trials."""
 
@@ -111,7 +119,7 @@ class Init(Common):
 
 
 @dataclass(kw_only=True)
-class Identify(Writes):
+class Identify(Reads):
     """Posterior of a machine's constants from its logs."""
 
     project: Positional[Path]
@@ -129,12 +137,13 @@ class Identify(Writes):
             out=out,
             seed=self.seed,
             check=self.check,
+            strict=self.strict,
             progress=progress,
         )
 
 
 @dataclass(kw_only=True)
-class Evaluate(Writes):
+class Evaluate(Reads):
     """Prediction of logs that a fit has not seen."""
 
     run_or_project: Annotated[Positional[Path], arg(metavar="RUN|PROJECT")]
@@ -154,7 +163,11 @@ class Evaluate(Writes):
                 raise usage_error("too many logs", got, expected, fix)
             _check_project(self.run_or_project)
             return _experiment("evaluate", "leave_one_out")(
-                self.run_or_project, horizon=self.horizon, out=out, progress=progress
+                self.run_or_project,
+                horizon=self.horizon,
+                out=out,
+                strict=self.strict,
+                progress=progress,
             )
         load_run(self.run_or_project)  # a folder that is no run fails before the work
         if not self.logs:
@@ -165,12 +178,13 @@ class Evaluate(Writes):
             list(self.logs),
             horizon=self.horizon,
             out=out,
+            strict=self.strict,
             progress=progress,
         )
 
 
 @dataclass(kw_only=True)
-class Explain(Writes):
+class Explain(Reads):
     """What physics a simulator lacks: nothing, an effect, or none of these."""
 
     path: Annotated[Positional[Path], arg(metavar="RUN")]
@@ -182,12 +196,12 @@ class Explain(Writes):
         out = _out(self.out, f"explain-{self.path.name}")
         load_run(self.path)  # a folder that is no run fails before the work
         return _experiment("explain")(
-            self.path, add=self.add, out=out, progress=progress
+            self.path, add=self.add, out=out, strict=self.strict, progress=progress
         )
 
 
 @dataclass(kw_only=True)
-class Compare(Writes):
+class Compare(Reads):
     """Which model the logs support: simulator, residual, function space, black box."""
 
     project: Positional[Path]
@@ -205,6 +219,7 @@ class Compare(Writes):
             horizons=self.horizon,
             out=out,
             seed=self.seed,
+            strict=self.strict,
             progress=progress,
         )
 

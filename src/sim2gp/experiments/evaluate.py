@@ -38,7 +38,7 @@ from sim2gp.experiments.prediction import (
 )
 from sim2gp.experiments.record import provenance
 from sim2gp.gaussian import Gaussian
-from sim2gp.logs import Log
+from sim2gp.logs import Log, none_unused, shared_rows
 from sim2gp.models.forecast import fit_band, forecast
 from sim2gp.models.grid import CURVE, Grid, evaluation_windows, steps_of
 from sim2gp.models.windows import Windows, fit_windows
@@ -48,7 +48,13 @@ from sim2gp.types import in_float64
 
 
 def run(
-    run: Path, logs: list[Path], *, horizon: float, out: Path, progress: Progress
+    run: Path,
+    logs: list[Path],
+    *,
+    horizon: float,
+    out: Path,
+    progress: Progress,
+    strict: bool = False,
 ) -> dict[str, Any]:
     """Predict ``logs`` by an identify run; writes and returns the summary."""
     started = time.perf_counter()
@@ -56,6 +62,8 @@ def run(
     fit = restored(run)
     found, system = fit.project, fit.project.system
     tested = found.read_logs(logs)
+    if strict:
+        none_unused(tested)
     with new_run(out, "evaluate") as writer, progress.task("evaluate", 2) as task:
         rows, longest = rows_for(horizon), max(horizon, CURVE[-1])
         grid = windows_for(tested, found, longest, horizon)
@@ -71,7 +79,8 @@ def run(
         summary, arrays = scores(whole, names, tested, horizon)
         picture = drawn(system, fit.posterior, fit.band, grid)
         arrays |= trace_arrays(picture, grid, tested, names)
-        notes = [str(note) for log in tested for note in log.notes]
+        notes = _said(tested)
+        notes += [str(note) for note in shared_rows(train or (), tested)]
         if train is None:
             notes.append("the training logs were not found: no regression beside")
         listed = " ".join(map(str, logs))
@@ -87,13 +96,18 @@ def run(
 
 
 def leave_one_out(
-    project: Path, *, horizon: float, out: Path, progress: Progress
+    project: Path,
+    *,
+    horizon: float,
+    out: Path,
+    progress: Progress,
+    strict: bool = False,
 ) -> dict[str, Any]:
     """Fit all recordings but one, predict that one, in turn; writes the summary."""
     started = time.perf_counter()
     check_horizon(horizon)
     found = load_project(project)
-    logs = load(found)
+    logs = load(found, strict=strict)
     files = list(dict.fromkeys(recordings(logs)))
     if len(files) < 2:
         raise InputError(
@@ -124,7 +138,7 @@ def leave_one_out(
             "command": "evaluate",
             "title": f"{found.name}: each log predicted by a fit of the others",
             "folds": len(files),
-            "warnings": [str(note) for log in logs for note in log.notes],
+            "warnings": [*_said(logs), *_repeated(logs, files)],
         }
         line = f"sim2gp evaluate {project} --horizon {horizon:g}"
         _write(writer, summary, curves | arrays, found, line, started)
@@ -210,6 +224,20 @@ def windows_for(
         expected=f"an unmasked stretch longer than the horizon of {horizon:g} s",
         fix="shorten --horizon, or record longer",
     )
+
+
+def _said(logs: Sequence[Log]) -> list[str]:
+    return [str(note) for log in logs for note in log.notes]
+
+
+def _repeated(logs: Sequence[Log], files: Sequence[str]) -> list[str]:
+    """Rows that a fold both learns from and is judged by (W128)."""
+    sets = [[log for log in logs if log.source == file] for file in files]
+    notes = []
+    for i, tested in enumerate(sets):
+        others = [log for group in sets[:i] + sets[i + 1 :] for log in group]
+        notes += [str(note) for note in shared_rows(others, tested)]
+    return notes
 
 
 def _training(

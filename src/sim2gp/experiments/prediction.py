@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 
 from sim2gp.errors import InputError
 from sim2gp.gaussian import Gaussian
-from sim2gp.logs import Log
+from sim2gp.logs import Log, none_unused
 from sim2gp.models.cutting import cut
 from sim2gp.models.forecast import Band, Forecast, forecast
 from sim2gp.models.grid import CURVE, PERIOD, Grid, steps_of
@@ -29,9 +29,14 @@ _TRACE_ROWS = np.arange(0, steps_of(TRACE) + 1, 5)
 _EVERY = 5  # of the windows, 0.1 s apart, are drawn
 
 
-def load(project: Project) -> tuple[Log, ...]:
-    """The project's logs; E160 for values fixed by group, which no fit takes yet."""
+def load(project: Project, *, strict: bool = False) -> tuple[Log, ...]:
+    """The project's logs; E160 for values fixed by group, which no fit takes yet.
+
+    ``strict``: every column is taken, or E105.
+    """
     logs = project.load_logs()
+    if strict:
+        none_unused(logs)
     for group, spec in enumerate(project.spec.logs):
         if spec.fixed:
             raise InputError(
