@@ -1,11 +1,9 @@
-"""The table of bad inputs: what an input is, and the bad logs among them (1 to 45).
+"""The table of bad inputs: what an input is, and how logs are spoilt.
 
 A case is a number, a title, and inputs; an input is made in a folder, and what its door
-must say is a code and some words. `bad_machines` holds the numbers from 46 on.
+must say is a code and some words. Here stands what the files of cases share.
 """
 
-import bz2
-import gzip
 import os
 import socket
 from collections.abc import Callable, Sequence
@@ -138,9 +136,7 @@ def log(
     return Input(code, named, make, summary)
 
 
-def stored(
-    name: str, write: Callable[[Path], object], code: str, *words: str
-) -> Input:
+def stored(name: str, write: Callable[[Path], object], code: str, *words: str) -> Input:
     """A file of any format that a project names, and that a function writes."""
 
     def make(folder: Path, patch: Patch) -> Sequence[str]:
@@ -162,7 +158,9 @@ DEGREES = renamed('x = "pos"\n"x.velocity" = "vel"\ntheta = "angle"', "") + (
     'theta = "pos"\n"theta.velocity" = "vel"\n'
 )
 BY_RUN = renamed('time = "t"', 'time = "t"\nepisode = "run"')
-COUNTS = renamed('x = "pos"\n"x.velocity" = "vel"', 'x = {column = "pos", scale = 1e-3}')
+COUNTS = renamed(
+    'x = "pos"\n"x.velocity" = "vel"', 'x = {column = "pos", scale = 1e-3}'
+)
 WRAPPED = np.angle(np.exp(1j * 9 * table()[:, 0]))
 
 

@@ -3,6 +3,7 @@
 import bz2
 import gzip
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,6 @@ from bad_inputs import (
     log,
     named,
     npz,
-    renamed,
     stored,
     swapped,
     table,
@@ -56,6 +56,27 @@ def in_two_files(folder: Path, patch: Patch) -> None:
     train, test = load_project(folder / "project.toml").load_logs()
     (note,) = shared_rows([train], [test])
     raise InputError(note.code, note.text, got="", expected="", fix="-")
+
+
+def misspelt(files: str, code: str, *said: str) -> Input:
+    """A project that names almost the file that is there."""
+
+    def make(folder: Path, patch: Patch) -> Sequence[str]:
+        (folder / "swing1.csv").write_text(TEXTS)
+        (folder / "project.toml").write_text(PROJECT.replace("*.csv", files))
+        return IDENTIFY
+
+    return Input(code, said, make)
+
+
+def words(command: str, code: str, *said: str) -> Input:
+    """A command beside a project."""
+
+    def make(folder: Path, patch: Patch) -> Sequence[str]:
+        (folder / "project.toml").write_text(PROJECT)
+        return command.split()
+
+    return Input(code, said, make)
 
 
 UNSTEADY = PERIOD * (np.arange(ROWS) + 0.2 * np.sin(np.arange(ROWS)))
@@ -348,6 +369,8 @@ FIRST: tuple[Case, ...] = (
         stored("a.csv", lambda path: path.symlink_to("gone"), "E130", "gone"),
         named("b.csv", "E130", "b.csv", "no such file"),
         named("*.cvs", "E130", "no file matches", "*.cvs"),
+        misspelt("swing.csv", "E130", "did you mean swing1.csv"),
+        words("identify projekt.toml", "E130", "did you mean project.toml"),
     ),
     # The user's own logs may lie anywhere; what a file itself names may not.
     case(
@@ -357,5 +380,3 @@ FIRST: tuple[Case, ...] = (
         stored("a.h5", bad.outside, "E131", "pos"),
     ),
 )
-
-

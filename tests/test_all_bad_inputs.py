@@ -1,23 +1,27 @@
 """The list of bad inputs, whole: each gets one line with its code and leaves nothing.
 
 Driven through the command that takes the input, in this process; through Python where
-no command does. What the numbers mean stands in `bad_logs` and `bad_machines`.
+no command does. The inputs stand in `bad_logs`, `bad_projects` and
+`bad_files`, what they share in `bad_inputs`.
 """
 
 import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 import stub_experiments
-from bad_inputs import Case, Input
+from bad_files import THIRD
+from bad_inputs import TEXTS, Case, Input, changed, log
 from bad_logs import FIRST
-from bad_machines import SECOND
+from bad_projects import SECOND
 from sim2gp.cli import main
 from sim2gp.errors import Sim2GPError
 
-CASES = (*FIRST, *SECOND)
+CASES = (*FIRST, *SECOND, *THIRD)
 LINE = re.compile(r"[EW]1\d\d \S.*(in|:) .*got .*expected .*\. Fix: .*\.")
 
 
@@ -103,3 +107,33 @@ def test_bad_input(
 def test_the_list_is_whole() -> None:
     assert [bad.number for bad in CASES] == [*range(1, 77)]
     assert all(bad.inputs for bad in CASES)
+
+
+def test_the_good_case_is_good(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What all inputs of a log are spoilt from is well, and nothing is said of it."""
+    monkeypatch.chdir(tmp_path)
+    good = log(TEXTS, "", n_transitions=299, warnings=0)
+    words = good.make(tmp_path, monkeypatch)
+    assert stated(good, [*(words or ())], capsys, monkeypatch) == ""
+
+
+def test_the_installed_command(tmp_path: Path) -> None:
+    """In a process of its own, as a user meets it."""
+    words = log(changed(7, 1, float("nan")), "E101").make(
+        tmp_path, pytest.MonkeyPatch()
+    )
+    before = contents(tmp_path)
+    call = "import sys; from sim2gp.cli import main; sys.exit(main(sys.argv[1:]))"
+    done = subprocess.run(
+        [sys.executable, "-c", call, *(words or ())],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+    )
+    assert done.returncode == 2, done.stderr
+    assert done.stdout == ""
+    assert done.stderr.startswith("E101 ")
+    assert done.stderr.count("\n") == 1
+    assert contents(tmp_path) == before

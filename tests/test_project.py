@@ -224,14 +224,8 @@ def test_faults_of_names_and_values(case: int, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "code"),
     [
-        ("# " + "x" * 1_000_001, "E161"),
-        ("a = " + "[" * 65 + "]" * 65, "E161"),
-        ("a = " + "[" * 100_000, "E161"),
         (".".join("a" * 70) + " = 1", "E161"),
-        ('system = "${env:HOME}"', "E162"),
-        ('system = "eval:print(1)"', "E162"),
-        ('[options]\n_target_ = "os.system"', "E162"),
-        ('system = "!!python/object:os"', "E162"),
+        ('system = "import:os"', "E162"),
         ("system = ", "E160"),
         ("{}", "E160"),
     ],

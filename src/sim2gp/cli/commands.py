@@ -155,32 +155,24 @@ class Evaluate(Reads):
 
     def run(self, progress: Progress) -> dict[str, Any]:
         name = self.run_or_project.stem
-        out = _out(self.out, f"evaluate-{name}")
+        how: dict[str, Any] = {
+            "horizon": self.horizon,
+            "out": _out(self.out, f"evaluate-{name}"),
+            "strict": self.strict,
+            "progress": progress,
+        }
         if self.run_or_project.suffix == ".toml":
             if self.logs:
                 got, fix = "--logs", "leave --logs out, or name a run"
                 expected = "no --logs with a project file: its own logs are left out"
                 raise usage_error("too many logs", got, expected, fix)
             _check_project(self.run_or_project)
-            return _experiment("evaluate", "leave_one_out")(
-                self.run_or_project,
-                horizon=self.horizon,
-                out=out,
-                strict=self.strict,
-                progress=progress,
-            )
+            return _experiment("evaluate", "leave_one_out")(self.run_or_project, **how)
         load_run(self.run_or_project)  # a folder that is no run fails before the work
         if not self.logs:
             expected, fix = "--logs FILE...", "name the logs to predict"
             raise usage_error("no logs", "no --logs", expected, fix)
-        return _experiment("evaluate")(
-            self.run_or_project,
-            list(self.logs),
-            horizon=self.horizon,
-            out=out,
-            strict=self.strict,
-            progress=progress,
-        )
+        return _experiment("evaluate")(self.run_or_project, list(self.logs), **how)
 
 
 @dataclass(kw_only=True)

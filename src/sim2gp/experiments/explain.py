@@ -98,9 +98,7 @@ def _data(run: Path, stored: Run, strict: bool = False) -> AbstractData:
     )
 
 
-def window_data(
-    project: Project, seed: int = 0, *, strict: bool = False
-) -> WindowData:
+def window_data(project: Project, seed: int = 0, *, strict: bool = False) -> WindowData:
     """A project's logs as windows; those of one second may share an error."""
     logs = load(project, strict=strict)
     windows, log = cut_logs(project, logs)

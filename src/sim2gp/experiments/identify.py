@@ -64,7 +64,8 @@ def run(
 ) -> dict[str, Any]:
     """Fit the logs of a project file and write the run; returns its summary.
 
-    ``strict`` refuses columns that nothing takes (E105). ``check`` holds Laplace's posterior against the exact one by importance sampling.
+    ``strict`` refuses columns that nothing takes (E105). ``check`` holds Laplace's
+    posterior against the exact one by importance sampling.
     """
     started = time.perf_counter()
     found = load_project(project)

@@ -75,7 +75,8 @@ def shown(path: Path) -> str:
 def kind_of(path: Path) -> str:
     """The format of a file or folder: "csv" or one of `SUFFIXES` and `FOLDERS`.
 
-    Raises `InputError` E115, E120, E126, E130, E180, E181 where name and content differ.
+    Raises `InputError` E115, E120, E126, E130, E180, E181 where name and content
+    differ.
     """
     _check_nul(path)
     if path.is_dir():

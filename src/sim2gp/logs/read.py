@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 
 from sim2gp.errors import InputError, nearest
 from sim2gp.logs import checks
+from sim2gp.logs.alignment import misaligned
 from sim2gp.logs.file import shown
 from sim2gp.logs.formats import BOOKKEEPING, TIME, Recording, recordings
 from sim2gp.logs.log import ChannelLike, Column, Log, Note
@@ -69,6 +70,7 @@ def read_log(
     limits: Mapping[str, tuple[float, float]] | None = None,
     fixed: Mapping[str, float] | None = None,
     group: int = 0,
+    longest_delay: float = 0.0,
 ) -> tuple[Log, ...]:
     """Read one file or folder into logs without gaps, episode by episode.
 
@@ -76,7 +78,8 @@ def read_log(
     "log"; ``period`` in s stands for it where rows are even; ``episode`` is a column of
     numbers. ``exclude`` lists intervals of the file's time in s; a log is cut around
     them. ``limits`` are end stops of states, in their units: samples there are masked.
-    ``keep_first`` drops further rows of the same stamp.
+    ``keep_first`` drops further rows of the same stamp. Commands that act within
+    ``longest_delay`` (s) of their rows are not called misaligned.
     Raises `InputError` with the codes of bad recordings (E101 to E141, E180, E182).
     """
     path = Path(path)
@@ -110,6 +113,8 @@ def read_log(
         logs += _assembled(recording, plan, called, dict(fixed or {}), group)
     if not logs:
         raise _too_short(shown(path), 1)
+    angles = [state.name for state in states if state.angle]
+    about += misaligned(max(logs, key=len), angles, longest_delay)
     return (replace(logs[0], notes=(*logs[0].notes, *about)), *logs[1:])
 
 

@@ -148,6 +148,7 @@ class Project:
             limits={name: (a, b) for name, (a, b) in self.spec.limits.items()},
             fixed=spec.fixed,
             group=group,
+            longest_delay=self.system.longest_delay,
         )
 
 

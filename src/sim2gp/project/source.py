@@ -97,7 +97,7 @@ def _yaml(name: str, bare: str) -> InputError | None:
         where=name,
         got="YAML, whose aliases and tags are not read",
         expected="TOML",
-        fix='write it as TOML: key = value, and [section] for a mapping',
+        fix="write it as TOML: key = value, and [section] for a mapping",
     )
 
 

@@ -29,9 +29,9 @@ _CHILD = os.path.join(os.path.dirname(__file__), "mjcf_child.py")
 def compiled(path: Path, root: Path | None = None) -> Any:
     """The model of an MJCF or URDF file.
 
-    Raises `InputError` E130 where there is no such file, E147 or E170 with MuJoCo's words where
-    it is no model, E171 where it names files outside ``root`` (its own folder) or
-    the parser crashed or took more than a minute.
+    Raises `InputError` E130 where there is no such file, E147 or E170 with MuJoCo's
+    words where it is no possible body or no model, E171 where it names files outside
+    ``root`` (its own folder) or the parser crashed or took more than a minute.
     """
     check_paths(path, path.parent if root is None else root)
     return compiled_all([path])[0]
