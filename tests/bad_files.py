@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 
 from bad_inputs import (
-    IDENTIFY,
+    MODEL,
     PROJECT,
     ROWS,
     TEXTS,
@@ -19,6 +18,7 @@ from bad_inputs import (
     Input,
     Patch,
     case,
+    model,
     npz,
     stored,
 )
@@ -27,32 +27,6 @@ from sim2gp.robot.policy import FORMAT, load_policy
 from sim2gp.runs import new_run
 
 # Models
-
-MODEL = """<mujoco><worldbody><body name="arm">
-  <joint name="hip" damping=".1"/>
-  <inertial pos="0 0 .1" mass="1" diaginertia="1 1 1"/>
-</body></worldbody><actuator><motor name="push" joint="hip"/></actuator></mujoco>
-"""
-LOGS = """[[logs]]
-files = ["a.csv"]
-time = "t"
-[logs.columns]
-hip = "pos"
-push = "cmd"
-"""
-
-
-def model(text: str, code: str, *said: str, more: str = "") -> Input:
-    """A project about a model's file."""
-
-    def make(folder: Path, patch: Patch) -> Sequence[str]:
-        pytest.importorskip("mujoco")
-        (folder / "arm.xml").write_text(text)
-        (folder / "a.csv").write_text(TEXTS)
-        (folder / "project.toml").write_text(f'system = "arm.xml"\n{LOGS}{more}')
-        return IDENTIFY
-
-    return Input(code, said, make)
 
 
 def crashing(folder: Path, patch: Patch) -> Sequence[str]:

@@ -268,3 +268,30 @@ def late(rows: int) -> np.ndarray:
     v -= v.mean()
     x = np.concatenate([[0.0], np.cumsum(PERIOD * 0.5 * (v[1:] + v[:-1]))])
     return np.stack([t, x, v, 0 * t, np.roll(u, rows)], axis=1)
+
+
+MODEL = """<mujoco><worldbody><body name="arm">
+  <joint name="hip" damping=".1"/>
+  <inertial pos="0 0 .1" mass="1" diaginertia="1 1 1"/>
+</body></worldbody><actuator><motor name="push" joint="hip"/></actuator></mujoco>
+"""
+LOGS = """[[logs]]
+files = ["a.csv"]
+time = "t"
+[logs.columns]
+hip = "pos"
+push = "cmd"
+"""
+
+
+def model(text: str, code: str, *said: str, more: str = "") -> Input:
+    """A project about a model's file."""
+
+    def make(folder: Path, patch: Patch) -> Sequence[str]:
+        pytest.importorskip("mujoco")
+        (folder / "arm.xml").write_text(text)
+        (folder / "a.csv").write_text(TEXTS)
+        (folder / "project.toml").write_text(f'system = "arm.xml"\n{LOGS}{more}')
+        return IDENTIFY
+
+    return Input(code, said, make)

@@ -11,10 +11,12 @@ import pytest
 from bad_inputs import (
     GOOD,
     IDENTIFY,
+    MODEL,
     Case,
     Input,
     Patch,
     case,
+    model,
     npz,
     renamed,
     stored,

@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float, Int
 
-from sim2gp.logs.log import Log, Note
+from sim2gp.logs.log import ChannelLike, Log, Note
 
 HALF_WIDTH = 0.02  # s, h
 REACH = 0.1  # s that commands are shifted by, at most, in rows at least NEAREST
@@ -30,11 +30,14 @@ EARLY = 0.85, 0.5  # k < 0: least R^2, and most of it at k = 0
 Values = Float[np.ndarray, " N"]
 
 
-def misaligned(log: Log, angles: Sequence[str], delay: float = 0.0) -> list[Note]:
+def misaligned(
+    log: Log, states: Sequence[ChannelLike], delay: float = 0.0
+) -> list[Note]:
     """Whether commands explain the motion best some rows from where they stand (W118).
 
-    ``angles`` are the channels that turn, ``delay`` (s) what the model may take up.
+    ``delay`` (s) is what the model may take up.
     """
+    angles = [state.name for state in states if state.angle]
     moved = {n: u for n, u in log.inputs.items() if np.ptp(u) > 0.0}
     joints = {
         n: q

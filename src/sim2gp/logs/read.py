@@ -78,8 +78,7 @@ def read_log(
     "log"; ``period`` in s stands for it where rows are even; ``episode`` is a column of
     numbers. ``exclude`` lists intervals of the file's time in s; a log is cut around
     them. ``limits`` are end stops of states, in their units: samples there are masked.
-    ``keep_first`` drops further rows of the same stamp. Commands that act within
-    ``longest_delay`` (s) of their rows are not called misaligned.
+    ``keep_first`` drops further rows of a stamp; a ``longest_delay`` is the model's.
     Raises `InputError` with the codes of bad recordings (E101 to E141, E180, E182).
     """
     path = Path(path)
@@ -113,8 +112,7 @@ def read_log(
         logs += _assembled(recording, plan, called, dict(fixed or {}), group)
     if not logs:
         raise _too_short(shown(path), 1)
-    angles = [state.name for state in states if state.angle]
-    about += misaligned(max(logs, key=len), angles, longest_delay)
+    about += misaligned(max(logs, key=len), states, longest_delay)
     return (replace(logs[0], notes=(*logs[0].notes, *about)), *logs[1:])
 
 
