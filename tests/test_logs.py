@@ -254,6 +254,17 @@ def test_shared_rows_are_counted(tmp_path: Path) -> None:
     assert shared_rows([train], [other]) == []
 
 
+def test_logs_that_begin_at_rest_share_no_rows(tmp_path: Path) -> None:
+    still, table = swing(), swing()
+    still[:50, 1:] = 0.0
+    table[:, 1:] = 0.5 * np.maximum(still[:, 1:], 0.0)
+    (train,) = read(write(tmp_path / "a.csv", still), {"q": Column("pos"), "u": 0.0})
+    (test,) = read(write(tmp_path / "b.csv", table), {"q": Column("pos"), "u": 0.0})
+    assert shared_rows([train], [test]) == []
+    (note,) = shared_rows([train], [train])
+    assert note.text.startswith("350 rows")
+
+
 def test_period_of_one_step_likelihoods(tmp_path: Path) -> None:
     (log,) = read(write(tmp_path / "a.csv", swing()))
     period_matches(log, 0.01)
