@@ -241,7 +241,7 @@ THIRD: tuple[Case, ...] = (
     ),
     case(
         76,
-        "run that is not as it was",
+        "run that was changed",
         run(flipped, "E183", "arrays.npz", "another checksum"),
         run(newer, "E185", "got 99", "at most 1"),
         run(fixed_since, "E184", "project.toml", "expected cart_mass"),

@@ -95,7 +95,7 @@ INPUTS = (
         "experiments/identify.py",
         "    if now == fitted:",
         "    if True:",
-        (TESTS, "run and not"),
+        (TESTS, "changed"),
     ),
     Mutant(
         "inputs: a policy may be NaN",
