@@ -152,21 +152,21 @@ LOGS = (
         HDF5,
         "if dataset.external or dataset.is_virtual:",
         "if dataset.is_virtual:",
-        ("test_bad_formats.py", "bad_hdf5"),
+        ("test_all_bad_inputs.py", "outside"),
     ),
     Mutant(
         "npz: headers are believed",
         NPZ,
         "if claimed != info.file_size - start:",
         "if False:",
-        ("test_bad_formats.py", "bad_archive"),
+        ("test_all_bad_inputs.py", "header"),
     ),
     Mutant(
         "npz: entries may leave the archive",
         NPZ,
         'or ".." in path.parts',
         "",
-        ("test_bad_formats.py", "bad_archive"),
+        ("test_all_bad_inputs.py", "archive"),
     ),
     Mutant(
         "npz: arrays by columns are read by rows",
@@ -180,7 +180,7 @@ LOGS = (
         FILE,
         "if declared > MAX_BYTES or bomb:",
         "if False:",
-        ("test_bad_formats.py", "unpacked or declares"),
+        ("test_bad_formats.py", "unpacked"),
     ),
     Mutant(
         "files: a file may change while it is read",
@@ -201,6 +201,6 @@ LOGS = (
         PARQUET,
         "page_checksum_verification=True",
         "page_checksum_verification=False",
-        ("test_bad_formats.py", "bad_parquet"),
+        ("test_all_bad_inputs.py", "corrupt"),
     ),
 )

@@ -20,6 +20,7 @@ from mutant_descent import DESCENTS
 from mutant_design import DESIGN
 from mutant_draft import FIRST_DRAFT
 from mutant_exploring import EXPLORING
+from mutant_inputs import INPUTS
 from mutant_interop import INTEROP
 from mutant_intervals import INTERVALS
 from mutant_list import MUTANTS as PHYSICS
@@ -43,6 +44,7 @@ MUTANTS = (
     *OFF_POLICY,
     *ON_THE_HOST,
     *LOGS,
+    *INPUTS,
     *INTEROP,
     *INTERVALS,
     *CONFIGURATIONS,

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from sim2gp.experiments.prediction import load
 from sim2gp.project import load_project
 from sim2gp.runs import Progress, new_run
 
@@ -33,10 +34,11 @@ def identify(
     progress: Progress,
     check: bool = False,
     held_out: bool = True,
+    strict: bool = False,
 ) -> dict[str, Any]:
     """Everything of an identification that reads input, and no fit."""
     found = load_project(project)
-    logs = found.load_logs()
+    logs = load(found, strict=strict)
     summary = {
         "n_transitions": sum(len(log) - 1 for log in logs),
         "parameters": {p.name: {"sd": p.sd} for p in found.system.parameters.free},

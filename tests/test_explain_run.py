@@ -123,7 +123,10 @@ def test_the_command_line_hands_on(
 ) -> None:
     monkeypatch.chdir(tmp_path)
 
-    def told(path: Path, *, add: bool, out: Path, progress: Progress) -> dict[str, Any]:
+    def told(
+        path: Path, *, add: bool, out: Path, strict: bool, progress: Progress
+    ) -> dict[str, Any]:
+        assert not strict
         return {"path": str(path), "add": add, "out": str(out), "answer": "missing"}
 
     stub_experiments.install(monkeypatch, explain=told)

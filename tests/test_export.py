@@ -125,13 +125,11 @@ def test_what_is_no_policy_is_refused(folder: Path, tmp_path: Path) -> None:
     arrays = found.arrays
     newer = written("newer", about | {"format": 2}, arrays)
     few = {k: v for k, v in arrays.items() if k != "biases/1"}
-    bad = arrays | {"scale": arrays["scale"] * np.float32("nan")}
     wide = arrays | {"scale": arrays["scale"].astype(float)}
     for place, got in (
         (newer, "another format"),
         (written("few", about, few), "biases/1"),
-        (written("bad", about, bad), "not finite float32"),
-        (written("wide", about, wide), "not finite float32"),
+        (written("wide", about, wide), "float64"),
     ):
         with pytest.raises(InputError, match=f"E133.*{got}"):
             load_policy(place)

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from sim2gp.gaussian import Gaussian, log_det_factor, lower_factor
+from sim2gp.errors import InputError
+from sim2gp.gaussian import (
+    Gaussian,
+    from_covariance,
+    log_det_factor,
+    lower_factor,
+)
 
 RNG = np.random.default_rng(0)
 MEAN = RNG.standard_normal(3)
@@ -93,3 +99,29 @@ def test_single_precision_stays_single():
         x = Gaussian(jnp.zeros(2), jnp.eye(2))
         for leaf in (x.sample(jax.random.key(0)), x.covariance(), x.entropy()):
             assert leaf.dtype == jnp.float32
+
+
+def test_a_covariance_of_another_tool():
+    """The same covariance, of full rank or not, in any units; or E143."""
+    rng = np.random.default_rng(0)
+    for rank in (4, 2):
+        root = rng.standard_normal((4, rank)) * np.asarray(
+            [[1e-9], [1.0], [1e3], [2.0]]
+        )
+        given = from_covariance(np.arange(4.0), root @ root.T)
+        np.testing.assert_array_equal(given.mean, np.arange(4.0))
+        sd = np.sqrt(np.diag(root @ root.T))
+        wrong = (np.asarray(given.covariance()) - root @ root.T) / np.outer(sd, sd)
+        assert np.abs(wrong).max() < 1e-14
+    fixed = from_covariance(np.zeros(2), np.diag([0.0, 4.0]))
+    np.testing.assert_allclose(fixed.sd(), [0.0, 2.0], atol=1e-15)
+    for matrix, where in (
+        (np.diag([1.0, -1e-6]), "length"),
+        (np.asarray([[1.0, np.nan], [np.nan, 1.0]]), "mass, length"),
+        (np.asarray([[1.0, 1.1], [1.1, 1.0]]), "eigenvalue of -0.1"),
+        (np.asarray([[0.0, 0.5], [0.5, 1.0]]), "eigenvalue"),
+    ):
+        with pytest.raises(InputError, match=f"E143 .*{where}"):
+            from_covariance(np.zeros(2), matrix, ("mass", "length"))
+    with pytest.raises(InputError, match=r"E143 .*mean nan"):
+        from_covariance(np.asarray([0.0, np.nan]), np.eye(2))

@@ -230,13 +230,13 @@ def test_any_file_is_resampled_on_demand(tmp_path: Path) -> None:
     rec.write_csv(tmp_path / "a.csv", table)
     columns = {"q": Column("q"), "u": Column("u")}
     (log,) = read(tmp_path / "a.csv", columns)
-    assert codes(log) == ["W110"]
+    assert codes(log) == ["W110", "W105"]
     assert "resample = {period = 0.013}" in log.notes[0].text
     (log,) = read(tmp_path / "a.csv", columns, resample=Resample(period=0.01))
     np.testing.assert_allclose(np.diff(log.time), 0.01, rtol=1e-12)
     expected = np.interp(log.time, table[:, 0], table[:, 1])
     np.testing.assert_allclose(log.channels["q"], expected, atol=1e-12)
-    assert codes(log) == ["W110", "W153"]
+    assert codes(log) == ["W110", "W153", "W105"]
 
 
 def headed(

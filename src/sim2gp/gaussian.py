@@ -5,11 +5,15 @@ may be any matrix ``(n, k)``: positive semidefinite by construction, never a cov
 that must be proved positive, and no jitter anywhere.
 """
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from sim2gp.errors import InputError
 from sim2gp.linalg import solve_triangular, triangular
 from sim2gp.types import Key, Scalar
 
@@ -76,6 +80,46 @@ class Gaussian(eqx.Module):
         e = solve_triangular(L1, self.mean - other.mean, lower=True)
         quadratic = jnp.sum(A**2) + e @ e - e.size
         return 0.5 * quadratic + log_det_factor(L1) - log_det_factor(L0)
+
+
+def from_covariance(
+    mean: Float[np.ndarray, " n"],
+    covariance: Float[np.ndarray, "n n"],
+    names: Sequence[str] = (),
+) -> Gaussian:
+    """The Gaussian of a covariance that another tool made; call it under `in_float64`.
+
+    ``names`` of the coordinates go into the message. Raises `InputError` E143 where the
+    matrix is no covariance, beyond the rounding of its own numbers.
+    """
+    diagonal = np.diag(covariance)
+    unit = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    scaled = covariance / np.outer(unit, unit)
+    slack = 16 * len(mean) * np.finfo(covariance.dtype).eps
+    where = list(names) or [f"coordinate {i}" for i in range(len(mean))]
+    bad = ~np.isfinite(scaled) | (np.abs(scaled - scaled.T) > slack)
+    if bad.any() or not np.isfinite(mean).all():
+        i, j = np.argwhere(bad)[0] if bad.any() else [np.argmin(np.isfinite(mean))] * 2
+        got = f"{covariance[i, j]:g} and {covariance[j, i]:g}, mean {mean[i]:g}"
+        raise _no_covariance(f"{where[i]}, {where[j]}", got, "a symmetric matrix")
+    values, vectors = np.linalg.eigh(scaled)
+    if values[0] < -slack:
+        i = int(np.argmax(np.abs(vectors[:, 0])))
+        got = f"a smallest eigenvalue of {values[0]:.3g}, of the correlations"
+        raise _no_covariance(where[i], got, "none below zero")
+    scale = unit[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+    return Gaussian(jnp.asarray(mean), jnp.asarray(scale))
+
+
+def _no_covariance(where: str, got: str, expected: str) -> InputError:
+    return InputError(
+        "E143",
+        "not a covariance",
+        where=where,
+        got=got,
+        expected=expected,
+        fix="give the matrix with all its digits, or a Gaussian with a scale",
+    )
 
 
 def lower_factor(scale: Float[Array, "n k"]) -> Float[Array, "n n"]:

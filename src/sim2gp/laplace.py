@@ -196,6 +196,7 @@ class Fit(eqx.Module):
                 "no parameter reaches the data",
                 where=where,
                 got=f"zero sensitivity to {', '.join(dead)}",
+                expected="data that depend on one of them at least",
                 fix="check the columns, the excitation and what is fixed",
             )
         if status == STALLED:

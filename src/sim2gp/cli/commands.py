@@ -56,6 +56,14 @@ class Chosen(Common):
 
 
 @dataclass(kw_only=True)
+class Reads(Writes):
+    """Options of a command that reads logs."""
+
+    strict: bool = False
+    """Refuse logs with columns that nothing takes."""
+
+
+@dataclass(kw_only=True)
 class Demo(Writes):
     """Learn to swing up a pendulum whose constants are unknown, in a few trials."""
 
@@ -119,7 +127,7 @@ class Init(Common):
 
 
 @dataclass(kw_only=True)
-class Identify(Writes):
+class Identify(Reads):
     """Posterior of a machine's constants from its logs."""
 
     project: Positional[Path]
@@ -140,12 +148,13 @@ class Identify(Writes):
             seed=self.seed,
             check=self.check,
             held_out=not self.quick,
+            strict=self.strict,
             progress=progress,
         )
 
 
 @dataclass(kw_only=True)
-class Evaluate(Writes, Chosen):
+class Evaluate(Reads, Chosen):
     """Prediction of logs that a fit has not seen."""
 
     run_or_project: Annotated[Positional[Path], arg(metavar="RUN|PROJECT")]
@@ -157,7 +166,12 @@ class Evaluate(Writes, Chosen):
 
     def run(self, progress: Progress) -> dict[str, Any]:
         name = self.run_or_project.stem
-        out = _out(self.out, f"evaluate-{name}")
+        how: dict[str, Any] = {
+            "horizon": self.horizon,
+            "out": _out(self.out, f"evaluate-{name}"),
+            "strict": self.strict,
+            "progress": progress,
+        }
         if self.run_or_project.suffix == ".toml":
             for option in ("logs", "configuration"):
                 if getattr(self, option):
@@ -165,25 +179,17 @@ class Evaluate(Writes, Chosen):
                     expected = "a project file alone: its own logs are left out"
                     raise usage_error("too much", f"--{option}", expected, fix)
             _check_project(self.run_or_project)
-            return _experiment("evaluate", "leave_one_out")(
-                self.run_or_project, horizon=self.horizon, out=out, progress=progress
-            )
+            return _experiment("evaluate", "leave_one_out")(self.run_or_project, **how)
         load_run(self.run_or_project)  # a folder that is no run fails before the work
         if not self.logs:
             expected, fix = "--logs FILE...", "name the logs to predict"
             raise usage_error("no logs", "no --logs", expected, fix)
-        return _experiment("evaluate")(
-            self.run_or_project,
-            list(self.logs),
-            horizon=self.horizon,
-            configuration=self.configuration,
-            out=out,
-            progress=progress,
-        )
+        how["configuration"] = self.configuration
+        return _experiment("evaluate")(self.run_or_project, list(self.logs), **how)
 
 
 @dataclass(kw_only=True)
-class Explain(Writes):
+class Explain(Reads):
     """What physics a simulator lacks: nothing, an effect, or none of these."""
 
     path: Annotated[Positional[Path], arg(metavar="RUN")]
@@ -195,12 +201,12 @@ class Explain(Writes):
         out = _out(self.out, f"explain-{self.path.name}")
         load_run(self.path)  # a folder that is no run fails before the work
         return _experiment("explain")(
-            self.path, add=self.add, out=out, progress=progress
+            self.path, add=self.add, out=out, strict=self.strict, progress=progress
         )
 
 
 @dataclass(kw_only=True)
-class Compare(Writes):
+class Compare(Reads):
     """Which model the logs support: simulator, residual, function space, black box."""
 
     project: Positional[Path]
@@ -218,6 +224,7 @@ class Compare(Writes):
             horizons=self.horizon,
             out=out,
             seed=self.seed,
+            strict=self.strict,
             progress=progress,
         )
 

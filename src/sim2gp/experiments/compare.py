@@ -90,6 +90,7 @@ def run(
     progress: Progress,
     horizons: Sequence[float] = HORIZONS,
     models: Makers = MODELS,
+    strict: bool = False,
 ) -> dict[str, Any]:
     """Fit, train and judge all models fold by fold; writes and returns the summary.
 
@@ -99,7 +100,7 @@ def run(
     for horizon in horizons:
         check_horizon(horizon)
     found = load_project(project)
-    setup, folds = prepare(found, load(found), horizons)
+    setup, folds = prepare(found, load(found, strict=strict), horizons)
     total = len(folds) * len(models) + 1
     with new_run(out, "compare") as writer, progress.task("compare", total) as task:
         key = jax.random.key(seed)

@@ -38,7 +38,7 @@ from sim2gp.experiments.prediction import (
 )
 from sim2gp.experiments.record import command, provenance
 from sim2gp.gaussian import Gaussian
-from sim2gp.logs import Log
+from sim2gp.logs import Log, none_unused, shared_rows
 from sim2gp.models.forecast import forecast
 from sim2gp.models.grid import CURVE, Grid, evaluation_windows, steps_of
 from sim2gp.models.windows import Windows
@@ -55,6 +55,7 @@ def run(
     out: Path,
     progress: Progress,
     configuration: str | None = None,
+    strict: bool = False,
 ) -> dict[str, Any]:
     """Predict ``logs`` by an identify run; writes and returns the summary.
 
@@ -66,6 +67,8 @@ def run(
     found, system = fit.project, fit.project.system
     index_of(configuration, system.parameters.configurations)
     tested = found.read_logs(logs, configuration)
+    if strict:
+        none_unused(tested)
     with new_run(out, "evaluate") as writer, progress.task("evaluate", 2) as task:
         rows, longest = rows_for(horizon), max(horizon, CURVE[-1])
         grid = windows_for(tested, found, longest, horizon)
@@ -83,7 +86,8 @@ def run(
         arrays |= shares
         picture = drawn(system, fit.posterior, fit.band, grid)
         arrays |= trace_arrays(picture, grid, tested, names)
-        notes = [str(note) for log in tested for note in log.notes]
+        notes = _said(tested)
+        notes += [str(note) for note in shared_rows(train or (), tested)]
         if train is None:
             notes.append("the training logs were not found: no regression beside")
         about, moves = film(
@@ -107,13 +111,18 @@ def run(
 
 
 def leave_one_out(
-    project: Path, *, horizon: float, out: Path, progress: Progress
+    project: Path,
+    *,
+    horizon: float,
+    out: Path,
+    progress: Progress,
+    strict: bool = False,
 ) -> dict[str, Any]:
     """Fit all recordings but one, predict that one, in turn; writes the summary."""
     started = time.perf_counter()
     check_horizon(horizon)
     found = load_project(project)
-    logs = found.load_logs()
+    logs = found.load_logs(strict=strict)
     files = list(dict.fromkeys(recordings(logs)))
     if len(files) < 2:
         raise InputError(
@@ -147,7 +156,7 @@ def leave_one_out(
             "command": "evaluate",
             "title": f"{found.name}: each log predicted by a fit of the others",
             "folds": len(files),
-            "warnings": [str(note) for log in logs for note in log.notes],
+            "warnings": [*_said(logs), *_repeated(logs, files)],
         }
         asked = "--horizon", f"{horizon:g}", "--out", out
         line = command("sim2gp", "evaluate", project, *asked)
@@ -214,6 +223,20 @@ def windows_for(
         expected=f"an unmasked stretch longer than the horizon of {horizon:g} s",
         fix="shorten --horizon, or record longer",
     )
+
+
+def _said(logs: Sequence[Log]) -> list[str]:
+    return [str(note) for log in logs for note in log.notes]
+
+
+def _repeated(logs: Sequence[Log], files: Sequence[str]) -> list[str]:
+    """Rows that a fold both learns from and is judged by (W128)."""
+    sets = [[log for log in logs if log.source == file] for file in files]
+    notes = []
+    for i, tested in enumerate(sets):
+        others = [log for group in sets[:i] + sets[i + 1 :] for log in group]
+        notes += [str(note) for note in shared_rows(others, tested)]
+    return notes
 
 
 def _training(

@@ -28,7 +28,9 @@ from sim2gp.tasks import MACHINES
 SHARED_SECOND = 1.0  # s of windows whose errors may be correlated
 
 
-def run(run: Path, *, add: bool, out: Path, progress: Progress) -> dict[str, Any]:
+def run(
+    run: Path, *, add: bool, out: Path, progress: Progress, strict: bool = False
+) -> dict[str, Any]:
     """Search what the run's machine lacks, write and return the summary.
 
     ``add`` writes the winner into the project file. Raises `InputError` E130 for a run
@@ -37,7 +39,7 @@ def run(run: Path, *, add: bool, out: Path, progress: Progress) -> dict[str, Any
     started = time.perf_counter()
     stored = load_run(run)
     file = _project_file(run, stored, add)
-    data = _data(run, stored)
+    data = _data(run, stored, strict)
     with new_run(out, "explain") as writer, progress.task("explain", 5) as task:
         found = explain(data, on_step=task.advance)
         candidates = candidate_rows(found)
@@ -79,10 +81,11 @@ def run(run: Path, *, add: bool, out: Path, progress: Progress) -> dict[str, Any
     return summary
 
 
-def _data(run: Path, stored: Run) -> AbstractData:
+def _data(run: Path, stored: Run, strict: bool = False) -> AbstractData:
     """The rows of a run, with their likelihood."""
     if (run / PROJECT).exists():
-        return window_data(_project(run, stored), int(stored.summary.get("seed", 0)))
+        seed = int(stored.summary.get("seed", 0))
+        return window_data(_project(run, stored), seed, strict=strict)
     if "animation/state" in stored.arrays and "machine" in stored.summary:
         return _flown(stored)
     raise InputError(
@@ -95,9 +98,9 @@ def _data(run: Path, stored: Run) -> AbstractData:
     )
 
 
-def window_data(project: Project, seed: int = 0) -> WindowData:
+def window_data(project: Project, seed: int = 0, *, strict: bool = False) -> WindowData:
     """A project's logs as windows; those of one second may share an error."""
-    logs = load(project)
+    logs = load(project, strict=strict)
     windows, log = cut_logs(project, logs)
     span = max(project.spec.likelihood.window, 1e-9)
     first = np.concatenate([[0], np.flatnonzero(np.diff(log)) + 1])

@@ -64,15 +64,17 @@ def run(
     progress: Progress,
     check: bool = False,
     held_out: bool = True,
+    strict: bool = False,
 ) -> dict[str, Any]:
     """Fit the logs of a project file and write the run; returns its summary.
 
     ``check`` holds Laplace's posterior against the exact one by importance sampling;
-    ``held_out`` fits once more without some of the data, and forecasts those.
+    ``held_out`` fits once more without some of the data, and forecasts those;
+    ``strict`` refuses columns that nothing takes (E105).
     """
     started = time.perf_counter()
     found = load_project(project)
-    logs = found.load_logs()
+    logs = found.load_logs(strict=strict)
     with new_run(out, "identify") as writer, progress.task("identify", 4) as task:
         windows, places = cut_places(found, logs)
         of = np.asarray([k for k, _ in places])
@@ -206,7 +208,7 @@ def project_of(run: Path, stored: Run, model: Path | None = None) -> Project:
 
 @in_float64
 def restored(run: Path) -> Identified:
-    """What `run` wrote; E130 for a folder that is not an identification."""
+    """What `run` wrote (E130 for another folder, E184 for other constants)."""
     stored = load_run(run)
     if "belief/mean" not in stored.arrays or not (run / PROJECT).exists():
         raise InputError(
@@ -219,6 +221,7 @@ def restored(run: Path) -> Identified:
         )
     x, noise = stored.arrays, stored.summary["noise"]
     project = project_of(run, stored)
+    _check_constants(run, project, stored.summary)
     _check_fitted(project, x)
     return Identified(
         project,
@@ -235,6 +238,21 @@ def restored(run: Path) -> Identified:
             x["band/shape"],
             float(x["band/inflation"]),
         ),
+    )
+
+
+def _check_constants(run: Path, project: Project, summary: dict[str, Any]) -> None:
+    """The run's copy of its project still opens the constants that it holds (E184)."""
+    now, fitted = project.system.parameters.names, tuple(summary["parameters"])
+    if now == fitted:
+        return
+    raise InputError(
+        "E184",
+        "another set of constants than was fitted",
+        where=str(run / PROJECT),
+        got=", ".join(n for n in now if n not in fitted) or ", ".join(now),
+        expected=", ".join(n for n in fitted if n not in now) or ", ".join(fitted),
+        fix="identify again, or take back the change of the run's project file",
     )
 
 

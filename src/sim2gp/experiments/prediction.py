@@ -29,7 +29,7 @@ _TRACE_ROWS = np.arange(0, steps_of(TRACE) + 1, 5)
 _EVERY = 5  # of the windows, 0.1 s apart, are drawn
 
 
-def load(project: Project) -> tuple[Log, ...]:
+def load(project: Project, *, strict: bool = False) -> tuple[Log, ...]:
     """The logs of a project whose machine has one configuration (else E160)."""
     for group, spec in enumerate(project.spec.logs):
         if spec.fixed or spec.free:
@@ -41,7 +41,7 @@ def load(project: Project) -> tuple[Log, ...]:
                 expected="the same constants in all groups",
                 fix="write a project file of one configuration's logs",
             )
-    return project.load_logs()
+    return project.load_logs(strict=strict)
 
 
 def cut_logs(project: Project, logs: Sequence[Log]) -> tuple[Windows, np.ndarray]:

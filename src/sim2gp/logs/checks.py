@@ -171,7 +171,8 @@ def sentinels(values: Values, name: str, rows: Rows) -> tuple[Mask, list[Note]]:
             expected="measurements in at least 99 % of the rows",
             fix="exclude those times or record again",
         )
-    text = f"{values[first]:g} means no value at {where}: {bad.sum()} samples masked"
+    masked = f"{bad.sum()} samples ({100 * share:.2g} %) masked"
+    text = f"{values[first]:g} means no value at {where}: {masked}"
     return bad, [Note("W102", text)]
 
 
@@ -283,12 +284,41 @@ def excitation(
     return notes
 
 
+def unused(names: Sequence[str], source: str) -> list[Note]:
+    """Columns of a file that nothing takes: perhaps one was forgotten (W105)."""
+    if not names:
+        return []
+    text = ", ".join(names)
+    text = text if len(text) <= 200 else f"{text[:197].rsplit(', ', 1)[0]}, ..."
+    return [Note("W105", f"columns of {source} that nothing takes: {text}")]
+
+
+def none_unused(logs: Sequence[Log]) -> None:
+    """Whoever is strict takes every column (E105)."""
+    for log in logs:
+        for note in log.notes:
+            if note.code == "W105":
+                raise InputError(
+                    "E105",
+                    "columns that nothing takes",
+                    where=log.source,
+                    got=note.text.split(": ", 1)[1],
+                    expected="every column to be a channel's, as --strict says",
+                    fix="name them in the project's columns, or remove them",
+                )
+
+
 def shared_rows(train: Sequence[Log], test: Sequence[Log]) -> list[Note]:
-    """Rows that stand in both sets: a test on them proves nothing (W128)."""
+    """Rows that stand in both sets: a test on them proves nothing (W128).
+
+    Rows at rest, alike in every log that begins with them, do not count.
+    """
 
     def rows_of(log: Log) -> set[bytes]:
         parts = [log.time, *log.channels.values(), *log.inputs.values()]
-        return {row.tobytes() for row in np.stack(parts, axis=1)}
+        rows = np.stack(parts, axis=1)
+        moved = np.any(np.diff(rows[:, 1:], axis=0) != 0.0, axis=1)
+        return {row.tobytes() for row in rows[np.concatenate([moved[:1], moved])]}
 
     known = set().union(*(rows_of(log) for log in train)) if train else set()
     notes = []

@@ -46,7 +46,7 @@ MAGIC = {
 }
 COMPRESSED = (b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"PK\x03\x04", b"\x28\xb5\x2f\xfd")
 _PICKLES = (".pkl", ".pickle", ".pt", ".pth", ".ckpt", ".joblib")
-_PICKLED = tuple(bytes([0x80, protocol]) for protocol in range(2, 6))
+PICKLED = tuple(bytes([0x80, protocol]) for protocol in range(2, 6))
 #: What parsers of other projects raise on bytes that they did not expect.
 FAULTS = (
     ArithmeticError,
@@ -75,7 +75,8 @@ def shown(path: Path) -> str:
 def kind_of(path: Path) -> str:
     """The format of a file or folder: "csv" or one of `SUFFIXES` and `FOLDERS`.
 
-    Raises `InputError` E115, E120, E126, E130, E180 where name and content differ.
+    Raises `InputError` E115, E120, E126, E130, E180, E181 where name and content
+    differ.
     """
     _check_nul(path)
     if path.is_dir():
@@ -85,6 +86,9 @@ def kind_of(path: Path) -> str:
         raise _not_a_file(shown(path), stat.S_IFDIR)
     if path.suffix.lower() in _PICKLES:
         raise pickled(shown(path), path.suffix)
+    if path.suffix.lower() == ".safetensors":
+        with steady(path), path.open("rb") as file:
+            raise _tensors(file.read(16), shown(path))
     kind = SUFFIXES.get(path.suffix.lower(), "csv")
     if kind != "csv":
         with steady(path), path.open("rb") as file:
@@ -104,7 +108,7 @@ def _check_magic(first: bytes, kind: str, where: str) -> None:
             expected=f"a recording as {kind}",
             fix="record the log again",
         )
-    if first.startswith(_PICKLED):
+    if first.startswith(PICKLED):
         raise pickled(where, "a pickle")
     if first.startswith(COMPRESSED) and not first.startswith(MAGIC["npz"]):
         raise compressed(where, first)
@@ -116,6 +120,20 @@ def _check_magic(first: bytes, kind: str, where: str) -> None:
         got=f"the first bytes of {other[0]}" if other else f"first bytes {first[:4]!r}",
         expected=f"first bytes {MAGIC[kind][:6]!r}",
         fix="rename the file, or record it again",
+    )
+
+
+def _tensors(first: bytes, where: str) -> InputError:
+    """E181: no header of a format that nothing here writes is believed."""
+    if first.startswith((*PICKLED, MAGIC["npz"])):  # as PyTorch saves objects
+        return pickled(where, "a pickle")
+    return InputError(
+        "E181",
+        "safetensors file refused",
+        where=where,
+        got=f"first bytes {first[:8].hex() or 'none'}",
+        expected="a recording: " + ", ".join(["CSV", *MAGIC]),
+        fix="save the arrays with numpy.savez",
     )
 
 

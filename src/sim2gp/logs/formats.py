@@ -23,6 +23,8 @@ from sim2gp.logs.table import Table, read_table
 
 BAGS = ("rosbag1", "rosbag2", "mcap")
 CLOCKS = ("header", "log")  # what ``time`` may be in a bag
+#: What LeRobot numbers its rows by.
+BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 TIME = "time"  # the column of time, where nothing else is said
 
 

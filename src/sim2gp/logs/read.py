@@ -17,8 +17,9 @@ from jaxtyping import Bool, Float
 
 from sim2gp.errors import InputError, nearest
 from sim2gp.logs import checks
+from sim2gp.logs.alignment import misaligned
 from sim2gp.logs.file import shown
-from sim2gp.logs.formats import TIME, Recording, recordings
+from sim2gp.logs.formats import BOOKKEEPING, TIME, Recording, recordings
 from sim2gp.logs.log import ChannelLike, Column, Log, Note
 from sim2gp.logs.resample import Resample, Track, joined
 from sim2gp.logs.table import Rows, Table
@@ -69,6 +70,7 @@ def read_log(
     limits: Mapping[str, tuple[float, float]] | None = None,
     fixed: Mapping[str, float] | None = None,
     group: int = 0,
+    longest_delay: float = 0.0,
 ) -> tuple[Log, ...]:
     """Read one file or folder into logs without gaps, episode by episode.
 
@@ -76,7 +78,7 @@ def read_log(
     "log"; ``period`` in s stands for it where rows are even; ``episode`` is a column of
     numbers. ``exclude`` lists intervals of the file's time in s; a log is cut around
     them. ``limits`` are end stops of states, in their units: samples there are masked.
-    ``keep_first`` drops further rows of the same stamp.
+    ``keep_first`` drops further rows of a stamp; a ``longest_delay`` is the model's.
     Raises `InputError` with the codes of bad recordings (E101 to E141, E180, E182).
     """
     path = Path(path)
@@ -100,17 +102,18 @@ def read_log(
     found = recordings(path, wanted, time=named, period=period, episode=episode)
     name = path.name if path.is_dir() else path.stem
     logs: list[Log] = []
-    short: list[Note] = []
+    about = checks.unused(_left(found[0].tables), shown(path))
     for recording in found:
         if len(found) > 1 and min(len(t.rows.numbers) for t in recording.tables) < 2:
             text = f"episode {recording.episode} of {shown(path)} has one row"
-            short.append(Note("W116", f"{text}: it is left out"))
+            about.append(Note("W116", f"{text}: it is left out"))
             continue
         called = f"{name}[{recording.episode}]" if recording.episode else name
         logs += _assembled(recording, plan, called, dict(fixed or {}), group)
     if not logs:
         raise _too_short(shown(path), 1)
-    return (replace(logs[0], notes=(*logs[0].notes, *short)), *logs[1:])
+    about += misaligned(max(logs, key=len), states, longest_delay)
+    return (replace(logs[0], notes=(*logs[0].notes, *about)), *logs[1:])
 
 
 def _assembled(
@@ -146,6 +149,19 @@ def _assembled(
         tuple(notes),
     )  # fmt: skip
     return _cut(log, whole.cuts, whole.rows)
+
+
+def _left(tables: Sequence[Table]) -> list[str]:
+    """The columns that were not read, but for a format's own.
+
+    A message of a bag has the fields of its type, whoever needs them.
+    """
+    return [
+        name
+        for table in tables
+        for name in table.header
+        if name and not table.stream and name not in {*table.columns, *BOOKKEEPING}
+    ]
 
 
 def _track(table: Table, plan: _Plan) -> Track:

@@ -16,10 +16,18 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sim2gp.errors import InputError, nearest
-from sim2gp.logs.file import COMPRESSED, MAGIC, compressed, read_bytes, shown
+from sim2gp.logs.file import (
+    COMPRESSED,
+    MAGIC,
+    PICKLED,
+    compressed,
+    pickled,
+    read_bytes,
+    shown,
+)
 from sim2gp.logs.log import Note
 
-_BINARY = (*(m for k, m in MAGIC.items() if k != "npz"), b"\x93NUMPY", b"\x80")
+_BINARY = (*(m for k, m in MAGIC.items() if k != "npz"), b"\x93NUMPY")
 _DATE = re.compile(
     r"\d{4}-\d\d-\d\d|\d{1,2}:\d\d(:\d\d)?|\d{1,2}[/.]\d{1,2}[/.]\d{2,4}"
 )
@@ -66,6 +74,8 @@ class Table:
 
 def decode(content: bytes, where: str) -> str:
     """Bytes to text: UTF-8 with or without a byte-order mark, no NUL bytes (E120)."""
+    if content.startswith(PICKLED):
+        raise pickled(where, "a pickle")
     if content.startswith(COMPRESSED):
         raise compressed(where, content)
     nul = content.find(b"\x00")

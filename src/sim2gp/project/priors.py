@@ -13,6 +13,8 @@ from sim2gp.errors import InputError
 from sim2gp.parameters import BOX_SD, Parameter, prior_from_moments
 from sim2gp.project.schema import PriorSpec
 
+_MATTER = {"kg": "mass", "kg m^2": "inertia"}
+
 
 def located(error: InputError, where: str) -> InputError:
     """The same error with its place in the file."""
@@ -29,6 +31,7 @@ def located(error: InputError, where: str) -> InputError:
 def prior(spec: PriorSpec | float, base: Parameter, where: str) -> Parameter | float:
     """The prior, or the fixed value, that a table of the file states (E141 to E144)."""
     if not isinstance(spec, PriorSpec):
+        _check_matter(float(spec), base, where)
         return float(spec)
     if spec.relative_sd is not None:
         spec = _absolute(spec, spec.relative_sd, base, where)
@@ -37,8 +40,10 @@ def prior(spec: PriorSpec | float, base: Parameter, where: str) -> Parameter | f
     if spec.value is not None:
         if len(given) > 1:
             raise _conflict(where, "value", given, "value alone, or a prior")
+        _check_matter(spec.value, base, where)
         return spec.value
     _check_bounds(spec, base, where)
+    _check_matter(spec.low, base, where)
     try:
         if spec.mean is None and spec.sd is None:
             return _box(spec, base, where)
@@ -47,6 +52,20 @@ def prior(spec: PriorSpec | float, base: Parameter, where: str) -> Parameter | f
         return _moments(spec, spec.mean, spec.sd, base)
     except InputError as error:
         raise located(error, where) from error
+
+
+def _check_matter(least: float | None, base: Parameter, where: str) -> None:
+    """A mass or an inertia is not negative (E147), unless it is a correction of one."""
+    if least is None or least >= 0.0 or base.unit not in _MATTER or base.low < 0.0:
+        return
+    raise InputError(
+        "E147",
+        f"negative {_MATTER[base.unit]}",
+        where=where,
+        got=f"{least:g} {base.unit}",
+        expected=f"{base.name} of at least 0",
+        fix="correct the sign",
+    )
 
 
 def _absolute(spec: PriorSpec, share: float, base: Parameter, where: str) -> PriorSpec:

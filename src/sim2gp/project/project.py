@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sim2gp.errors import InputError, nearest
-from sim2gp.logs import Column, Log, Resample, read_log
+from sim2gp.logs import Column, Log, Resample, none_unused, read_log
 from sim2gp.logs.file import shown
 from sim2gp.project.schema import (
     ColumnSpec,
@@ -55,22 +55,26 @@ class Project:
         """The machine with the file's options, priors and actuators."""
         return self.system
 
-    def load_logs(self) -> tuple[Log, ...]:
-        """Every log of every group, cut at gaps; names are unique (E101 to E131)."""
-        seen: dict[Path, int] = {}
+    def load_logs(self, *, strict: bool = False) -> tuple[Log, ...]:
+        """Every log of every group, cut at gaps; names are unique (E101 to E131).
+
+        ``strict``: every column is taken, or E105.
+        """
+        seen: dict[str, int] = {}
         logs: list[Log] = []
         for group, spec in enumerate(self.spec.logs):
             for file in self.files(group):
-                if file.resolve() in seen:
+                place = os.path.realpath(file)  # of links in a circle, too
+                if place in seen:
                     raise InputError(
                         "E160",
                         "file listed twice",
                         where=self.source.where("logs", group, "files"),
                         got=shown(file),
                         expected="each file in one group",
-                        fix=f"remove it here or from group {seen[file.resolve()] + 1}",
+                        fix=f"remove it here or from group {seen[place] + 1}",
                     )
-                seen[file.resolve()] = group
+                seen[place] = group
                 logs += self._read(file, group, spec)
         if not logs:
             raise InputError(
@@ -81,7 +85,9 @@ class Project:
                 expected="at least one",
                 fix="add a [[logs]] table with files and columns",
             )
-        return tuple(_uniquely_named(logs))
+        if strict:
+            none_unused(logs)
+        return tuple(_uniquely_named(_said_once(logs)))
 
     def read_logs(
         self, files: Iterable[Path | str], configuration: str | None = None
@@ -116,7 +122,14 @@ class Project:
         for i, pattern in enumerate(self.spec.logs[group].files):
             where = self.source.where("logs", group, "files", i)
             if "\x00" in pattern:
-                raise InputError("E131", "NUL in a path", where=where, got="NUL")
+                raise InputError(
+                    "E131",
+                    "NUL in a path",
+                    where=where,
+                    got=repr(pattern),
+                    expected="a plain path",
+                    fix="remove the character",
+                )
             anchored = os.path.join(self.path.parent, pattern)
             if not glob.has_magic(pattern):
                 found[Path(anchored)] = None
@@ -150,6 +163,7 @@ class Project:
             limits={name: (a, b) for name, (a, b) in self.spec.limits.items()},
             fixed=spec.fixed,
             group=self.spec.configurations.index(self.spec.configuration(group)),
+            longest_delay=self.system.longest_delay,
         )
 
 
@@ -260,6 +274,21 @@ def _no_group(source: Source) -> InputError:
         expected="one that says how columns are named",
         fix="add a [[logs]] table with columns",
     )
+
+
+def _said_once(logs: Sequence[Log]) -> list[Log]:
+    """Files of a group are alike: what nothing takes is said of the first of them."""
+    seen: set[tuple[int, str]] = set()
+    out = []
+    for log in logs:
+        kept = []
+        for note in log.notes:
+            about = (log.group, note.text.rpartition(": ")[2])
+            if note.code != "W105" or about not in seen:
+                kept.append(note)
+                seen.add(about)
+        out.append(replace(log, notes=tuple(kept)))
+    return out
 
 
 def _uniquely_named(logs: Sequence[Log]) -> list[Log]:

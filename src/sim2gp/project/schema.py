@@ -272,7 +272,7 @@ def _fault(
     code = "E160"
     if kind == "finite_number" and path[-1] in ("low", "high"):
         code = "E141"
-    elif path and path[-1] in ("sd", "start_sd", "noise_floor"):
+    elif {"sd", "start_sd", "noise_floor"} & set(path):
         code = "E144" if kind in ("greater_than", "finite_number") else "E160"
     elif path and path[0] == "planner" and kind == "greater_than":
         code = "E148"

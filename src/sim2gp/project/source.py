@@ -26,6 +26,8 @@ _TOKEN = re.compile(
     r'"""(?:[^\\]|\\.)*?"""|\'\'\'.*?\'\'\'|"(?:[^"\\\n]|\\.)*"|\'[^\'\n]*\'|#[^\n]*',
     re.DOTALL,
 )
+#: A line that TOML has not, as a file of YAML begins.
+_YAML = re.compile(r"^(---|%YAML|-\s|[\w\"'-]+\s*:(\s|$))")
 _HOSTILE = re.compile(r"\$\{|^\s*(eval|exec|import|env|file|python)\s*:|^\s*!!")
 
 
@@ -62,7 +64,7 @@ def read_source(path: Path) -> Source:
     try:
         values = tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
-        raise _syntax(name, text, str(error)) from error
+        raise _yaml(name, bare) or _syntax(name, text, str(error)) from error
     source = Source(name, text, values, dict(_lines(text, bare)))
     for key, value in _leaves(values, ()):
         if _is_hostile(key, value):
@@ -81,6 +83,21 @@ def _refused(name: str, got: str, expected: str) -> InputError:
     fix = "write a smaller, flatter file"
     return InputError(
         "E161", "project file refused", where=name, got=got, expected=expected, fix=fix
+    )
+
+
+def _yaml(name: str, bare: str) -> InputError | None:
+    """A file that begins as YAML does, whatever it is called, is not looked into."""
+    line = next((x for x in bare.splitlines() if x.strip()), "")
+    if not _YAML.match(line):
+        return None
+    return InputError(
+        "E161",
+        "project file refused",
+        where=name,
+        got="YAML, whose aliases and tags are not read",
+        expected="TOML",
+        fix="write it as TOML: key = value, and [section] for a mapping",
     )
 
 

@@ -260,8 +260,14 @@ def checked(action: Any, shape: tuple[int, ...]) -> np.ndarray:
     """An action in float32 (E140 for another shape, E101 where it is not finite)."""
     u = np.asarray(action, np.float32)
     if u.shape != shape:
-        expected = f"shape {shape}"
-        raise InputError("E140", "action", got=f"shape {u.shape}", expected=expected)
+        raise InputError(
+            "E140",
+            "action of another shape",
+            where="step",
+            got=f"shape {u.shape}",
+            expected=f"shape {shape}, one number for each input of the machine",
+            fix="give an action of the environment's action_space",
+        )
     if not np.isfinite(u).all():
         raise InputError("E101", "action that is not finite", got=u.tolist())
     return u

@@ -66,8 +66,9 @@ class NumpyPolicy:
 def load_policy(folder: Path | str) -> NumpyPolicy:
     """Read what `export_policy` wrote.
 
-    Raises `InputError` E133 for a run that is no policy, or one of another format, and
-    what `load_run` raises: a damaged file is never half used.
+    Raises `InputError` E133 for a run that is no policy, or one of another format, E181
+    for numbers that are not finite, and what `load_run` raises: a damaged file is never
+    half used.
     """
     run = load_run(folder)
     about, arrays = run.summary.get("policy"), run.arrays
@@ -81,11 +82,26 @@ def load_policy(folder: Path | str) -> NumpyPolicy:
     except KeyError as error:
         raise _refused(run, f"no array {error}") from error
     for x in (scale, low, high, *weights, *biases):
-        if x.dtype != np.float32 or not np.isfinite(x).all():
-            raise _refused(run, "numbers that are not finite float32")
+        if x.dtype != np.float32:
+            raise _refused(run, f"numbers of {x.dtype}")
+    _check_finite(run)
     states, actions = tuple(about["states"]), tuple(about["actions"])
     angle = about["angle"]
     return NumpyPolicy(states, actions, weights, biases, scale, low, high, angle)
+
+
+def _check_finite(run: Run) -> None:
+    for name, x in run.arrays.items():
+        bad = int(np.size(x) - np.isfinite(x).sum())
+        if bad:
+            raise InputError(
+                "E181",
+                "policy with numbers that are not finite",
+                where=f"{run.path}, array {name}",
+                got=f"{bad} of {np.size(x)}",
+                expected="finite numbers",
+                fix="train it again: its training diverged",
+            )
 
 
 def _refused(run: Run, got: str) -> InputError:

@@ -20,6 +20,8 @@ from sim2gp.errors import InputError
 SECONDS = 60  # that a model may take to compile
 _BYTES = 50_000_000  # of one file of text
 _NAMED = re.compile(r'<\s*(\w+)[^>]*?\b(?:file|filename)\s*=\s*["\']([^"\']*)["\']')
+#: MuJoCo's words for masses and inertias; not for a mesh that encloses no volume.
+_IMPOSSIBLE = re.compile(r"mass and inertia|inertia must|mass, inertia or density")
 _FOLDER = re.compile(r'\b(meshdir|texturedir|assetdir)\s*=\s*["\']([^"\']*)["\']')
 _CHILD = os.path.join(os.path.dirname(__file__), "mjcf_child.py")
 
@@ -27,9 +29,9 @@ _CHILD = os.path.join(os.path.dirname(__file__), "mjcf_child.py")
 def compiled(path: Path, root: Path | None = None) -> Any:
     """The model of an MJCF or URDF file.
 
-    Raises `InputError` E130 where there is no such file, E170 with MuJoCo's words where
-    it is no model, E171 where it names files outside ``root`` (its own folder) or
-    the parser crashed or took more than a minute.
+    Raises `InputError` E130 where there is no such file, E147 or E170 with MuJoCo's
+    words where it is no possible body or no model, E171 where it names files outside
+    ``root`` (its own folder) or the parser crashed or took more than a minute.
     """
     check_paths(path, path.parent if root is None else root)
     return compiled_all([path])[0]
@@ -61,7 +63,7 @@ def _made(paths: Sequence[Path], folder: str, form: str) -> list[Path]:
         raise _died(where, f"no answer in {2 * seconds} s")
     if done.returncode == 3:
         said = " ".join(done.stderr.split("REFUSED ", 1)[-1].split())
-        raise InputError("E170", "no model", where=where, got=said)
+        raise _refused(where, said)
     if done.returncode != 0:
         last = done.stderr.strip().splitlines()[-1:] or ["no words"]
         raise _died(where, f"exit {done.returncode}, {last[0]}")
@@ -89,6 +91,27 @@ def in_child(
         )
     except subprocess.TimeoutExpired:
         return None
+
+
+def _refused(where: str, said: str) -> InputError:
+    """E147 for a body that no matter could make, E170 for what is no model."""
+    if _IMPOSSIBLE.search(said):
+        return InputError(
+            "E147",
+            "impossible body",
+            where=where,
+            got=said,
+            expected="positive masses, and moments of inertia with A + B >= C",
+            fix="correct the mass or the inertia of the body",
+        )
+    return InputError(
+        "E170",
+        "no model",
+        where=where,
+        got=said,
+        expected="a model that MuJoCo compiles",
+        fix="mend the file where MuJoCo says",
+    )
 
 
 def check_paths(path: Path, root: Path) -> None:

@@ -1,0 +1,249 @@
+"""Bad inputs 67 to 76: models, archives, runs."""
+
+import io
+import json
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bad_inputs import (
+    MODEL,
+    PROJECT,
+    ROWS,
+    TEXTS,
+    Case,
+    Input,
+    Patch,
+    case,
+    model,
+    npz,
+    stored,
+)
+from sim2gp.project import load_project
+from sim2gp.robot.policy import FORMAT, load_policy
+from sim2gp.runs import new_run
+
+# Models
+
+
+def crashing(folder: Path, patch: Patch) -> Sequence[str]:
+    """No file is known that crashes this parser: its process is one that dies."""
+    from sim2gp.systems import mjcf_load
+
+    child = folder / "child.py"
+    child.write_text("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
+    patch.setattr(mjcf_load, "_CHILD", str(child))
+    found = model(MODEL, "E171").make(folder, patch)
+    assert found is not None
+    return found
+
+
+# Archives
+
+
+def archive(*members: tuple[str, bytes]) -> Callable[[Path], object]:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as file:
+        for name, content in members:
+            file.writestr(name, content)
+    return lambda path: path.write_bytes(buffer.getvalue())
+
+
+def header(*shape: int) -> bytes:
+    """The start of an array that claims a shape."""
+    buffer = io.BytesIO()
+    spec = {"descr": "<f8", "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(buffer, spec)
+    return buffer.getvalue()
+
+
+def raw(content: bytes) -> Callable[[Path], object]:
+    return lambda path: path.write_bytes(content)
+
+
+class Touch:
+    """Loading a pickle of this would make a folder, which a test would see."""
+
+    def __reduce__(self) -> tuple[Any, tuple[str]]:
+        return Path.mkdir, (Path("was-unpickled"),)  # type: ignore[return-value]
+
+
+PICKLE = b"\x80\x04\x95" + bytes(40)
+TORCH = archive(("a/data.pkl", b"\x80\x02."), ("a/0", b""))
+TENSORS = (8).to_bytes(8, "little") + b'{"a":{}}'
+
+# Runs
+
+
+def policy(changes: Mapping[str, Any], code: str, *said: str) -> Input:
+    """What `export_policy` writes, of one layer, with some arrays changed."""
+
+    def make(folder: Path, patch: Patch) -> None:
+        one = np.ones((1, 1), np.float32)
+        stored = {"weights/0": one, "biases/0": one[0], "scale": one[0]}
+        stored |= {"low": -one[0], "high": one[0]}
+        about = {"format": FORMAT, "layers": 1, "angle": None}
+        about |= {"states": ["x"], "actions": ["u"]}
+        with new_run(folder / "policy", "export policy") as writer:
+            writer.write_arrays("arrays.npz", stored | dict(changes))
+            writer.write_summary({"policy": about})
+        load_policy(folder / "policy")
+
+    return Input(code, said, make)
+
+
+NAN = np.full((1, 1), np.nan, np.float32)
+
+
+def run(spoil: Callable[[Path], object], code: str, *said: str) -> Input:
+    """An identification that something happened to since; `evaluate` reads it."""
+
+    def make(folder: Path, patch: Patch) -> Sequence[str]:
+        (folder / "project.toml").write_text(PROJECT)
+        (folder / "a.csv").write_text(TEXTS)
+        table = load_project(folder / "project.toml").system.parameters
+        summary = {
+            "command": "identify",
+            "parameters": {name: {"mean": 1.0} for name in table.names},
+            "noise": {"x": 1e-3},
+            "period": 0.01,
+        }
+        zeros = np.zeros(len(table))
+        with new_run(folder / "run", "identify") as writer:
+            writer.write_summary(summary)
+            writer.write_text("project.toml", PROJECT)
+            belief = {"belief/mean": zeros, "belief/scale": np.diag(zeros)}
+            writer.write_arrays("arrays.npz", belief)
+        spoil(folder / "run")
+        return "evaluate", "run", "--logs", "a.csv"
+
+    return Input(code, ("run", *said), make)
+
+
+def flipped(folder: Path) -> None:
+    content = bytearray((folder / "arrays.npz").read_bytes())
+    content[len(content) // 2] ^= 1
+    (folder / "arrays.npz").write_bytes(content)
+
+
+def newer(folder: Path) -> None:
+    manifest = json.loads((folder / "manifest.json").read_text())
+    (folder / "manifest.json").write_text(json.dumps(manifest | {"format": 99}))
+
+
+def fixed_since(folder: Path) -> None:
+    (folder / "project.toml").write_text(f"{PROJECT}[parameters]\ncart_mass = 0.4\n")
+
+
+THIRD: tuple[Case, ...] = (
+    # Channels are named in the words of the project, whatever its machine (E160).
+    case(
+        67,
+        "MJCF: no such joint, actuator",
+        model(
+            MODEL,
+            "E170",
+            "project.toml:line 9",
+            "did you mean joint/hip/damping",
+            more='[parameters]\n"joint/hop/damping" = 1.0',
+        ),
+        model(
+            MODEL,
+            "E160",
+            "project.toml:line 8",
+            "one of push",
+            more="[actuators.pusj]\ngain = 1.0",
+        ),
+    ),
+    case(
+        68,
+        "MJCF: syntax, mesh",
+        model("<mujoco>\n<worldbody>\n</mujoco>", "E170", "arm.xml"),
+        model(
+            MODEL.replace(
+                "<worldbody>", '<asset><mesh file="no.stl"/></asset><worldbody>'
+            ),
+            "E170",
+            "arm.xml",
+            "no.stl",
+        ),
+    ),
+    case(
+        69,
+        "MJCF: crash, foreign file",
+        Input("E171", ("arm.xml", "exit -11"), crashing),
+        model(
+            '<mujoco><include file="/etc/passwd"/></mujoco>', "E171", "got /etc/passwd"
+        ),
+    ),
+    # No project chooses MJX; what that lacks is refused in test_mujoco_mjx.py.
+    case(
+        70,
+        "MJCF: unsupported",
+        model(
+            MODEL.replace(
+                '<joint name="hip" damping=".1"/>', '<freejoint name="hip"/>'
+            ).replace('<actuator><motor name="push" joint="hip"/></actuator>', ""),
+            "E172",
+            "quaternion",
+            "hip",
+        ),
+    ),
+    case(
+        71,
+        "pickle by another name",
+        stored("a.npz", raw(PICKLE), "E180", "pickle refused"),
+        stored("a.csv", raw(PICKLE), "E180", "pickle refused"),
+        stored("a.safetensors", raw(PICKLE), "E180", "pickle refused"),
+        stored("a.pt", raw(b"never read"), "E180", "pickle refused"),
+        stored("a.joblib", raw(b"never read"), "E180", "pickle refused"),
+        stored("a.PICKLE", raw(b"never read"), "E180", "pickle refused"),
+        stored("a.npz", TORCH, "E180", "data.pkl"),
+        stored("a.safetensors", TORCH, "E180", "pickle refused"),
+    ),
+    case(
+        72,
+        "objects in an npz",
+        stored("a.npz", npz(pos=np.array([Touch()] * ROWS)), "E180", "column pos"),
+    ),
+    case(
+        73,
+        "header that declares too much",
+        stored(
+            "a.npz",
+            archive(("pos.npy", header(65536, 65536))),
+            "E126",
+            "(65536, 65536)",
+        ),
+    ),
+    # No tensor file is read at all; a policy is a run of ours, with its checksums.
+    case(
+        74,
+        "tensors",
+        stored("a.safetensors", raw(TENSORS), "E181", "numpy.savez"),
+        policy({"weights/0": NAN}, "E181", "weights/0", "1 of 1"),
+        policy({"weights/0": np.ones((1, 1))}, "E133", "float64"),
+        stored(
+            "a.npz",
+            archive(("pos.npy", b"\x93NUMPY\x02\x00" + b"\xff" * 3 + b"\x7f")),
+            "E125",
+        ),
+    ),
+    case(
+        75,
+        "archive entry outside",
+        stored("a.npz", archive(("../../evil.npy", header(0))), "E182", "../../evil"),
+        stored("a.npz", archive(("/etc/evil.npy", header(0))), "E182", "/etc/evil"),
+        stored("a.npz", archive(("C:\\evil.npy", header(0))), "E182", "evil"),
+    ),
+    case(
+        76,
+        "run that was changed",
+        run(flipped, "E183", "arrays.npz", "another checksum"),
+        run(newer, "E185", "got 99", "at most 1"),
+        run(fixed_since, "E184", "project.toml", "expected cart_mass"),
+    ),
+)

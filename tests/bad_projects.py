@@ -1,0 +1,268 @@
+"""Bad inputs 46 to 66: shapes, constants, project files."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from bad_inputs import (
+    GOOD,
+    IDENTIFY,
+    MODEL,
+    Case,
+    Input,
+    Patch,
+    case,
+    model,
+    npz,
+    renamed,
+    stored,
+)
+from sim2gp import laplace
+from sim2gp.arrowhead import Elimination
+from sim2gp.gaussian import from_covariance
+from sim2gp.types import in_float64
+
+
+def project(more: str, code: str, *words: str, name: str = "project.toml") -> Input:
+    """A project file with some lines more than its system."""
+    return written(f'system = "cartpole"\n{more}', code, *words, name=name)
+
+
+def written(text: str, code: str, *words: str, name: str = "project.toml") -> Input:
+    def make(folder: Path, patch: Patch) -> Sequence[str]:
+        (folder / name).write_text(text)
+        return "identify", name
+
+    return Input(code, (name, *words), make)
+
+
+def words(command: str, code: str, *said: str) -> Input:
+    """A command line that is at fault by itself."""
+    return Input(code, ("the command line", *said), lambda *_: command.split())
+
+
+# Shapes
+
+
+def of_two_numbers(folder: Path, patch: Patch) -> None:
+    """What both environments ask before they step (test_gymnasium.py)."""
+    pytest.importorskip("gymnasium")
+    from sim2gp.robot.gymnasium import checked
+
+    checked(np.zeros(2), (1,))
+
+
+def without_batch(folder: Path, patch: Patch) -> None:
+    pytest.importorskip("gymnasium")
+    from sim2gp.robot.gymnasium import checked
+
+    checked(np.zeros(1), (8, 1))
+
+
+X = np.stack([GOOD["pos"], GOOD["vel"]])
+AS_TABLE = renamed('"pos"', '"state[0]"').replace('"vel"', '"state[1]"')
+
+
+def arrays(content: Mapping[str, Any], code: str, *said: str) -> Input:
+    """An archive whose ``state`` is a table."""
+
+    def make(folder: Path, patch: Patch) -> Sequence[str]:
+        (folder / "project.toml").write_text(AS_TABLE.replace("*.csv", "a.npz"))
+        np.savez(folder / "a.npz", **content)
+        return IDENTIFY
+
+    return Input(code, said, make)
+
+
+NO_STATE = {name: GOOD[name] for name in ("t", "angle", "cmd")}
+
+# Constants
+
+
+@in_float64
+def no_covariance(folder: Path, patch: Patch) -> None:
+    """Beliefs are square roots of covariances; this is the way in for a matrix."""
+    matrix = np.asarray([[1.0, 2.0], [2.0, 1.0]])
+    from_covariance(np.zeros(2), matrix, ("mass", "length"))
+
+
+@in_float64
+def no_symmetry(folder: Path, patch: Patch) -> None:
+    from_covariance(np.zeros(2), np.asarray([[1.0, 0.5], [0.2, 1.0]]))
+
+
+@in_float64
+def nothing_moves(folder: Path, patch: Patch) -> None:
+    """Known after a linearisation and no sooner: a fit whose Jacobian is zero.
+
+    That descents end so stands in test_laplace.py; `identify` then exits with 2.
+    """
+    factor, none = jnp.zeros((3, 3)).at[2, 2].set(1.0), jnp.zeros((1, 0))
+    z, zero = jnp.zeros(2), jnp.zeros(())
+    at = laplace.Point(z, none, factor[None, None], zero + 0.5, z, none)
+    arrow = Elimination(factor, jnp.zeros((1, 0, 0)), jnp.zeros((1, 0, 3)))
+    status, steps = jnp.asarray(laplace.CONVERGED), jnp.asarray(0)
+    fit = laplace.Fit(at, arrow, factor, zero, status, steps)
+    fit.raise_unless_converged(("mass", "length"), "arm.csv")
+
+
+BOMB = "a: &a [x, x]\nb: &b [*a, *a]\nc: [*b, *b]\n"
+OBJECT = "a: !!python/object/apply:os.system ['touch was-run']\n"
+
+SECOND: tuple[Case, ...] = (
+    case(
+        46,
+        "(N, D) where (N + 1, D)",
+        stored("a.npz", npz(cmd=GOOD["cmd"][:-1]), "E140", "300 rows of t, 299 of cmd"),
+    ),
+    case(
+        47,
+        "transposed",
+        arrays(NO_STATE | {"state": X}, "E140", "looks transposed", "save state.T"),
+        arrays(NO_STATE | {"state": X.T}, ""),
+    ),
+    case(
+        48,
+        "wrong action dimension",
+        Input("E140", ("got shape (2,)", "expected shape (1,)"), of_two_numbers),
+    ),
+    case(
+        49,
+        "batch axis",
+        stored("a.npz", npz(cmd=GOOD["cmd"][:, None, None]), "E140", "(300, 1, 1)"),
+        Input("E140", ("got shape (1,)", "expected shape (8, 1)"), without_batch),
+    ),
+    case(
+        50,
+        "min > max",
+        project(
+            "[parameters.cart_mass]\nlow = 1.0\nhigh = 0.5",
+            "E141",
+            "line 2",
+            "cart_mass reversed",
+            "low = 1, high = 0.5",
+        ),
+        project("[limits]\nx = [1.0, -1.0]", "E141", "line 3", "limits of x reversed"),
+    ),
+    case(
+        51,
+        "min == max",
+        project(
+            "[parameters.cart_mass]\nlow = 1.0\nhigh = 1.0",
+            "E141",
+            "line 2",
+            "fix it instead: value = 1",
+        ),
+    ),
+    case(
+        52,
+        "NaN or infinite bound",
+        project("[parameters.cart_mass]\nlow = 0.1\nhigh = inf", "E141", "line 4"),
+        project("[parameters.cart_mass]\nlow = nan\nhigh = 1.0", "E141", "line 3"),
+    ),
+    case(
+        53,
+        "prior mean outside its bounds",
+        project(
+            "[parameters.cart_mass]\nmean = 2.0\nsd = 0.1\nlow = 0.1\nhigh = 1.0",
+            "E142",
+            "line 2",
+            "mean = 2",
+        ),
+    ),
+    case(
+        54,
+        "no covariance",
+        Input("E143", ("smallest eigenvalue of -1", "mass"), no_covariance),
+        Input("E143", ("coordinate 0", "0.5 and 0.2", "symmetric"), no_symmetry),
+    ),
+    case(
+        55,
+        "variance <= 0 or NaN",
+        project("[parameters.cart_mass]\nmean = 0.4\nsd = 0.0", "E144", "line 2"),
+        project("[likelihood]\nnoise_floor = 0.0", "E144", "line 3"),
+        project("[likelihood]\nnoise_floor = nan", "E144", "line 3", "nan"),
+        project("[likelihood]\nstart_sd = {x = -1.0}", "E144", "line 3", "-1"),
+    ),
+    case(
+        56,
+        "duplicate or unknown parameter",
+        project("[parameters]\ncart_mass = 1.0\ncart_mass = 2.0", "E145", "line 4"),
+        project("[parameters]\ncart_mas = 1.0", "E145", "line 3", "mean cart_mass"),
+    ),
+    # One such constant keeps its prior and its verdict is `dead`; all are an error.
+    case(
+        57,
+        "parameter that reaches nothing",
+        Input("E146", ("arm.csv", "mass, length"), nothing_moves),
+    ),
+    case(
+        58,
+        "impossible mass or inertia",
+        model(MODEL.replace('mass="1"', 'mass="-1"'), "E147", "arm.xml", "'arm'"),
+        model(MODEL.replace("1 1 1", "1 1 5"), "E147", "arm.xml", "A + B >= C"),
+        project("[parameters]\ncart_mass = -1.0", "E147", "line 3", "-1 kg"),
+        project(
+            "[parameters.pole_mass]\nlow = -1.0\nhigh = 1.0", "E147", "line 2", "-1 kg"
+        ),
+    ),
+    case(
+        59,
+        "budget <= 0, more elites than samples",
+        project("[planner]\nsamples = 0", "E148", "line 3", "samples", "got 0"),
+        project("[planner]\nhorizon = -1", "E148", "line 3", "horizon"),
+        project("[planner]\nsamples = 8\nelites = 9", "E148", "line 4", "9 of 8"),
+        words("demo --episodes 0", "E148", "--episodes", "got 0"),
+    ),
+    case(
+        60,
+        "seed",
+        words("demo --seed -1", "E149", "got -1"),
+        words("demo --seed 1.5", "E149", "got 1.5"),
+        words("demo --seed 4294967296", "E149", "4294967295"),
+    ),
+    case(
+        61,
+        "unknown config key",
+        project("[likelyhood]\n", "E160", "line 2", "did you mean likelihood"),
+        project("[planner]\nelite = 3", "E160", "line 3", "did you mean elites"),
+    ),
+    case(
+        62,
+        "wrong type",
+        project("[likelihood]\nrobust = yes", "E160", "line 3"),
+        project('[likelihood]\nrobust = "yes"', "E160", "line 3", "true or false"),
+        project('[likelihood]\nwindow = "1e-3"', "E160", "line 3", "without quotes"),
+    ),
+    case(
+        63,
+        "YAML alias bomb",
+        written(BOMB, "E161", "aliases", name="project.yaml"),
+        written(BOMB, "E161", "aliases"),
+    ),
+    case(
+        64,
+        "YAML object",
+        written(OBJECT, "E161", "tags", name="project.yaml"),
+        written(OBJECT, "E161", "tags"),
+        project('[options]\na = "!!python/object:os"', "E162", "line 3"),
+    ),
+    case(
+        65,
+        "nested or large",
+        project("a = " + "[" * 65 + "]" * 65, "E161", "nesting of 65"),
+        project("a = " + "[" * 100_000, "E161", "nesting of 100000"),
+        project("# " + "x" * 1_000_000, "E161", "1000022 characters"),
+    ),
+    case(
+        66,
+        "code in a config",
+        project('[options]\n_target_ = "os.system"', "E162", "line 3"),
+        written('system = "eval:print(1)"', "E162", "line 1", "eval:"),
+        written('system = "${env:HOME}"', "E162", "line 1", "${env:HOME}"),
+    ),
+)

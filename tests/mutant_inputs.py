@@ -1,0 +1,156 @@
+"""Mutants of what refuses bad input: each must fail the table, or its own test."""
+
+from mutant_list import Mutant
+
+ALIGNMENT, CHECKS, TABLE = "logs/alignment.py", "logs/checks.py", "logs/table.py"
+TESTS = "test_all_bad_inputs.py"
+
+INPUTS = (
+    Mutant(
+        "inputs: few sentinels are an error, many are not",
+        CHECKS,
+        "if share > 0.01:",
+        "if share < 0.01:",
+        (TESTS, "sentinel"),
+    ),
+    Mutant(
+        "inputs: swapped columns are told like others",
+        CHECKS,
+        "if swapped and swapped[1] > 0.9",
+        "if swapped and swapped[1] > 9.0",
+        (TESTS, "swapped"),
+    ),
+    Mutant(
+        "inputs: a clock may go on by years",
+        CHECKS,
+        "steps > DAY",
+        "steps > 1e12",
+        (TESTS, "clock"),
+    ),
+    Mutant(
+        "inputs: rows at rest are shared rows",
+        CHECKS,
+        "moved = np.any(np.diff(rows[:, 1:], axis=0) != 0.0, axis=1)",
+        "moved = np.any(np.diff(rows, axis=0) != 0.0, axis=1)",
+        ("test_logs.py", "shared_rows"),
+    ),
+    Mutant(
+        "inputs: nobody is strict",
+        "experiments/prediction.py",
+        "    if strict:",
+        "    if False:",
+        (TESTS, "extra"),
+    ),
+    Mutant(
+        "inputs: every file of a group says what nothing takes",
+        "project/project.py",
+        'if note.code != "W105" or about not in seen:',
+        "if True:",
+        ("test_project.py", "logs_are_found"),
+    ),
+    Mutant(
+        "inputs: a pickle is text",
+        TABLE,
+        "if content.startswith(PICKLED):",
+        "if False:",
+        (TESTS, "pickle"),
+    ),
+    Mutant(
+        "inputs: tensors are text",
+        "logs/file.py",
+        'if path.suffix.lower() == ".safetensors":',
+        "if False:",
+        (TESTS, "tensors"),
+    ),
+    Mutant(
+        "inputs: links in a circle are followed",
+        "project/project.py",
+        "place = os.path.realpath(file)",
+        "place = str(file.resolve(strict=True))",
+        (TESTS, "unreadable"),
+    ),
+    Mutant(
+        "inputs: YAML is bad TOML",
+        "project/source.py",
+        "raise _yaml(name, bare) or _syntax",
+        "raise _syntax",
+        (TESTS, "YAML"),
+    ),
+    Mutant(
+        "inputs: masses may be negative",
+        "project/priors.py",
+        "if least is None or least >= 0.0",
+        "if least is None or least >= -2.0",
+        (TESTS, "impossible"),
+    ),
+    Mutant(
+        "inputs: a seed may have any number of digits",
+        "cli/arguments.py",
+        "low <= int(value) <= MAX_SEED",
+        "low <= int(value)",
+        (TESTS, "seed"),
+    ),
+    Mutant(
+        "inputs: a run's project may change",
+        "experiments/identify.py",
+        "    if now == fitted:",
+        "    if True:",
+        (TESTS, "changed"),
+    ),
+    Mutant(
+        "inputs: a policy may be NaN",
+        "robot/policy.py",
+        "        if bad:",
+        "        if False:",
+        (TESTS, "tensors"),
+    ),
+    Mutant(
+        "inputs: a covariance is what it is called",
+        "gaussian.py",
+        "if values[0] < -slack:",
+        "if False:",
+        ("test_gaussian.py", "another_tool"),
+    ),
+    Mutant(
+        "inputs: units decide what a covariance is",
+        "gaussian.py",
+        "scaled = covariance / np.outer(unit, unit)",
+        "scaled = covariance",
+        ("test_gaussian.py", "another_tool"),
+    ),
+    Mutant(
+        "alignment: the other way",
+        ALIGNMENT,
+        "np.roll(u, lag)",
+        "np.roll(u, -lag)",
+        ("test_alignment.py", "shift"),
+    ),
+    Mutant(
+        "alignment: a step's own acceleration is left out",
+        ALIGNMENT,
+        "once[:-1] * dt + 0.5 * f[:-1] * dt**2",
+        "once[:-1] * dt",
+        ("test_alignment.py", "shift"),
+    ),
+    Mutant(
+        "alignment: a controller is called late",
+        ALIGNMENT,
+        "EARLY = 0.85, 0.5",
+        "EARLY = 0.5, 0.9",
+        ("test_alignment.py", "controller"),
+    ),
+    Mutant(
+        "alignment: a model's own delay is a fault",
+        ALIGNMENT,
+        "taken = lag * log.period <= delay + 0.5 * log.period",
+        "taken = False",
+        ("test_alignment.py", "delay"),
+    ),
+    Mutant(
+        "alignment: what the states explain counts",
+        ALIGNMENT,
+        "return x - self.states @ (self.states.T @ x)",
+        "return x",
+        ("test_alignment.py", "shift or place or controller or real"),
+    ),
+)
