@@ -4,8 +4,8 @@
 
 The pages are plain Markdown that reads as it is; three things are said differently for
 the site. A fence ```` ```python nightly ```` loses what the tests say to themselves; a
-link that leaves docs/ takes its target along, since a site is one folder; and README's
-place is taken by index.md. The reference has a page for each package of sim2gp, and one
+link that leaves docs/ takes its target along, since a site is one folder; and what README
+calls the tree is the reference. That has a page for each package of sim2gp, and one
 for the modules beside them, so that a new module is in it without being entered.
 """
 
@@ -70,7 +70,7 @@ def _target(link: str, page: Path, out: Path) -> str:
     if where.as_posix() in TOP:
         return TOP[where.as_posix()]
     if where.as_posix() == "README.md":
-        return "index.md"
+        return "reference/index.md"  # whose second heading is README's, the tree
     copy = out / "files" / where
     copy.parent.mkdir(parents=True, exist_ok=True)
     shutil.copy(file, copy)
@@ -127,7 +127,7 @@ def reference() -> dict[str, str]:
         module = path if path in home else path.rpartition(".")[0]
         says = first_sentence(path, module)
         lines.append(f"| [`sg.{name}`]({home[module]}.md#{path}) | {says} |")
-    lines += ["", "And every module, by package:", ""]
+    lines += ["", "## The tree", "", "Every module, by package:", ""]
     for page, found in pages.items():
         lines.append(f"- [{page}]({page}.md): " + heading(page, found))
     texts = {"index": "\n".join(lines) + "\n"}
