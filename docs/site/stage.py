@@ -4,9 +4,9 @@
 
 The pages are plain Markdown that reads as it is; three things are said differently for
 the site. A fence ```` ```python nightly ```` loses what the tests say to themselves; a
-link that leaves docs/ takes its target along, since a site is one folder; and what README
-calls the tree is the reference. That has a page for each package of sim2gp, and one
-for the modules beside them, so that a new module is in it without being entered.
+link that leaves docs/ takes its target along, since a site is one folder; and what
+README calls the tree is the reference. That has a page for each package of sim2gp, and
+one for the modules beside them, so that a new module is in it without being entered.
 """
 
 import ast
@@ -22,6 +22,7 @@ PACKAGE = ROOT / "src" / "sim2gp"
 TOP = {"CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
 #: Modules that stand beside the packages share a page.
 CORE = "core"
+DEFINITIONS = (ast.ClassDef, ast.FunctionDef)
 
 FENCE = re.compile(r"^```python[^\n]*$", re.MULTILINE)
 LINK = re.compile(r"(?<=\]\()([^)#\s]+)")
@@ -37,8 +38,8 @@ def main(out: Path) -> None:
     for name, target in TOP.items():
         (out / target).write_text(staged(ROOT / name, out), encoding="utf-8")
     (out / "assets").mkdir()
-    for file in sorted(Path(__file__).parent.glob("*.js")):
-        shutil.copy(file, out / "assets" / file.name)
+    for name in ("iframe-worker.js", "site.css"):
+        shutil.copy(Path(__file__).with_name(name), out / "assets" / name)
     for name, text in reference().items():
         (out / "reference" / f"{name}.md").write_text(text, encoding="utf-8")
 
@@ -110,7 +111,7 @@ def place(name: str, module: str) -> str:
     if file_of(f"{module}.{name}").is_file():
         return f"{module}.{name}"
     for node in tree(module).body:
-        if isinstance(node, ast.ClassDef | ast.FunctionDef) and node.name == name:
+        if isinstance(node, DEFINITIONS) and node.name == name:
             return f"{module}.{name}"
         if isinstance(node, ast.ImportFrom) and name in {a.name for a in node.names}:
             return place(name, node.module or "")
@@ -145,7 +146,13 @@ def _page(page: str, found: list[str]) -> str:
     lines = [f"# {page}", "", heading(page, found), "", "| module | |", "|---|---|"]
     lines += [f"| [`{m}`](#{m}) | {first_sentence(m, m)} |" for m in found]
     for module in found:
-        lines += ["", f"::: {module}"]
+        # What a package imports is told where it is defined.
+        own = [
+            node.name
+            for node in tree(module).body
+            if isinstance(node, DEFINITIONS) and node.name[0] != "_"
+        ]
+        lines += ["", f"::: {module}", "    options:", f"      members: {own or False}"]
     return "\n".join(lines) + "\n"
 
 
@@ -153,7 +160,7 @@ def first_sentence(path: str, module: str) -> str:
     """What the docstring of a module, or of a thing in it, begins with; one cell."""
     node: ast.Module | ast.ClassDef | ast.FunctionDef = tree(module)
     for inner in tree(module).body:
-        if isinstance(inner, ast.ClassDef | ast.FunctionDef):
+        if isinstance(inner, DEFINITIONS):
             node = inner if f"{module}.{inner.name}" == path else node
     text = ast.get_docstring(node) or ""
     return " ".join(text.split("\n\n")[0].split()).replace("|", "\\|")
