@@ -139,7 +139,7 @@ def test_every_machine_of_a_project_file_is_told() -> None:
     found: dict[str, tuple[set[str], set[str], set[str]]] = {}
     for row in rows(section("project_file.md", "Machines"))[2:-1]:
         names, *cells = (set(re.findall(r"`([\w.]+)`", cell)) for cell in row)
-        found |= {name: (cells[0], cells[1], cells[2]) for name in names}
+        found |= dict.fromkeys(names, (cells[0], cells[1], cells[2]))
     expected = {}
     for name in SYSTEMS:
         system = system_class(name)()
@@ -230,18 +230,28 @@ def test_every_module_and_public_name_stands_in_the_reference() -> None:
 
 
 def test_pages_are_staged(tmp_path: Path) -> None:
-    page = tmp_path / "docs" / "page.md"
-    text = "[a](other.md#b) [c](https://x.org/y) `[d](e)`\n```python nightly\nf[0](g)\n"
-    (tmp_path / "docs").mkdir()
-    page.write_text(text + "```\n[h](images/demo.gif)\n", encoding="utf-8")
-    real = DOCS / "page.md"  # links are looked up from where the page would stand
-    moved = STAGE.relinked("[h](images/demo.gif) [i](../README.md#j)", real, tmp_path)
-    gone = "files/docs/images/demo.gif"
-    assert moved == f"[h]({gone}) [i](reference/index.md#j)"
-    assert (tmp_path / gone).is_file()
-    assert STAGE.FENCE.sub("```python", text).count("```python\n") == 1
-    assert STAGE.relinked("[a](theory.md#b) [c](https://x.org/y)", real, tmp_path) == (
-        "[a](theory.md#b) [c](https://x.org/y)"
+    fence = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```", re.MULTILINE | re.DOTALL)
+    page = DOCS / "your_system.md"
+    text = STAGE.staged(page, tmp_path)
+    assert "```python\n" in text
+    assert "```python nightly" not in text
+    assert fence.findall(text) == fence.findall(page.read_text(encoding="utf-8"))
+    assert "](contributing.md#a-new-system)" in text
+    links = (
+        "[a](images/demo.gif) [b](../README.md#c) [d](theory.md#e) [f](https://x.y/z)"
+    )
+    file = "files/docs/images/demo.gif"
+    assert STAGE.relinked(links, page, tmp_path) == (
+        f"[a]({file}) [b](reference/index.md#c) [d](theory.md#e) [f](https://x.y/z)"
+    )
+    assert (tmp_path / file).read_bytes() == (DOCS / "images/demo.gif").read_bytes()
+
+
+def test_code_keeps_what_looks_like_a_link(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("`[a](b)`\n\n```python logs\nx[0](y)\n```\n", encoding="utf-8")
+    assert STAGE.staged(page, tmp_path).split() == (
+        ["`[a](b)`", "```python", "x[0](y)", "```"]
     )
 
 
@@ -273,7 +283,7 @@ def test_pages_are_reached_from_the_first_one() -> None:
             reached.add(page)
             links = re.findall(r"\]\(([^)#\s:]+)", page.read_text(encoding="utf-8"))
             waiting += [(DOCS / link).resolve() for link in links]
-    assert {page for page in DOCS.glob("*.md")} <= reached
+    assert set(DOCS.glob("*.md")) <= reached
 
 
 def defined(file: Path, path: str) -> bool:

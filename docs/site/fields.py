@@ -40,7 +40,8 @@ def constructor(cls: griffe.Class) -> list[str]:
     for name, member in cls.members.items():
         if not isinstance(member, griffe.Attribute) or member.annotation is None:
             continue
-        if re.search(r"ClassVar|AbstractVar", str(member.annotation)):
+        computed = "property" in member.labels
+        if computed or re.search(r"ClassVar|AbstractVar", str(member.annotation)):
             continue
         default = None if member.value is None else stated(str(member.value))
         found.append(name if default is None else f"{name}={default}")
