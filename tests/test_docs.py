@@ -8,6 +8,7 @@ import importlib.util
 import itertools
 import re
 import tomllib
+from dataclasses import fields
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -15,6 +16,7 @@ from typing import Any
 import pytest
 
 from sim2gp import cli
+from sim2gp.cli.commands import COMMANDS
 from sim2gp.logs.arrays import missing
 from sim2gp.project.build import EFFECTS
 from sim2gp.project.project import SYSTEMS, system_class
@@ -189,6 +191,38 @@ def test_every_exit_code_is_told() -> None:
 def test_the_example_of_an_error_is_what_is_printed() -> None:
     error = missing("tau1", ["time", "pos1", "tau_1"], "runs/a.csv")
     assert str(error) in (DOCS / "codes.md").read_text(encoding="utf-8")
+
+
+def test_every_command_is_told() -> None:
+    told = re.findall(r"`sim2gp (\w+)", section("choose.md", "Which command"))
+    assert sorted(told) == sorted([*COMMANDS, "COMMAND"])
+
+
+def test_every_option_that_pages_give_a_command_is_there() -> None:
+    seen, unknown = 0, []
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        for name, rest in re.findall(r"sim2gp ([a-z]+)\b([^`\n|#]*)", text):
+            options = re.findall(r"--([a-z][a-z-]*)", rest)
+            if name in COMMANDS and options:
+                known = {f.name.replace("_", "-") for f in fields(COMMANDS[name])}
+                seen += len(options)
+                unknown += [
+                    f"{page.name}: {name} {o}" for o in options if o not in known
+                ]
+    assert seen > 30
+    assert not unknown, "\n".join(unknown)
+
+
+def test_project_files_of_the_pages_are_valid() -> None:
+    seen = 0
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        for block in re.findall(r"^```toml\n(.*?)^```", text, re.M | re.S):
+            if block.startswith("system"):
+                ProjectSpec.model_validate(tomllib.loads(block))
+                seen += 1
+    assert seen >= 2
 
 
 # ---------------------------------------------------------------------- the site
