@@ -86,7 +86,6 @@ def modules() -> dict[str, list[str]]:
         if parts[-1] == "__main__" or parts == ("__init__",):
             continue
         if parts[-1] == "__init__":
-            parts = parts[:-1]
             pages[parts[0]] = [f"sim2gp.{parts[0]}", *pages.get(parts[0], [])]
         else:
             page = parts[0] if len(parts) > 1 else CORE
