@@ -20,9 +20,13 @@ class Fields(griffe.Extension):
         """Rewrite the docstring of a class once its members are known."""
         if cls.docstring is None:
             return
-        text, fields = listed(cls.docstring.value), ", ".join(constructor(cls))
-        call = f"\n\n```python\n{cls.name}({fields})\n```" if fields else ""
-        cls.docstring.value = text + call
+        text, fields = listed(cls.docstring.value), constructor(cls)
+        if fields:
+            call = f"{cls.name}({', '.join(fields)})"
+            if len(call) > 80:
+                call = f"{cls.name}(\n    " + ",\n    ".join(fields) + ",\n)"
+            text += f"\n\n```python\n{call}\n```"
+        cls.docstring.value = text
 
     def on_function_instance(self, *, func: griffe.Function, **_: object) -> None:
         """Arguments that a function explains in lines are a list too."""
