@@ -85,5 +85,5 @@ $(VENV)/.docs: $(VENV)/.core
 	@touch $@
 
 $(VENV)/.test: $(VENV)/.core
-	$(INSTALL) -c constraints.txt -e ".[test]"
-	@touch $@
+	$(INSTALL) -c constraints.txt -e ".[docs,test]"
+	@touch $@ $(VENV)/.docs
