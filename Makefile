@@ -1,8 +1,9 @@
 # Two commands, each with nothing before it:
 #
 #   make demo     installs sim2gp into .venv and learns to swing up a pendulum
-#   make test     adds the test tools; lint, types, tests (at most 20 minutes, 2 cores)
+#   make test     adds the test tools; lint, types, site, tests (at most 20 minutes, 2 cores)
 #
+# And `make docs` builds the site into build/docs/site, where a warning is an error.
 # uv is used when it is on the PATH, else the standard library's venv and pip. Another
 # interpreter: make test PYTHON=python3.13. More arguments: make demo ARGS="--seed 1".
 
@@ -20,16 +21,16 @@ else
   INSTALL := $(UV) pip install --quiet --python $(BIN)/python
 endif
 
-.PHONY: demo test lint types unit nightly figures format constraints clean help
+.PHONY: demo test lint types docs unit nightly figures format constraints clean help
 .DEFAULT_GOAL := help
 
 help:
-	@sed -n '1,8s/^# \{0,1\}//p' Makefile
+	@sed -n '1,9s/^# \{0,1\}//p' Makefile
 
 demo: $(VENV)/.core
 	$(BIN)/sim2gp demo $(ARGS)
 
-test: lint types unit
+test: lint types docs unit
 
 lint: $(VENV)/.test
 	$(BIN)/ruff check
@@ -37,6 +38,11 @@ lint: $(VENV)/.test
 
 types: $(VENV)/.test
 	$(BIN)/mypy
+
+# Plain pages and the docstrings become a folder that is read without a network.
+docs: $(VENV)/.docs
+	$(BIN)/python docs/site/stage.py build/docs/pages
+	$(BIN)/zensical build --clean --strict
 
 # Two processes, whole files each, and one cache of what they compile, begun anew.
 unit: $(VENV)/.test
@@ -74,6 +80,10 @@ $(VENV)/.core: pyproject.toml constraints.txt | $(BIN)/python
 	$(INSTALL) -c constraints.txt -e .
 	@touch $@
 
-$(VENV)/.test: $(VENV)/.core
-	$(INSTALL) -c constraints.txt -e ".[test]"
+$(VENV)/.docs: $(VENV)/.core
+	$(INSTALL) -c constraints.txt -e ".[docs]"
 	@touch $@
+
+$(VENV)/.test: $(VENV)/.core
+	$(INSTALL) -c constraints.txt -e ".[docs,test]"
+	@touch $@ $(VENV)/.docs

@@ -32,7 +32,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 #: Code that users run; tests may break the rules they test.
 RUNNABLE = [
     path
-    for folder in ("src", "examples", "benchmarks")
+    for folder in ("src", "examples", "benchmarks", "docs")
     for path in sorted((ROOT / folder).rglob("*.py"))
 ]
 TESTS = sorted((ROOT / "tests").rglob("*.py"))
@@ -254,7 +254,7 @@ def test_sdist_holds_the_sources_and_little_else(tmp_path: Path) -> None:
     assert tops <= {
         *("src", "tests", "docs", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md"),
         *("LICENSE", "Makefile", "README.md", "SECURITY.md", "constraints.txt"),
-        *("pyproject.toml", "PKG-INFO", ".gitignore"),
+        *("pyproject.toml", "zensical.toml", "PKG-INFO", ".gitignore"),
     }
     assert not [name for name in names if "__pycache__" in name]
 

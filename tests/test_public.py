@@ -20,7 +20,7 @@ SYSTEMS = """
 AbstractMechanism AbstractODE AbstractPlant AbstractSystem Actuated BlackBox Bound
 CartPole Channel Furuta MuJoCo ODE TwoLink rk4
 """
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "your_system.md"
+DOCS = Path(__file__).resolve().parents[1] / "docs"
 
 
 def test_public_names_stay() -> None:
@@ -32,7 +32,8 @@ def test_public_names_stay() -> None:
         _ = sg.Sim3GP
 
 
-def test_what_one_brings_needs_public_names_alone() -> None:
-    page = PAGE.read_text(encoding="utf-8")
+@pytest.mark.parametrize("thing", ["system", "model", "planner"])
+def test_what_one_brings_needs_public_names_alone(thing: str) -> None:
+    page = (DOCS / f"your_{thing}.md").read_text(encoding="utf-8")
     assert not re.findall(r"sim2gp\.\w+ import|import sim2gp\.\w+", page)
     assert set(re.findall(r"\bsg\.(\w+)", page)) <= set(NAMES.split())

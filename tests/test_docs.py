@@ -1,0 +1,346 @@
+"""Pages that repeat what the code says say the same, and no page is lost or unlinked.
+
+`make docs` builds the site; these tests need nothing that it installs.
+"""
+
+import ast
+import importlib.util
+import itertools
+import re
+import tomllib
+from dataclasses import fields
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from sim2gp import cli
+from sim2gp.cli.commands import COMMANDS
+from sim2gp.logs.arrays import missing
+from sim2gp.project.build import EFFECTS
+from sim2gp.project.project import SYSTEMS, system_class
+from sim2gp.project.schema import ProjectSpec
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+PACKAGE = ROOT / "src" / "sim2gp"
+PAGES = [*sorted(DOCS.glob("*.md")), *sorted(ROOT.glob("*.md"))]
+CODE = re.compile(r"[EW]\d{3}")
+
+
+def load_stage() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("stage", DOCS / "site" / "stage.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+STAGE = load_stage()
+
+
+def rows(text: str) -> list[list[str]]:
+    """The cells of every row of every table, headings and rulers too."""
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    cells = [re.split(r"(?<!\\)\|", line)[1:-1] for line in lines]
+    return [[cell.strip() for cell in row] for row in cells]
+
+
+def section(page: str, heading: str) -> str:
+    """What stands below one heading of a page."""
+    text = (DOCS / page).read_text(encoding="utf-8")
+    parts = re.split(r"^## (.*)$", text, flags=re.MULTILINE)
+    return dict(zip(parts[1::2], parts[2::2], strict=True))[heading]
+
+
+# ---------------------------------------------------------------- the project file
+
+
+def words(schema: dict[str, Any]) -> str:
+    """What a key may hold, from its JSON schema, as the page says it."""
+    if "$ref" in schema:
+        return "prior" if schema["$ref"].endswith("PriorSpec") else "table"
+    if "anyOf" in schema:
+        kinds = [words(each) for each in schema["anyOf"] if each.get("type") != "null"]
+        if kinds[-1] == "prior":  # a number is the shortest prior
+            kinds = ["prior", *kinds[1:-1]]
+        return " or ".join(dict.fromkeys(kinds))
+    if "enum" in schema:
+        return "one of " + ", ".join(str(each) for each in schema["enum"])
+    if "const" in schema:
+        return f'"{schema["const"]}"'
+    if schema.get("maxItems") == 2:
+        return "[low, high]"
+    inner = schema.get("items", schema.get("additionalProperties"))
+    many = words(inner) if isinstance(inner, dict) else ""
+    many = "tables" if many.startswith("table") else many
+    many = "priors" if many == "prior" else many
+    of = f" of {many}" if many else ""
+    names = {"number": "number", "integer": "whole number", "string": "text"}
+    names |= {"boolean": "true or false", "array": f"list{of}", "object": f"table{of}"}
+    least = {"exclusiveMinimum": " > 0", "minimum": " >= 0"}
+    bound = next((text for key, text in least.items() if key in schema), "")
+    return names[schema["type"]] + bound
+
+
+def stated(schema: dict[str, Any], key: str, required: list[str]) -> str:
+    """A key's default as the page says it."""
+    value = schema.get("default")
+    if key in required:
+        return "required"
+    if value is None or isinstance(value, dict):
+        return "-"
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+SPEC = ProjectSpec.model_json_schema()
+SECTIONS = {
+    "The whole file": "",
+    "[parameters.NAME]": "PriorSpec",
+    "[effects.CHANNEL.NAME]": "EffectSpec",
+    "[[logs]]": "LogSpec",
+    "[logs.columns.CHANNEL]": "ColumnSpec",
+    "[logs.resample]": "ResampleSpec",
+    "[actuators.INPUT]": "ActuatorSpec",
+    "[likelihood]": "LikelihoodSpec",
+    "[task]": "TaskSpec",
+    "[model]": "ModelSpec",
+    "[planner]": "PlannerSpec",
+}
+
+
+@pytest.mark.parametrize("heading", SECTIONS)
+def test_every_key_of_a_project_file_is_told(heading: str) -> None:
+    """A failure shows the rows to be written: key, value, default; then its meaning."""
+    name = SECTIONS[heading]
+    table = SPEC["$defs"][name] if name else SPEC
+    known = table["properties"]
+    if name == "EffectSpec":  # beside a prior's keys
+        known = {k: v for k, v in known.items() if k not in prior_keys()}
+    required = table.get("required", [])
+    expected = [
+        [f"`{key}`", words(value), stated(value, key, required)]
+        for key, value in known.items()
+    ]
+    told = rows(section("project_file.md", heading))[2:]
+    assert [row[:3] for row in told] == expected
+    assert all(len(row) == 4 and row[3] for row in told)
+
+
+def prior_keys() -> set[str]:
+    return set(SPEC["$defs"]["PriorSpec"]["properties"])
+
+
+def test_every_section_of_a_project_file_is_told() -> None:
+    assert set(SPEC["$defs"]) == set(SECTIONS.values()) - {""}
+
+
+def test_every_machine_of_a_project_file_is_told() -> None:
+    found: dict[str, tuple[set[str], set[str], set[str]]] = {}
+    for row in rows(section("project_file.md", "Machines"))[2:-1]:
+        names, *cells = (set(re.findall(r"`([\w.]+)`", cell)) for cell in row)
+        found |= dict.fromkeys(names, (cells[0], cells[1], cells[2]))
+    expected = {}
+    for name in SYSTEMS:
+        system = system_class(name)()
+        states = {c.name for c in system.physical_states if ".velocity" not in c.name}
+        options = set(type(system).__init__.__annotations__) - {"parameters", "return"}
+        expected[name] = states, {c.name for c in system.actions}, options
+    assert found == expected
+
+
+def test_every_effect_of_a_project_file_is_told() -> None:
+    text = section("project_file.md", "[effects.CHANNEL.NAME]")
+    listed = text.split("exist:")[1].split("Of a model's")[0]
+    assert re.findall(r"`(\w+)`", listed) == sorted(EFFECTS)
+
+
+# ------------------------------------------------------------------------- codes
+
+
+def spoken_codes() -> set[str]:
+    """Codes that begin a text of the package: what it raises, warns of, or reports."""
+    found = set()
+    for module in itertools.chain(*STAGE.modules().values()):
+        for node in ast.walk(STAGE.tree(module)):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                code = node.value[:4]
+                if CODE.fullmatch(code) and node.value[4:5] in ("", " "):
+                    found.add(code)
+    return found
+
+
+def test_every_code_is_told_once_and_none_that_is_not_spoken() -> None:
+    told = [
+        row[0].strip("`")
+        for row in rows((DOCS / "codes.md").read_text(encoding="utf-8"))
+        if CODE.fullmatch(row[0].strip("`"))
+    ]
+    assert len(told) == len(set(told))
+    assert set(told) == spoken_codes()
+
+
+def test_every_exit_code_is_told() -> None:
+    told = {int(row[0]) for row in rows(section("codes.md", "Exit codes"))[2:]}
+    codes = "OK BUG INPUT DISK OWNED INTERRUPTED TERMINATED".split()
+    assert told == {getattr(cli, name) for name in codes}
+
+
+def test_the_example_of_an_error_is_what_is_printed() -> None:
+    error = missing("tau1", ["time", "pos1", "tau_1"], "runs/a.csv")
+    assert str(error) in (DOCS / "codes.md").read_text(encoding="utf-8")
+
+
+def test_every_command_is_told() -> None:
+    told = re.findall(r"`sim2gp (\w+)", section("choose.md", "Which command"))
+    assert sorted(told) == sorted([*COMMANDS, "COMMAND"])
+
+
+def test_every_option_that_pages_give_a_command_is_there() -> None:
+    seen, unknown = 0, []
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        for name, rest in re.findall(r"sim2gp ([a-z]+)\b([^`\n|#]*)", text):
+            options = re.findall(r"--([a-z][a-z-]*)", rest)
+            if name in COMMANDS and options:
+                known = {f.name.replace("_", "-") for f in fields(COMMANDS[name])}
+                seen += len(options)
+                unknown += [
+                    f"{page.name}: {name} {o}" for o in options if o not in known
+                ]
+    assert seen > 30
+    assert not unknown, "\n".join(unknown)
+
+
+def test_project_files_of_the_pages_are_valid() -> None:
+    seen = 0
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        for block in re.findall(r"^```toml\n(.*?)^```", text, re.M | re.S):
+            if block.startswith("system"):
+                ProjectSpec.model_validate(tomllib.loads(block))
+                seen += 1
+    assert seen >= 2
+
+
+# ---------------------------------------------------------------------- the site
+
+
+def navigation(entries: list[dict[str, Any]]) -> list[str]:
+    """The pages that the site's navigation lists, in order."""
+    pages = []
+    for entry in entries:
+        for target in entry.values():
+            pages += [target] if isinstance(target, str) else navigation(target)
+    return pages
+
+
+def test_every_page_and_package_stands_in_the_navigation_once() -> None:
+    project = tomllib.loads((ROOT / "zensical.toml").read_text())["project"]
+    expected = [page.name for page in DOCS.glob("*.md")]
+    expected += [f"reference/{name}.md" for name in ["index", *STAGE.modules()]]
+    expected += STAGE.TOP.values()
+    assert sorted(navigation(project["nav"])) == sorted(expected)
+
+
+def test_every_module_and_public_name_stands_in_the_reference() -> None:
+    import sim2gp
+
+    files = {p.relative_to(PACKAGE).as_posix() for p in PACKAGE.rglob("*.py")}
+    pages = STAGE.reference()
+    told = re.findall(r"^::: (\S+)$", "\n".join(pages.values()), re.MULTILINE)
+    assert len(told) == len(set(told)) == len(files - {"__init__.py", "__main__.py"})
+    assert {STAGE.file_of(name).relative_to(PACKAGE).as_posix() for name in told} <= (
+        files
+    )
+    names = re.findall(r"`sg\.(\w+)`\]\((\S+)\.md#([\w.]+)\) \| \S", pages["index"])
+    assert {name for name, _, _ in names} == set(sim2gp.__all__) - {"__version__"}
+    for _, page, path in names:  # the anchor is of a thing that the page documents
+        assert {path, path.rpartition(".")[0]} & set(
+            re.findall(r"^::: (\S+)$", pages[page], re.MULTILINE)
+        )
+
+
+def test_pages_are_staged(tmp_path: Path) -> None:
+    fence = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```", re.MULTILINE | re.DOTALL)
+    page = DOCS / "your_system.md"
+    text = STAGE.staged(page, tmp_path)
+    assert "```python\n" in text
+    assert "```python nightly" not in text
+    assert fence.findall(text) == fence.findall(page.read_text(encoding="utf-8"))
+    assert "](contributing.md#a-new-system)" in text
+    links = (
+        "[a](images/demo.gif) [b](../README.md#c) [d](theory.md#e) [f](https://x.y/z)"
+    )
+    file = "files/docs/images/demo.gif"
+    assert STAGE.relinked(links, page, tmp_path) == (
+        f"[a]({file}) [b](reference/index.md#c) [d](theory.md#e) [f](https://x.y/z)"
+    )
+    assert (tmp_path / file).read_bytes() == (DOCS / "images/demo.gif").read_bytes()
+
+
+def test_code_keeps_what_looks_like_a_link(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("`[a](b)`\n\n```python logs\nx[0](y)\n```\n", encoding="utf-8")
+    assert STAGE.staged(page, tmp_path).split() == (
+        ["`[a](b)`", "```python", "x[0](y)", "```"]
+    )
+
+
+def anchors(page: Path) -> set[str]:
+    """What a page's headings are called in a link."""
+    text = re.sub(r"^```.*?^```", "", page.read_text("utf-8"), flags=re.M | re.S)
+    titles = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    plain = [re.sub(r"[^\w\s-]", "", title.lower()).strip() for title in titles]
+    return {title.replace(" ", "-") for title in plain}
+
+
+def test_links_between_pages_find_their_heading() -> None:
+    broken = []
+    for page in PAGES:
+        for target, heading in re.findall(
+            r"\]\(([^)#\s:]*)#([^)]+)\)", page.read_text(encoding="utf-8")
+        ):
+            there = (page.parent / target).resolve() if target else page
+            if there.suffix == ".md" and heading not in anchors(there):
+                broken.append(f"{page.name}: {target}#{heading}")
+    assert not broken, "\n".join(broken)
+
+
+def test_pages_are_reached_from_the_first_one() -> None:
+    reached, waiting = set(), [DOCS / "index.md"]
+    while waiting:
+        page = waiting.pop()
+        if page not in reached and page.suffix == ".md" and page.parent == DOCS:
+            reached.add(page)
+            links = re.findall(r"\]\(([^)#\s:]+)", page.read_text(encoding="utf-8"))
+            waiting += [(DOCS / link).resolve() for link in links]
+    assert set(DOCS.glob("*.md")) <= reached
+
+
+def defined(file: Path, path: str) -> bool:
+    """Whether a file defines a function, a class, or a method, by its dotted path."""
+    body = ast.parse(file.read_text(encoding="utf-8")).body
+    for name in path.split("."):
+        kinds = ast.ClassDef | ast.FunctionDef
+        found = [n for n in body if isinstance(n, kinds) and n.name == name]
+        if not found:
+            return False
+        body = found[0].body
+    return True
+
+
+def test_the_theory_names_code_and_tests_that_are_there() -> None:
+    text = (DOCS / "theory.md").read_text(encoding="utf-8")
+    lost = []
+    for file, path in re.findall(r"`([\w/]+\.py):([\w.]+)`", text):
+        home = ROOT / "tests" if file.startswith("test_") else PACKAGE
+        if not ((home / file).is_file() and defined(home / file, path)):
+            lost.append(f"{file}:{path}")
+    assert not lost, "\n".join(lost)
+    numbered = [row for row in rows(text) if re.fullmatch(r"\(\d+\)", row[0])]
+    numbers = list(dict.fromkeys(int(row[0].strip("()")) for row in numbered))
+    assert sorted(numbers) == list(range(1, max(numbers) + 1))
+    assert all(len(row) == 4 and "`test_" in row[3] for row in numbered)
