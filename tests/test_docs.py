@@ -103,6 +103,7 @@ SECTIONS = {
     "[[logs]]": "LogSpec",
     "[logs.columns.CHANNEL]": "ColumnSpec",
     "[logs.resample]": "ResampleSpec",
+    "[[weighed]]": "WeighedSpec",
     "[actuators.INPUT]": "ActuatorSpec",
     "[likelihood]": "LikelihoodSpec",
     "[task]": "TaskSpec",

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from sim2gp.cli.arguments import numbers, pairs, usage_error
+from sim2gp.cli.options import Chosen, Common, Reads, Writes
 from sim2gp.runs import Progress, load_run
 from sim2gp.runs.store import check_absent, check_target
 from sim2gp.runs.workers import cores
@@ -25,42 +26,6 @@ FIGURES = {
     "fig5": "figure3",
     "mismatch": "mismatch",
 }
-
-
-@dataclass(kw_only=True)
-class Common:
-    """Options that every command has."""
-
-    json: bool = False
-    """Print the summary alone, as JSON, on stdout."""
-    quiet: bool = False
-    """No progress and no notes."""
-    debug: bool = False
-    """Show the traceback of an error."""
-
-
-@dataclass(kw_only=True)
-class Writes(Common):
-    """Options of a command that writes a run directory."""
-
-    out: Annotated[Path | None, arg(metavar="DIR")] = None
-    """The run directory; default runs/NAME."""
-
-
-@dataclass(kw_only=True)
-class Chosen(Common):
-    """The option of a command that needs the machine as it stands."""
-
-    configuration: Annotated[str | None, arg(metavar="NAME")] = None
-    """Which one, where groups of logs are of several."""
-
-
-@dataclass(kw_only=True)
-class Reads(Writes):
-    """Options of a command that reads logs."""
-
-    strict: bool = False
-    """Refuse logs with columns that nothing takes."""
 
 
 @dataclass(kw_only=True)

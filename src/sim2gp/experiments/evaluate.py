@@ -86,8 +86,7 @@ def run(
         arrays |= shares
         picture = drawn(system, fit.posterior, fit.band, grid)
         arrays |= trace_arrays(picture, grid, tested, names)
-        notes = _said(tested)
-        notes += [str(note) for note in shared_rows(train or (), tested)]
+        notes = _said(tested) + list(map(str, shared_rows(train or (), tested)))
         if train is None:
             notes.append("the training logs were not found: no regression beside")
         about, moves = film(

@@ -79,8 +79,7 @@ def run(
         windows, places = cut_places(found, logs)
         of = np.asarray([k for k, _ in places])
         task.advance(f"{len(windows)} windows")
-        key = jax.random.key(seed)
-        robust = found.spec.likelihood.robust
+        key, robust = jax.random.key(seed), found.spec.likelihood.robust
         grid = evaluation_windows(logs, found.system, longest=CURVE[-1])
         compile_forecast(found.system, grid.windows)
         compile_linearise(found.system, windows)
@@ -91,9 +90,9 @@ def run(
         honest = corrected_windows(belief, windows, of)
         summary = _summarise(found, logs, windows, belief, honest, band, seed)
         arrays = _stored(belief, honest.posterior, band, seed)
-        other = (
-            unseen(found, logs, windows, places, grid, key=key) if held_out else None
-        )
+        other = None
+        if held_out:
+            other = unseen(found, logs, windows, places, grid, key=key)
         said, drawings = _drawings(found, logs, belief, band, grid, other)
         summary, arrays = summary | said, arrays | drawings
         task.advance("forecasts")
