@@ -270,6 +270,8 @@ def full_run() -> Run:
             {"title": "Leave one log out", "columns": ["log", "joint", "ratio"],
              "rows": [["excite_1.csv", "q1", 0.874], ["excite_1.csv", "q2", 0.913]],
              "note": "Error over that of plain least squares."},
+            {"title": "By horizon", "rows": [["0.1", *["0.0123"] * 9]],
+             "columns": ["horizon, s", *(f"joint {k}, held" for k in range(9))]},
         ],
     }  # fmt: skip
     arrays: dict[str, np.ndarray] = {}

@@ -112,6 +112,15 @@ def test_a_plane_is_seen_at_a_right_angle(normal: tuple[float, ...]) -> None:
     assert normal[2] > 0.5 or up[0, 1] < middle[0, 1] - 5  # what is up stays up
 
 
+@pytest.mark.parametrize("normal", [(1, -1, 0.4), (1, 1, 1), (0.2, 1, -0.3)])
+def test_half_a_circle_stands_in_the_middle(normal: tuple[float, ...]) -> None:
+    half = turned(np.asarray(normal, float))[:24, 1:]
+    scene = skeleton({"fixed": [], "rods": [], "balls": [[0, "tip"]]}, half)
+    pixels, _ = scenes.project(scene, half[:, 0])
+    middle = 0.5 * (pixels.min(axis=0) + pixels.max(axis=0))
+    np.testing.assert_allclose(middle, [scene.width / 2, scene.height / 2], atol=6)
+
+
 def test_what_moves_in_space_is_seen_from_above_and_can_be_turned() -> None:
     t = np.linspace(0.0, 6.0, 50)
     path = np.stack([np.cos(t), 0.7 * np.sin(t), 0.4 * np.cos(2.3 * t)], axis=1)
@@ -140,11 +149,13 @@ def test_what_moves_along_a_line_is_seen_from_its_side(axis: int) -> None:
 def test_the_recorded_machine_is_a_pale_shadow_of_its_own_points() -> None:
     summary, arrays = a_film()
     about = summary["animation"]["figure"]
+    about = about | {"rods": [*about["rods"], [0, 2, "link"]]}  # from the base
     scene = skeleton(about, arrays["animation/points"])
     both = overlaid(scene, arrays["animation/recorded_points"])
     assert both.moving.shape[1] == 6
     ghosts = [shape for shape in both.shapes if shape.colour == "ghost"]
-    assert {shape.points for shape in ghosts} == {(4, 5), (5, 6), (4,), (5,), (6,)}
+    rods, balls = {(4, 5), (5, 6), (0, 5)}, {(4,), (5,), (6,)}
+    assert {shape.points for shape in ghosts} == rods | balls
     lowest = min(shape.layer for shape in both.shapes if shape.colour == "blue")
     assert all(shape.layer < lowest for shape in ghosts)
     np.testing.assert_array_equal(
