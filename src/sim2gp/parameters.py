@@ -216,9 +216,8 @@ def _match_in_box(boxed: Parameter, mean: float, sd: float) -> Parameter:
         fit = scipy.optimize.least_squares(moments, start, xtol=1e-14, ftol=1e-14)
     if float(np.abs(fit.fun).max()) > 1e-6:
         raise _impossible(boxed, mean, sd, "moments that this map can reach")
-    return dataclasses.replace(
-        boxed, mean=float(fit.x[0]), sd=float(math.exp(fit.x[1]))
-    )
+    mean, sd = float(fit.x[0]), math.exp(fit.x[1])
+    return dataclasses.replace(boxed, mean=mean, sd=sd)
 
 
 def _impossible(p: Parameter, mean: float, sd: float, expected: str) -> InputError:
