@@ -32,7 +32,7 @@ INPUTS = (
         CHECKS,
         "moved = np.any(np.diff(rows[:, 1:], axis=0) != 0.0, axis=1)",
         "moved = np.any(np.diff(rows, axis=0) != 0.0, axis=1)",
-        ("test_logs.py", "shared_rows"),
+        ("test_logs.py", "begin_at_rest"),
     ),
     Mutant(
         "inputs: nobody is strict",

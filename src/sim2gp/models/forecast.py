@@ -26,7 +26,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.optimize
 from jaxtyping import Array, Bool, Float
 
 from sim2gp.ahead import ahead
@@ -173,6 +172,8 @@ def fit_band(found: Forecast, grid: Grid, recordings: int) -> Band:
     The disturbances' standard deviations maximise the Gaussian likelihood of the
     errors at all rows, taken as if they were independent.
     """
+    import scipy.optimize  # late, as in `sim2gp.parameters`
+
     start_sd = np.sqrt(np.nanmean(grid.lag**2, axis=0))
     resolution = np.asarray(grid.windows.floor)
     valid, m = found.valid, recordings
