@@ -74,10 +74,10 @@ CONFIGURATIONS = (
         (HERE, "one_step"),
     ),
     Mutant(
-        "configurations: a column for what nobody shares",
+        "configurations: a column for what is known",
         MACHINES,
         "if column == p.name or column in own:",
-        "if column == p.name or column in own or column == columns:",
+        "if column == p.name or AT in column:",
         (HERE, "columns_are"),
     ),
     Mutant(

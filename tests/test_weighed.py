@@ -10,6 +10,7 @@ import pytest
 import scipy.optimize
 
 from linear_system import linear, transitions, windows_of
+from sim2gp.diagnose.score import _Linear
 from sim2gp.errors import InputError
 from sim2gp.models import Sim2GP
 from sim2gp.models.informed import informed_prior
@@ -144,6 +145,19 @@ def test_a_candidate_keeps_what_is_known() -> None:
     assert machine.longest_delay == 0.02
     more = {"theta.coulomb", "voltage.delay"}
     assert {*machine.parameters.names} == {*both.parameters.names, *more}
+
+
+@in_float64
+def test_a_linearised_likelihood_moves_its_sums() -> None:
+    table = Parameters(BOXES, weighed=(Weighed(("a", "c"), (1.0, 3.0), 2.0, 0.1),))
+    z0, z = jnp.asarray([0.3, -0.2, 0.1]), jnp.asarray([0.31, -0.21, 0.12])
+    rows = table.known(table.prior(), z0)
+    linear_one = _Linear(jnp.zeros((1, 1, 4, 4)), z0, jnp.zeros((1, 0)), rows)
+    np.testing.assert_array_equal(linear_one.known(z0), rows)
+    exact = table.known(table.prior(), z)
+    np.testing.assert_array_equal(linear_one.known(z)[:, :-1], rows[:, :-1])
+    np.testing.assert_allclose(linear_one.known(z)[:, -1], exact[:, -1], atol=5e-3)
+    assert float(jnp.abs(rows - exact)[0, -1]) > 0.1
 
 
 ARM = """system = "uniform_rod_arm"
