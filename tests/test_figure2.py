@@ -105,7 +105,13 @@ def test_a_policy_that_is_trained_has_cells_of_its_own():
     assert quick.steps * quick.updates <= 4000
 
 
-@pytest.mark.parametrize("method", TRAINED)
+@pytest.mark.parametrize(
+    "method",
+    [
+        "domain randomisation",
+        pytest.param("off-policy oracle", marks=pytest.mark.nightly),
+    ],
+)
 def test_policies_are_trained_where_no_episode_changes_anything(method, monkeypatch):
     small = SAC(hidden=(8,), worlds=4, steps=5, updates=1)
     monkeypatch.setitem(swingup.PLANNERS, "sac", small)

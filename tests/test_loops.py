@@ -200,7 +200,10 @@ def test_keys_differ_by_episode_and_purpose() -> None:
 # ------------------------------------------------------------------- oracles
 @pytest.mark.parametrize(
     ("preset", "least"),
-    [(tasks.furuta_swingup, 140.0 / 200.0), (tasks.cartpole_swingup, 190.0 / 250.0)],
+    [
+        (tasks.cartpole_swingup, 190.0 / 250.0),
+        pytest.param(tasks.furuta_swingup, 140.0 / 200.0, marks=pytest.mark.nightly),
+    ],
 )
 def test_the_oracle_swings_up_the_published_machine(
     preset: Callable[[], Task], least: float

@@ -116,6 +116,7 @@ def test_ljung_box_keeps_to_episodes_and_rows_that_exist() -> None:
     assert pytest.approx(expected * (N + 2) / N, rel=1e-12) == Q
 
 
+@pytest.mark.nightly
 def test_ljung_box_has_its_level_with_many_constants_and_few_rows() -> None:
     """Four channels, 12 constants, 250 rows: the projection alone correlates rows."""
     found = [misfit(**linear(seed, N=250, d=4, p=12)) for seed in range(250)]
@@ -255,6 +256,7 @@ def test_verdicts_say_what_to_do() -> None:
     assert "theta" in bad.tests["f_test"].text
 
 
+@pytest.mark.nightly
 def test_the_pendulum_of_reliability_3_4() -> None:
     """S10 in small; see `misfit_pendulum` for the set-up."""
     fine = alarms(200, 500)

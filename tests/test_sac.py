@@ -280,6 +280,7 @@ def test_a_new_draw_is_new_data() -> None:
     assert int(learner.updates) == 3 * 5 * 2
 
 
+@pytest.mark.nightly
 def test_seeds_side_by_side_are_seeds_one_by_one() -> None:
     """A preparation is pure: several learners train as one batch, in their worlds."""
     planner = dataclasses.replace(discounted(0.5), steps=4, updates=2)

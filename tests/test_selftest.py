@@ -1,6 +1,7 @@
 """The selftest passes here, and each of its checks notices what it is there for."""
 
 import math
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,7 +22,13 @@ def figure(name, seed=0):
     return CHECKS[name].measure(np.random.default_rng([seed, number]))
 
 
-@pytest.mark.parametrize("name", CHECKS)
+def by_day() -> list[Any]:
+    """The machines' derivatives have tests of their own (test_system_jacobians.py)."""
+    night = pytest.mark.nightly
+    return [pytest.param(n, marks=night) if n == "jacobians" else n for n in CHECKS]
+
+
+@pytest.mark.parametrize("name", by_day())
 def test_each_check_passes_here(name):
     assert figure(name) <= CHECKS[name].limit
 

@@ -98,6 +98,7 @@ def test_the_right_model_meets_the_information_identity():
     np.testing.assert_allclose(off, 0.0, atol=4.5 * sd / np.sqrt(2.0))
 
 
+@pytest.mark.nightly
 def test_rows_said_twice_say_nothing_new():
     """Every row five times over, one after the other: the same posterior as once."""
     J, y = rows(400, bent=1.0)
@@ -179,6 +180,7 @@ def without_its_layer(belief):
     return eqx.tree_at(lambda b: b.head.layer.scale, belief, replace_fn=jnp.zeros_like)
 
 
+@pytest.mark.nightly
 def test_the_residual_model_is_as_wide_as_its_data_disagree(bent):
     belief, _, (expected, kappa) = bent
     assert kappa > 3.0

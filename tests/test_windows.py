@@ -211,7 +211,7 @@ def _none(x: object) -> bool:
     return x is None
 
 
-@pytest.mark.parametrize("jitter", [0.0, 0.4])
+@pytest.mark.parametrize("jitter", [pytest.param(0.0, marks=pytest.mark.nightly), 0.4])
 def test_delay_is_recovered_without_velocities(jitter: float) -> None:
     truth = 0.0063
     free = actuator_prior(pendulum().actions[0], "delay")
