@@ -113,7 +113,7 @@ CONFIGURATIONS = (
         "laplace.py",
         "+ z + known[:, :-1].T @ apart",
         "+ z",
-        ROW,
+        (WEIGHED, "gradient"),
     ),
     Mutant(
         "weighed: linearised about the prior's mean",

@@ -10,10 +10,13 @@ import pytest
 import scipy.optimize
 
 from linear_system import linear, transitions, windows_of
+from sim2gp.arrowhead import Noise
 from sim2gp.diagnose.score import _Linear
 from sim2gp.errors import InputError
+from sim2gp.laplace import minimise
 from sim2gp.models import Sim2GP
 from sim2gp.models.informed import informed_prior
+from sim2gp.models.sim2gp import likelihood
 from sim2gp.models.windows import WindowsBelief, fit_windows
 from sim2gp.parameters import Parameter, Parameters
 from sim2gp.project import load_project
@@ -82,6 +85,19 @@ def test_one_step_data_know_it_too() -> None:
     scale = np.asarray(found.posterior.scale)
     np.testing.assert_allclose(scale @ scale.T, covariance, rtol=1e-7)
     np.testing.assert_allclose(found.posterior.mean, mean, rtol=1e-8)
+
+
+@in_float64
+def test_its_pull_is_part_of_the_gradient() -> None:
+    """At the MAP the sum and the prior pull against each other."""
+    J, y = data()
+    model = Sim2GP(with_weighed(linear(3, 1), [SUM]), dt=1.0)
+    rows = jax.tree.map(jnp.asarray, transitions(J, y))
+    noise = Noise(jnp.full(1, 0.1), jnp.ones(1))
+    one = likelihood(model, rows)
+    fit = jax.jit(lambda z: minimise(one, z, jnp.zeros((1, 0)), noise))(jnp.zeros(3))
+    np.testing.assert_allclose(fit.z, dense(0.1)[0], rtol=1e-9)
+    assert float(fit.gradient) < 1e-8
 
 
 @in_float64
