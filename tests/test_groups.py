@@ -294,3 +294,26 @@ def test_commands_for_one_configuration_say_so(
     with pytest.raises(InputError, match=one):
         explain.run(run, add=False, out=out, progress=QUIET)
     assert not out.exists()
+
+
+@pytest.mark.nightly
+def test_a_weighed_sum_is_known_before_the_logs(
+    run: Path, folder: Path, tmp_path: Path
+) -> None:
+    path = folder / "weighed.toml"
+    both = ("body/arm/mass", "body/hand/mass @ loaded")
+    known = f"[[weighed]]\nof = {json.dumps(both)}\nvalue = 0.9\nsd = 0.001\n"
+    path.write_text(PROJECT.replace("[[logs]]", f"{known}[[logs]]", 1))
+    identify.run(path, out=tmp_path / "run", seed=0, progress=QUIET)
+    plain, told = (load_run(x).summary for x in (run, tmp_path / "run"))
+    for name in both:
+        now, before = told["parameters"][name], plain["parameters"][name]
+        assert abs(now["mean"] - before["mean"]) < 3.0 * before["sd"]
+        assert now["sd"] < before["sd"]
+        assert now["prior_sd"] < 0.95 * before["prior_sd"]
+    total = sum(told["parameters"][name]["mean"] for name in both)
+    assert total == pytest.approx(0.9, abs=0.003)
+    damping = NAMES[0]
+    prior = [x["parameters"][damping]["prior_sd"] for x in (plain, told)]
+    assert prior[0] == pytest.approx(prior[1])
+    assert not told["misfit"]["alarm"]
