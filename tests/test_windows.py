@@ -136,6 +136,10 @@ def test_window_zero_is_the_one_step_fit() -> None:
         np.asarray(one.posterior.mean),
         atol=0.02 * sd.min(),
     )
+    # Begun at the MAP, a descent ends there.
+    again = fit_windows(system, windows, key=key, near=ours.posterior.mean)
+    moved = np.asarray(again.posterior.mean) - np.asarray(ours.posterior.mean)
+    assert np.all(np.abs(moved) < 1e-4 * sd)
 
 
 def test_masked_rows_count_as_removed_ones() -> None:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Array, Bool, Float
 
 from sim2gp.experiments.prediction import (
     Judged,
@@ -98,8 +98,9 @@ def fold(
     *,
     key: Key,
     starts: int,
+    near: Float[Array, " p"] | None = None,
 ) -> Fold:
-    """The fit of what ``part`` may see, judged by the rest.
+    """The fit of what ``part`` may see, begun ``near`` its MAP, judged by the rest.
 
     Raises as `sim2gp.models.windows.fit_windows` does.
     """
@@ -107,7 +108,7 @@ def fold(
     mask = np.asarray(windows.mask) & part.train[:, None, None]
     kept = eqx.tree_at(lambda w: w.mask, windows, mask)
     robust = project.spec.likelihood.robust
-    belief = fit_windows(system, kept, key=key, robust=robust, starts=starts)
+    belief = fit_windows(system, kept, key=key, robust=robust, starts=starts, near=near)
     result = forecast(system, belief.posterior, grid.windows, rows)
     train, tested = subset(grid, part.known), subset(grid, part.test)
     curve = np.isin(rows, [steps_of(h) for h in CURVE])

@@ -92,7 +92,7 @@ def run(
         arrays = _stored(belief, honest.posterior, band, seed)
         other = None
         if held_out:
-            other = unseen(found, logs, windows, places, grid, key=key)
+            other = unseen(found, logs, windows, places, grid, belief)
         said, drawings = _drawings(found, logs, belief, band, grid, other)
         summary, arrays = summary | said, arrays | drawings
         task.advance("forecasts")

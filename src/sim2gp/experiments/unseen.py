@@ -7,6 +7,7 @@ the last recording (or the end of the only one), which is then forecast.
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from sim2gp.errors import DeadParameters, NotConverged, NotFinite
@@ -15,9 +16,8 @@ from sim2gp.experiments.folds import Fold, fold, held_out
 from sim2gp.experiments.prediction import TRACE, channels, drawn, scores, trace_arrays
 from sim2gp.logs import Log
 from sim2gp.models.grid import CURVE, Grid, steps_of
-from sim2gp.models.windows import Windows
+from sim2gp.models.windows import Windows, WindowsBelief
 from sim2gp.project import Project
-from sim2gp.types import Key
 
 PREFIX = "unseen"  # of the traces
 Picture = dict[str, tuple[np.ndarray, ...]]
@@ -38,19 +38,23 @@ def unseen(
     windows: Windows,
     places: Sequence[tuple[int, int]],
     grid: Grid,
-    *,
-    key: Key,
+    whole: WindowsBelief,
 ) -> Unseen:
     """A second fit, of a part of the windows, and its forecasts of the rest.
 
-    As many starts as `identify` has: the two fits share their compilation.
+    It begins where the ``whole`` logs put the constants, from as many starts as that
+    fit: the two share their compilation.
     """
     part = held_out(logs, windows, places, grid)
     if part is None:
         return _none("too little was recorded to hold some of it out.")
     horizon = _horizon(grid, part.test)
     try:
-        found = fold(project, windows, grid, part, horizon, key=key, starts=2)
+        key = jax.random.key(0)  # of starts that it does not draw
+        near = whole.posterior.mean
+        found = fold(
+            project, windows, grid, part, horizon, key=key, starts=2, near=near
+        )
     except (NotConverged, NotFinite, DeadParameters) as error:
         return _none(f"a fit without {part.words} failed ({error}).")
     names = channels(project.system, windows)

@@ -347,21 +347,28 @@ def fit_windows(
     prior: Gaussian | None = None,
     robust: bool = False,
     starts: int = 2,
+    near: Float[Array, " p"] | None = None,
 ) -> WindowsBelief:
     """Posterior of the constants given windows of logs.
 
     Noise by EM, one Student-t weight per window where ``robust``. A ``prior`` is what
-    is believed but for what was weighed. Raises `NotConverged`, `NotFinite` or
-    `DeadParameters`.
+    is believed but for what was weighed. The descent begins at the prior's mean and
+    elsewhere, or at virtual values ``near`` the MAP alone. Raises `NotConverged`,
+    `NotFinite` or `DeadParameters`.
     """
     prior = system.parameters.prior() if prior is None else prior
     p = prior.mean.size
-    spread = 0.7 * jax.random.normal(key, (starts - 1, p))
+    first = jnp.zeros((starts, p))
+    if near is not None:
+        z = jnp.linalg.solve(prior.scale, jnp.asarray(near, float) - prior.mean)
+        first = first + z[None]
+    elif starts > 1:
+        first = first.at[1:].set(0.7 * jax.random.normal(key, (starts - 1, p)))
     fit, belief = _fit(
         system,
         prior,
         jax.tree.map(jnp.asarray, windows),
-        jnp.concatenate([jnp.zeros((1, p)), spread]),
+        first,
         jnp.asarray(FREEDOM if robust else jnp.inf),
     )
     names = system.parameters.names
