@@ -103,7 +103,8 @@ def nothing_moves(folder: Path, patch: Patch) -> None:
     """
     factor, none = jnp.zeros((3, 3)).at[2, 2].set(1.0), jnp.zeros((1, 0))
     z, zero = jnp.zeros(2), jnp.zeros(())
-    at = laplace.Point(z, none, factor[None, None], zero + 0.5, z, none)
+    known = jnp.zeros((0, 3))
+    at = laplace.Point(z, none, factor[None, None], known, zero + 0.5, z, none)
     arrow = Elimination(factor, jnp.zeros((1, 0, 0)), jnp.zeros((1, 0, 3)))
     status, steps = jnp.asarray(laplace.CONVERGED), jnp.asarray(0)
     fit = laplace.Fit(at, arrow, factor, zero, status, steps)

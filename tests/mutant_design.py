@@ -8,7 +8,7 @@ RUN = "experiments/design.py"
 TOLD = ("test_design.py", "tells_what_the_log")
 GOAL = ("test_design.py", "dense_covariances")
 KEPT = ("test_design.py", "exactly or followed")
-SEARCHED = ("test_design.py", "beats_random or nothing_can")
+SEARCHED = ("test_design_search.py", "beats_random or nothing_can")
 
 DESIGN = (
     Mutant(
@@ -100,7 +100,7 @@ DESIGN = (
         SEARCH,
         "if bad <= ALLOWED:",
         "if bad <= 1.0:",
-        ("test_design.py", "no_smaller"),
+        ("test_design_search.py", "no_smaller"),
     ),
     Mutant(
         "search: the worst plan",
@@ -114,7 +114,7 @@ DESIGN = (
         SEARCH,
         "if jnp.mean(then < LOST) > 1.0 - LEAVING:",
         "if True:",
-        ("test_design.py", "given_up"),
+        ("test_design_search.py", "given_up"),
     ),
     Mutant(
         "search: a turn at most",
@@ -128,7 +128,7 @@ DESIGN = (
         SEARCH,
         "noise=experiment.noise / math.sqrt(k)",
         "noise=experiment.noise",
-        ("test_design.py", "longer_periods"),
+        ("test_design_search.py", "longer_periods"),
     ),
     Mutant(
         "goal: some constants count as one",

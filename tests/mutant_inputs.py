@@ -36,9 +36,9 @@ INPUTS = (
     ),
     Mutant(
         "inputs: nobody is strict",
-        "experiments/prediction.py",
-        "    if strict:",
-        "    if False:",
+        "project/project.py",
+        "        if strict:",
+        "        if False:",
         (TESTS, "extra"),
     ),
     Mutant(

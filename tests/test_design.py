@@ -10,58 +10,28 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from design_cases import (
+    PERIOD,
+    STEPS,
+    WINDOW,
+    commands,
+    delayed,
+    experiment,
+    limits,
+)
 from sim2gp import design as d
 from sim2gp.design import search
 from sim2gp.design.limits import excess, kept
 from sim2gp.errors import InputError
-from sim2gp.gaussian import Gaussian
 from sim2gp.logs import Log
 from sim2gp.models.cutting import cut
 from sim2gp.models.windows import WindowsBelief, information_at
-from sim2gp.systems.actuator import Actuated, actuator_prior
 from simulated_logs import pendulum
 
 pytestmark = pytest.mark.usefixtures("float64")
 
-PERIOD, STEPS, WINDOW = 0.01, 200, 20
 TRAJECTORY, INFORMATION = eqx.filter_jit(d.trajectory), eqx.filter_jit(d.information)
 ROWS = eqx.filter_jit(d.experiment.sensitivity_at)
-LIMITS = {"theta": (-1.5, 1.5), "theta.velocity": (-15.0, 15.0)}
-
-
-def experiment(system=None, *, width=0.5) -> d.Experiment:
-    """Two seconds of a pendulum with three unknown constants, angles measured."""
-    system = pendulum() if system is None else system
-    prior = system.parameters.prior()
-    return d.Experiment(
-        system,
-        Gaussian(prior.mean + 0.1, width * prior.scale),
-        jnp.asarray([2e-3, 3e-3]),
-        jnp.asarray([0.1, 0.4, 0.0, 0.0]),
-        jnp.asarray([0.05, 0.05, 1.0, 1.0]),
-        (0, 1),
-        PERIOD,
-        STEPS,
-        WINDOW,
-    )
-
-
-def commands(seed=0, size=4.0):
-    rng = np.random.default_rng(seed)
-    held = np.repeat(rng.uniform(-size, size, (STEPS // 4, 1)), 4, axis=0)
-    held[:4] = 0.0  # as before the log, whose first input is taken to have held
-    return jnp.asarray(held)
-
-
-def limits(system, stated=LIMITS, rates=None, start=(0.1, 0.4, 0.0, 0.0)):
-    return d.Limits.of(system, stated, rates or {}, start=np.asarray(start))
-
-
-def delayed():
-    """The same pendulum behind an input with an unknown delay."""
-    system = pendulum()
-    free = {"voltage.delay": actuator_prior(system.actions[0], "delay")}
-    return Actuated(system, free)
 
 
 @pytest.mark.parametrize("system", [pendulum(), delayed()], ids=["plain", "delayed"])
@@ -250,151 +220,3 @@ def test_stated_limits_narrow_those_of_the_channels() -> None:
     wide = limits(system, {"voltage": (2.0 * channel.low, 0.5 * channel.high)})
     assert wide.low[0] == channel.low
     assert wide.high[0] == 0.5 * channel.high
-
-
-# ---------------------------------------------------------------- search
-QUICK = {"BLOCKS": 3, "TRIALS": 60, "GUARDS": 12, "CHECKED": 200}
-
-
-def test_worth_has_a_gradient_in_the_commands() -> None:
-    """Against differences, also where some windows tell nothing of a constant."""
-    e = experiment(delayed())
-    z = 0.3 * jnp.ones_like(e.belief.mean)
-
-    @jax.jit
-    def worth(U):
-        states = d.trajectory(e, z, U)
-        return search._worth_at(e, d.Everything(), z, U, states)[0]
-
-    U = commands(2).at[: STEPS // 2].set(0.0)
-    V = commands(3)
-    slope = float(jnp.sum(jax.jit(jax.grad(worth))(U) * V))
-    h = 1e-5
-    difference = float(worth(U + h * V) - worth(U - h * V)) / (2.0 * h)
-    assert slope == pytest.approx(difference, rel=1e-5)
-
-
-def test_a_search_on_longer_periods_sees_the_same() -> None:
-    """Fewer samples of as much less noise; an experiment of few periods stays whole."""
-    fine = dataclasses.replace(experiment(), period=0.002, steps=500, window=50)
-    coarse, signal = search._coarser(fine, d.Multisine(0.002, 500))
-    assert (coarse.period, coarse.steps, coarse.window) == (0.01, 100, 10)
-    box, nowhere = limits(fine.system), jnp.zeros((1, 3))
-    C = 0.1 * jax.random.normal(jax.random.key(1), (signal.coefficients, 1))
-    told = [
-        float(search._worth(e, d.Everything(), nowhere, s.commands(C, box))[0])
-        for e, s in ((fine, d.Multisine(0.002, 500)), (coarse, signal))
-    ]
-    assert told[1] == pytest.approx(told[0], abs=0.1)
-    short = dataclasses.replace(fine, steps=3, window=3)
-    kept, _ = search._coarser(short, d.Multisine(0.002, 3))
-    assert (kept.period, kept.steps, kept.window) == (0.002, 3, 3)
-
-
-def test_commands_are_made_no_smaller_than_they_must_be() -> None:
-    e = experiment()
-    box, draws = limits(e.system), jax.random.normal(jax.random.key(1), (100, 3))
-    U, states, bad = search._kept(e, box, commands(4, 5.0), draws)
-    share = float(jnp.max(jnp.abs(U)) / jnp.max(jnp.abs(commands(4, 5.0))))
-    assert 0.0 < share < 1.0
-    assert bad <= 0.01
-    assert np.mean([float(excess(box, S)) > 0.0 for S in states]) == pytest.approx(bad)
-    _, larger = search._checked(e, box, U / search.SMALLER, draws)
-    assert float(jnp.mean(larger > 0.0)) > 0.01
-
-
-class Away:
-    """A climb that always ends far outside."""
-
-    def compile_for(self, *args) -> None:
-        pass
-
-    def __call__(self, *args):
-        C, state = args[7:9]
-        return 0.0 * C + 1.0, state
-
-
-def test_a_climb_that_ends_far_outside_is_given_up(monkeypatch) -> None:
-    e = experiment()
-    box, signal = limits(e.system), d.Multisine(PERIOD, STEPS)
-    draws = jax.random.normal(jax.random.key(1), (50, 3))
-    monkeypatch.setattr(search, "_climb", Away())
-    improve = search._climber(e, signal, d.Everything(), box, draws[:2], draws)
-    start = improve(jax.random.key(3))
-    assert float(jnp.max(jnp.abs(start))) < 1.0
-    # It begins nearly within its limits.
-    U = signal.commands(start.astype(float), box)
-    _, beyond = search._checked(e, search._narrowed(box), U, draws)
-    assert float(jnp.mean(beyond > 0.0)) <= search.LEAVING + 0.05
-
-
-@pytest.fixture(scope="module")
-def found():
-    """A short search."""
-    with jax.enable_x64(True), pytest.MonkeyPatch.context() as patch:
-        for name, value in QUICK.items():
-            patch.setattr(search, name, value)
-        e = experiment()
-        box = limits(e.system, LIMITS, {"voltage": 100.0})
-        signal = d.Multisine(PERIOD, STEPS)
-        key, goal = jax.random.key(0), d.Everything()
-        best = d.design(e, goal, box, signal, key=key)
-        assert d.design(e, goal, box, signal, key=key, starts=3).nats > best.nats
-        return e, box, signal, best
-
-
-def test_a_designed_experiment_beats_random_ones(found) -> None:
-    e, box, signal, best = found
-    assert best.violations <= 0.01
-    assert float(excess(box, jnp.asarray(best.states))) <= 0.0
-    draws = jax.random.normal(jax.random.key(5), (12, signal.coefficients, 1))
-    nowhere = jnp.zeros(3)
-
-    @jax.jit
-    def random(c):
-        U = signal.commands(0.05 * c, box)
-        states = d.trajectory(e, nowhere, U)
-        scale = d.after(e.belief, d.information(e, nowhere, U, states))
-        return d.Everything().nats(e.belief.scale, scale), excess(box, states)
-
-    told = [random(c) for c in draws]
-    nats = [float(n) for n, beyond in told if float(beyond) <= 0.0]
-    assert nats
-    assert best.nats > max(nats) + 0.3
-    # The scale that is told is that of its own commands.
-    U = jnp.asarray(best.commands)
-    states = TRAJECTORY(e, nowhere, U)
-    A = np.asarray(INFORMATION(e, nowhere, U, states))
-    np.testing.assert_allclose(best.states, states, atol=1e-9)
-    np.testing.assert_allclose(best.scale, d.after(e.belief, jnp.asarray(A)), rtol=1e-9)
-
-
-def test_a_refused_start_does_not_end_the_search(found, monkeypatch) -> None:
-    """The second of two is returned; the first one's refusal is not."""
-    e, box, signal, _ = found
-    for name, value in QUICK.items():
-        monkeypatch.setattr(search, name, value)
-    kept, calls = search._kept, []
-
-    def refused_once(*args: object) -> object:
-        calls.append(args)
-        if len(calls) == 1:
-            raise InputError("E150", "no commands keep the limits")
-        return kept(*args)
-
-    monkeypatch.setattr(search, "_kept", refused_once)
-    key = jax.random.key(0)
-    second = d.design(e, d.Everything(), box, signal, key=key, starts=2)
-    assert len(calls) == 2
-    assert second.violations <= search.ALLOWED
-
-
-def test_no_commands_keep_limits_that_nothing_can(found) -> None:
-    """A pole that starts beside its limit swings beyond it whatever is done."""
-    e, _, signal, _ = found
-    box = limits(e.system, {"alpha": (-0.2, 0.401)})
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in QUICK.items():
-            patch.setattr(search, name, value)
-        with pytest.raises(InputError, match="E150 no commands keep the limits"):
-            d.design(e, d.Everything(), box, signal, key=jax.random.key(0))

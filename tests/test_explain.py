@@ -32,6 +32,7 @@ def flown(planted: Any, seed: int = 5) -> OneStepData:
     return study.data_of("furuta", planted, jax.random.key(seed))
 
 
+@pytest.mark.nightly
 def test_an_effect_is_found() -> None:
     """The study in small, on machines with constants of their own."""
     spring = explain(flown(sy.Spring("theta", 4.5e-3), 6), FEW)

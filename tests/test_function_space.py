@@ -385,6 +385,7 @@ class Rooted(Linear):
         return super().ode(params, s, a) + 0.0 * jnp.sqrt(a[0] + 0.9)
 
 
+@pytest.mark.nightly
 def test_a_simulator_that_is_nowhere_on_the_box_is_said(monkeypatch):
     """Else its scale becomes the noise, and training skips what it meets."""
     monkeypatch.setattr(module, "POOL", 2048)

@@ -23,9 +23,10 @@ def figure(name, seed=0):
 
 
 def by_day() -> list[Any]:
-    """The machines' derivatives have tests of their own (test_system_jacobians.py)."""
+    """Derivatives and the arm's fit have tests of their own elsewhere."""
+    late = ("jacobians", "arm")
     night = pytest.mark.nightly
-    return [pytest.param(n, marks=night) if n == "jacobians" else n for n in CHECKS]
+    return [pytest.param(n, marks=night) if n in late else n for n in CHECKS]
 
 
 @pytest.mark.parametrize("name", by_day())
@@ -83,6 +84,7 @@ def test_jitter_is_noticed_by_the_units(monkeypatch):
     assert figure("units") > CHECKS["units"].limit
 
 
+@pytest.mark.nightly
 def test_wrong_derivatives_are_noticed(monkeypatch):
     right = checks.jax.jacfwd
     monkeypatch.setattr(

@@ -73,6 +73,7 @@ def test_a_linearised_draw_is_its_formula():
     np.testing.assert_allclose(nonlinear(s, a), there, atol=1e-12)
 
 
+@pytest.mark.nightly
 def test_draws_of_a_machine_have_the_moments_of_the_belief():
     """50,000 functions at two inputs, cross-covariance included."""
     system, n = Furuta(), 50_000
@@ -237,6 +238,7 @@ def test_a_wrong_model_has_a_posterior_that_converged():
     assert int(belief.count) == data.count
 
 
+@pytest.mark.nightly
 def test_starts_reach_the_same_map():
     """S14: at least 95 % of 200 starts, on the two-link arm."""
     system = UniformRodArm()

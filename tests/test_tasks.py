@@ -121,7 +121,7 @@ def test_swung_up_means_the_whole_last_second() -> None:
 
 @pytest.mark.parametrize("system", [Furuta(), CartPole()])
 def test_truths_come_from_the_prior(system: object) -> None:
-    drawn = [tasks.draw_truth(system, jax.random.fold_in(KEY, i)) for i in range(200)]
+    drawn = [tasks.draw_truth(system, jax.random.fold_in(KEY, i)) for i in range(80)]
     table = system.parameters
     for p in table.free:
         values = np.asarray([float(getattr(truth, p.name)) for truth in drawn])

@@ -73,6 +73,7 @@ def test_rows_that_say_nothing_make_no_part():
     np.testing.assert_array_equal(parts(jnp.zeros(7)), 0)
 
 
+@pytest.mark.nightly
 def test_the_right_model_meets_the_information_identity():
     """The pulls' second moment is the identity, less one part in all for the MAP."""
     total, runs = np.zeros((P, P)), 60

@@ -159,6 +159,7 @@ def test_masked_rows_count_as_removed_ones() -> None:
     np.testing.assert_allclose(*map(_sizes, (R1, R2)), rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.nightly
 def test_order_of_windows_and_masked_windows_do_not_matter(short: Log) -> None:
     system = pendulum()
     windows, _ = cut([short], system, window=0.1)

@@ -1,0 +1,175 @@
+"""The search for the next experiment."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from design_cases import (
+    LIMITS,
+    PERIOD,
+    STEPS,
+    commands,
+    delayed,
+    experiment,
+    limits,
+)
+from sim2gp import design as d
+from sim2gp.design import search
+from sim2gp.design.limits import excess
+from sim2gp.errors import InputError
+
+pytestmark = pytest.mark.usefixtures("float64")
+
+QUICK = {"BLOCKS": 3, "TRIALS": 60, "GUARDS": 12, "CHECKED": 200}
+
+
+@pytest.mark.nightly
+def test_worth_has_a_gradient_in_the_commands() -> None:
+    """Against differences, also where some windows tell nothing of a constant."""
+    e = experiment(delayed())
+    z = 0.3 * jnp.ones_like(e.belief.mean)
+
+    @jax.jit
+    def worth(U):
+        states = d.trajectory(e, z, U)
+        return search._worth_at(e, d.Everything(), z, U, states)[0]
+
+    U = commands(2).at[: STEPS // 2].set(0.0)
+    V = commands(3)
+    slope = float(jnp.sum(jax.jit(jax.grad(worth))(U) * V))
+    h = 1e-5
+    difference = float(worth(U + h * V) - worth(U - h * V)) / (2.0 * h)
+    assert slope == pytest.approx(difference, rel=1e-5)
+
+
+@pytest.mark.nightly
+def test_a_search_on_longer_periods_sees_the_same() -> None:
+    """Fewer samples of as much less noise; an experiment of few periods stays whole."""
+    fine = dataclasses.replace(experiment(), period=0.002, steps=500, window=50)
+    coarse, signal = search._coarser(fine, d.Multisine(0.002, 500))
+    assert (coarse.period, coarse.steps, coarse.window) == (0.01, 100, 10)
+    box, nowhere = limits(fine.system), jnp.zeros((1, 3))
+    C = 0.1 * jax.random.normal(jax.random.key(1), (signal.coefficients, 1))
+    told = [
+        float(search._worth(e, d.Everything(), nowhere, s.commands(C, box))[0])
+        for e, s in ((fine, d.Multisine(0.002, 500)), (coarse, signal))
+    ]
+    assert told[1] == pytest.approx(told[0], abs=0.1)
+    short = dataclasses.replace(fine, steps=3, window=3)
+    kept, _ = search._coarser(short, d.Multisine(0.002, 3))
+    assert (kept.period, kept.steps, kept.window) == (0.002, 3, 3)
+
+
+def test_commands_are_made_no_smaller_than_they_must_be() -> None:
+    e = experiment()
+    box, draws = limits(e.system), jax.random.normal(jax.random.key(1), (100, 3))
+    U, states, bad = search._kept(e, box, commands(4, 5.0), draws)
+    share = float(jnp.max(jnp.abs(U)) / jnp.max(jnp.abs(commands(4, 5.0))))
+    assert 0.0 < share < 1.0
+    assert bad <= 0.01
+    assert np.mean([float(excess(box, S)) > 0.0 for S in states]) == pytest.approx(bad)
+    _, larger = search._checked(e, box, U / search.SMALLER, draws)
+    assert float(jnp.mean(larger > 0.0)) > 0.01
+
+
+class Away:
+    """A climb that always ends far outside."""
+
+    def compile_for(self, *args) -> None:
+        pass
+
+    def __call__(self, *args):
+        C, state = args[7:9]
+        return 0.0 * C + 1.0, state
+
+
+def test_a_climb_that_ends_far_outside_is_given_up(monkeypatch) -> None:
+    e = experiment()
+    box, signal = limits(e.system), d.Multisine(PERIOD, STEPS)
+    draws = jax.random.normal(jax.random.key(1), (50, 3))
+    monkeypatch.setattr(search, "_climb", Away())
+    improve = search._climber(e, signal, d.Everything(), box, draws[:2], draws)
+    start = improve(jax.random.key(3))
+    assert float(jnp.max(jnp.abs(start))) < 1.0
+    # It begins nearly within its limits.
+    U = signal.commands(start.astype(float), box)
+    _, beyond = search._checked(e, search._narrowed(box), U, draws)
+    assert float(jnp.mean(beyond > 0.0)) <= search.LEAVING + 0.05
+
+
+@pytest.fixture(scope="module")
+def found():
+    """A short search."""
+    with jax.enable_x64(True), pytest.MonkeyPatch.context() as patch:
+        for name, value in QUICK.items():
+            patch.setattr(search, name, value)
+        e = experiment()
+        box = limits(e.system, LIMITS, {"voltage": 100.0})
+        signal = d.Multisine(PERIOD, STEPS)
+        key, goal = jax.random.key(0), d.Everything()
+        best = d.design(e, goal, box, signal, key=key)
+        assert d.design(e, goal, box, signal, key=key, starts=3).nats > best.nats
+        return e, box, signal, best
+
+
+@pytest.mark.nightly
+def test_a_designed_experiment_beats_random_ones(found) -> None:
+    e, box, signal, best = found
+    assert best.violations <= 0.01
+    assert float(excess(box, jnp.asarray(best.states))) <= 0.0
+    draws = jax.random.normal(jax.random.key(5), (12, signal.coefficients, 1))
+    nowhere = jnp.zeros(3)
+
+    @jax.jit
+    def random(c):
+        U = signal.commands(0.05 * c, box)
+        states = d.trajectory(e, nowhere, U)
+        scale = d.after(e.belief, d.information(e, nowhere, U, states))
+        return d.Everything().nats(e.belief.scale, scale), excess(box, states)
+
+    told = [random(c) for c in draws]
+    nats = [float(n) for n, beyond in told if float(beyond) <= 0.0]
+    assert nats
+    assert best.nats > max(nats) + 0.3
+    # The scale that is told is that of its own commands.
+    U = jnp.asarray(best.commands)
+    states = TRAJECTORY(e, nowhere, U)
+    A = np.asarray(INFORMATION(e, nowhere, U, states))
+    np.testing.assert_allclose(best.states, states, atol=1e-9)
+    np.testing.assert_allclose(best.scale, d.after(e.belief, jnp.asarray(A)), rtol=1e-9)
+
+
+@pytest.mark.nightly
+def test_a_refused_start_does_not_end_the_search(found, monkeypatch) -> None:
+    """The second of two is returned; the first one's refusal is not."""
+    e, box, signal, _ = found
+    for name, value in QUICK.items():
+        monkeypatch.setattr(search, name, value)
+    kept, calls = search._kept, []
+
+    def refused_once(*args: object) -> object:
+        calls.append(args)
+        if len(calls) == 1:
+            raise InputError("E150", "no commands keep the limits")
+        return kept(*args)
+
+    monkeypatch.setattr(search, "_kept", refused_once)
+    key = jax.random.key(0)
+    second = d.design(e, d.Everything(), box, signal, key=key, starts=2)
+    assert len(calls) == 2
+    assert second.violations <= search.ALLOWED
+
+
+@pytest.mark.nightly
+def test_no_commands_keep_limits_that_nothing_can(found) -> None:
+    """A pole that starts beside its limit swings beyond it whatever is done."""
+    e, _, signal, _ = found
+    box = limits(e.system, {"alpha": (-0.2, 0.401)})
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in QUICK.items():
+            patch.setattr(search, name, value)
+        with pytest.raises(InputError, match="E150 no commands keep the limits"):
+            d.design(e, d.Everything(), box, signal, key=jax.random.key(0))
