@@ -49,7 +49,8 @@ unit: $(VENV)/.test
 	@cache=$$(mktemp -d) && trap 'rm -rf "$$cache"' EXIT && \
 	  export JAX_COMPILATION_CACHE_DIR="$$cache" && \
 	  export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0.3 && \
-	  $(BIN)/python -m pytest -m "not nightly" -n 2 --dist loadfile $(ARGS)
+	  $(BIN)/python -m pytest -m "not nightly" -n 2 --dist loadfile \
+	    --no-loadscope-reorder $(ARGS)
 
 nightly: $(VENV)/.test
 	$(BIN)/python -m pytest -m nightly $(ARGS)

@@ -289,7 +289,7 @@ class Parameters(eqx.Module):
     ) -> dict[str, Scalar]:
         """Every constant by name, in physical units: the free ones and the fixed.
 
-        ``configuration`` is an index; only a table that has several needs it (E147).
+        ``configuration`` is an index; only a table that has several needs it (E152).
         """
         return valued(self._columns(tt), self.configurations, configuration)
 
