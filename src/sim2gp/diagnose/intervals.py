@@ -94,12 +94,7 @@ def pulls_of_windows(
 
     Raises `NotFinite` E203.
     """
-    n = cut.start.shape[1]
-    rows = _rows(belief, cut, belief.posterior.mean)
-    must_be_finite("derivatives or residuals", rows, "the intervals")
-    R = np.asarray(np.linalg.qr(rows, mode="r"))[:, n:, n:]
-    scores = np.einsum("wkp,wk->wp", R[..., :-1], R[..., -1])
-    return Pulls(R[..., :-1], scores, np.asarray(group))
+    return _pulls(_rows(belief, cut, belief.posterior.mean), cut, group)
 
 
 @in_float64
@@ -109,10 +104,23 @@ def cost_of_windows(belief: WindowsBelief, cut: Windows, tt: Array) -> float:
     Starts follow by one Gauss-Newton step from where the fit has put them. Infinite
     where the simulation is not finite.
     """
+    return _cost(_rows(belief, cut, tt), cut)
+
+
+def _pulls(
+    rows: Float[np.ndarray, "W k npr"], cut: Windows, group: Int[np.ndarray, " W"]
+) -> Pulls:
+    must_be_finite("derivatives or residuals", rows, "the intervals")
     n = cut.start.shape[1]
-    rows = _rows(belief, cut, tt)
+    R = np.asarray(np.linalg.qr(rows, mode="r"))[:, n:, n:]
+    scores = np.einsum("wkp,wk->wp", R[..., :-1], R[..., -1])
+    return Pulls(R[..., :-1], scores, np.asarray(group))
+
+
+def _cost(rows: Float[np.ndarray, "W k npr"], cut: Windows) -> float:
     if not np.isfinite(rows).all():
         return math.inf
+    n = cut.start.shape[1]
     both = np.concatenate([rows[..., :n], rows[..., -1:]], axis=-1)
     R = np.asarray(np.linalg.qr(both, mode="r"))
     return 0.5 * float(np.sum(R[:, n:, n] ** 2))
@@ -148,7 +156,8 @@ def corrected_windows(
     no more than the linear one says, to `TRUSTED` nats of data that count as often as
     they should.
     """
-    pulls = pulls_of_windows(belief, cut, group)
+    rows = _rows(belief, cut, belief.posterior.mean)
+    pulls = _pulls(rows, cut, group)
     found = corrected(belief.prior, belief.posterior, pulls)
     start = np.asarray(belief.posterior.mean)
     step = np.asarray(found.posterior.mean) - start
@@ -157,7 +166,7 @@ def corrected_windows(
     dz = np.linalg.solve(np.asarray(belief.prior.scale), step)
     score = pulls.scores.sum(axis=0)
     F = np.einsum("wkp,wkq->pq", pulls.factors, pulls.factors)
-    before = cost_of_windows(belief, cut, jnp.asarray(start))
+    before = _cost(rows, cut)
     for share in 0.5 ** np.arange(HALVINGS):
         there = cost_of_windows(belief, cut, jnp.asarray(start + share * step))
         told = share * dz @ (score + 0.5 * share * F @ dz)
