@@ -21,6 +21,7 @@ RATIO = 1.02
 def main() -> None:
     """Print the table and the verdict."""
     from sim2gp.experiments.evaluate import leave_one_out
+    from sim2gp.project import load_project
     from sim2gp.runs import Progress
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -46,8 +47,10 @@ def main() -> None:
             for train, log in zip(rest, logs, strict=True)
         ],
     }
+    project = load_project(ROOT / "examples" / "qube.toml")
     summary = leave_one_out(
-        ROOT / "examples" / "qube.toml",
+        project,
+        project.load_logs(),
         horizon=horizon,
         out=options.run,
         progress=Progress(),

@@ -48,10 +48,14 @@ def errors_of(models: list[np.ndarray], logs: list[Any], horizon: float) -> list
 def ours(horizon: float, folder: Path) -> dict[str, Any]:
     """Leave one log out by the package's own command."""
     from sim2gp.experiments.evaluate import leave_one_out
+    from sim2gp.project import load_project
     from sim2gp.runs import Progress
 
-    project = ROOT / "examples" / "double_pendulum.toml"
-    return leave_one_out(project, horizon=horizon, out=folder, progress=Progress())
+    project = load_project(ROOT / "examples" / "double_pendulum.toml")
+    logs = project.load_logs()
+    return leave_one_out(
+        project, logs, horizon=horizon, out=folder, progress=Progress()
+    )
 
 
 def table(summary: dict[str, Any], title: str) -> dict[str, Any]:

@@ -25,7 +25,7 @@ TURNS = 3
 def main() -> None:
     """Print rows and warm seconds of both, and the verdict."""
     from sim2gp.experiments import identify
-    from sim2gp.experiments.prediction import cut_logs, load
+    from sim2gp.experiments.prediction import cut_logs
     from sim2gp.models.windows import fit_windows
     from sim2gp.project import load_project
     from sim2gp.runs import Progress
@@ -42,15 +42,21 @@ def main() -> None:
         for times in (1, 2):
             path = project_of(folder / f"{times}", files, times)
             project = load_project(path)
-            logs = load(project)
+            logs = project.load_logs()
             windows, _ = cut_logs(project, logs)
             rows = sum(len(log) for log in logs)
             say(f"{6 * times} logs: {rows} rows, {len(windows)} windows")
             works[f"fit, {6 * times} logs"] = lambda p=project, w=windows: (
                 jax.block_until_ready(fit_windows(p.system, w, key=key).posterior)
             )
-            works[f"identify, {6 * times} logs"] = lambda p=path, n=times: identify.run(
-                p, out=folder / f"run{n}", seed=0, progress=Progress(quiet=True)
+            works[f"identify, {6 * times} logs"] = lambda p=project, n=times: (
+                identify.run(
+                    p,
+                    p.load_logs(),
+                    out=folder / f"run{n}",
+                    seed=0,
+                    progress=Progress(quiet=True),
+                )
             )
         seconds = warm(works)
     for name, fastest in seconds.items():

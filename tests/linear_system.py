@@ -61,11 +61,11 @@ def windows_of(J: np.ndarray, y: np.ndarray, group: np.ndarray) -> Windows:
     N, d = y.shape
     ends = np.broadcast_to(np.asarray([0.0, 1.0])[None], (N, 2))
     return Windows(
-        np.stack([np.zeros_like(y), y], axis=1),
-        np.broadcast_to((ends > 0.0)[..., None], (N, 2, d)),
         ends,
         ends,
         np.stack([np.zeros((N, J[0].size)), J.reshape(N, -1)], axis=1),
+        np.stack([np.zeros_like(y), y], axis=1),
+        np.broadcast_to((ends > 0.0)[..., None], (N, 2, d)),
         np.zeros((N, d)),
         np.zeros((N, d)),
         np.full(d, 1e-2),

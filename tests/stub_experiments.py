@@ -1,15 +1,15 @@
 """Stand-ins for the experiments, so that the command line is tested by itself."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import pytest
 
-from sim2gp.experiments.prediction import load
-from sim2gp.project import load_project
+from sim2gp.logs import Log
+from sim2gp.project import Project
 from sim2gp.runs import Progress, new_run
 
 
@@ -27,21 +27,19 @@ def install(
 
 
 def identify(
-    project: Path,
+    project: Project,
+    logs: Sequence[Log],
     *,
     out: Path,
     seed: int,
     progress: Progress,
     check: bool = False,
     held_out: bool = True,
-    strict: bool = False,
 ) -> dict[str, Any]:
-    """Everything of an identification that reads input, and no fit."""
-    found = load_project(project)
-    logs = load(found, strict=strict)
+    """What an identification says of its input, and no fit."""
     summary = {
         "n_transitions": sum(len(log) - 1 for log in logs),
-        "parameters": {p.name: {"sd": p.sd} for p in found.system.parameters.free},
+        "parameters": {p.name: {"sd": p.sd} for p in project.system.parameters.free},
         "seed": seed,
         "check": check,
         "held_out": held_out,

@@ -13,6 +13,7 @@ from sim2gp.cli import main
 from sim2gp.errors import InputError
 from sim2gp.experiments import compare
 from sim2gp.models import ResidualFunctionSpace
+from sim2gp.project import load_project
 from sim2gp.runs import Progress, load_run
 from sim2gp.systems import Perturbed, UniformRodArm
 from sim2gp.systems.effects import Spring
@@ -96,8 +97,10 @@ def compared(folder: Path, name: str) -> Path:
     """The run on the logs of one of the two arms, left out two at a time."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(compare, "MOST_FOLDS", 2)
+        project = load_project(project_in(folder, name))
         compare.run(
-            project_in(folder, name),
+            project,
+            project.load_logs(),
             out=folder / f"run-{name}",
             seed=0,
             progress=QUIET,
@@ -199,16 +202,18 @@ def test_every_position_must_be_measured(folder: Path) -> None:
     path = project_in(folder, "cable")
     lame = folder / "lame.toml"
     lame.write_text(path.read_text().replace('q2 = "q2"\n', ""))
+    project, out = load_project(lame), folder / "none"
+    logs = project.load_logs()
     with pytest.raises(InputError, match="also q2") as caught:
-        compare.run(lame, out=folder / "none", seed=0, progress=QUIET, models=SOME)
+        compare.run(project, logs, out=out, seed=0, progress=QUIET, models=SOME)
     assert caught.value.code == "E103"
     assert "lame.toml:line" in str(caught.value)
     assert not (folder / "none").exists()
 
 
 def test_one_recording_leaves_out_its_last_quarter(folder: Path) -> None:
-    found = compare.load_project(project_in(folder, "cable"))
-    logs = compare.load(found)[:1]
+    found = load_project(project_in(folder, "cable"))
+    logs = found.load_logs()[:1]
     setup, folds = compare.prepare(found, logs, (0.2,))
     assert [log.name for log in setup.logs] == ["log0", "log0, last quarter"]
     assert folds == [[1]]
@@ -226,8 +231,8 @@ def test_one_recording_leaves_out_its_last_quarter(folder: Path) -> None:
 
 
 def test_many_recordings_are_left_out_in_six_groups(folder: Path) -> None:
-    found = compare.load_project(project_in(folder, "cable"))
-    log = compare.load(found)[0]
+    found = load_project(project_in(folder, "cable"))
+    log = found.load_logs()[0]
     named = [
         compare.replace(log, name=str(k), source=str(k // 2)) for k in range(16)
     ]  # eight files in two pieces each

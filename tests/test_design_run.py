@@ -11,6 +11,7 @@ import pytest
 from sim2gp.cli import main
 from sim2gp.design import Everything, Limits, Named, search
 from sim2gp.experiments.design import Asked, foretold, goal_of, setting, verdict
+from sim2gp.project import load_project
 from sim2gp.runs import load_run
 from test_identify import folder, project_in, run
 
@@ -81,7 +82,7 @@ def test_after_a_fit(run: Path, tmp_path: Path, capsys) -> None:
 
 def test_what_is_asked_about(tmp_path: Path) -> None:
     asked = dataclasses.replace(ASKED, about=("pendulum_length", "arm_damping"))
-    _, experiment, _ = setting(project_in(tmp_path), asked)
+    _, experiment, _ = setting(load_project(project_in(tmp_path)), asked)
     names = experiment.system.parameters.names
     box = Limits.of(experiment.system, {}, {}, start=np.zeros(4))
     goal = goal_of(asked, experiment, box, jax.random.key(0))

@@ -43,7 +43,9 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         log = simulated(seconds=1.3, seed=seed, noise=5e-4, effects=(SPRING,))
         write(log, folder / "logs" / f"log{seed}.csv")
     out = folder / "run"
-    identify.run(project_in(folder), out=out, seed=0, progress=QUIET, held_out=False)
+    project = load_project(project_in(folder))
+    logs = project.load_logs()
+    identify.run(project, logs, out=out, seed=0, progress=QUIET, held_out=False)
     return folder / "run"
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from sim2gp.configurations import Configuration
 from sim2gp.errors import InputError
-from sim2gp.experiments import apply, compare, design, evaluate, explain, identify
+from sim2gp.experiments import apply, design, evaluate, explain, identify
 from sim2gp.experiments.configurations import told
 from sim2gp.logs import Log
 from sim2gp.project import load_project
@@ -184,9 +184,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def identified(path: Path, out: Path) -> None:
+    project = load_project(path)
+    identify.run(project, project.load_logs(), out=out, seed=0, progress=QUIET)
+
+
 @pytest.fixture(scope="module")
 def run(folder: Path) -> Path:
-    identify.run(folder / "arm.toml", out=folder / "run", seed=0, progress=QUIET)
+    identified(folder / "arm.toml", folder / "run")
     return folder / "run"
 
 
@@ -290,7 +295,7 @@ def test_commands_for_one_configuration_say_so(
     path, out = folder / "arm.toml", tmp_path / "out"
     one = "E160 several configurations, which only identify and evaluate take"
     with pytest.raises(InputError, match=one):
-        compare.run(path, horizons=(0.2,), out=out, seed=0, progress=QUIET)
+        load_project(path).load_logs(alike=True)
     with pytest.raises(InputError, match=one):
         explain.run(run, add=False, out=out, progress=QUIET)
     assert not out.exists()
@@ -304,7 +309,7 @@ def test_a_weighed_sum_is_known_before_the_logs(
     both = ("body/arm/mass", "body/hand/mass @ loaded")
     known = f"[[weighed]]\nof = {json.dumps(both)}\nvalue = 0.9\nsd = 0.001\n"
     path.write_text(PROJECT.replace("[[logs]]", f"{known}[[logs]]", 1))
-    identify.run(path, out=tmp_path / "run", seed=0, progress=QUIET)
+    identified(path, tmp_path / "run")
     plain, told = (load_run(x).summary for x in (run, tmp_path / "run"))
     for name in both:
         now, before = told["parameters"][name], plain["parameters"][name]

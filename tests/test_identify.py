@@ -61,8 +61,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def run(folder: Path) -> Path:
-    path, out = project_in(folder), folder / "run"
-    identify.run(path, out=out, seed=0, progress=QUIET, check=True)
+    project, out = load_project(project_in(folder)), folder / "run"
+    logs = project.load_logs()
+    identify.run(project, logs, out=out, seed=0, progress=QUIET, check=True)
     return folder / "run"
 
 
@@ -192,9 +193,10 @@ def test_evaluate_predicts_a_log_from_anywhere(
 
 
 def test_leave_one_out_predicts_every_log(folder: Path, tmp_path: Path) -> None:
-    path = project_in(folder)
-    out = tmp_path / "out"
-    summary = evaluate.leave_one_out(path, horizon=0.2, out=out, progress=QUIET)
+    project, out = load_project(project_in(folder)), tmp_path / "out"
+    summary = evaluate.leave_one_out(
+        project, project.load_logs(), horizon=0.2, out=out, progress=QUIET
+    )
     rows = summary["tables"][1]["rows"]
     assert [row[0] for row in rows] == ["log1", "log2", "pooled"]
     one, two, pooled = (float(row[2]) for row in rows)

@@ -89,7 +89,9 @@ def no_update(fit, noise):
     return noise
 
 
-def multi_start(residual, starts, rounds=0, update=no_update, tolerance=1e-10):
+def multi_start(
+    residual, starts, rounds=0, update=no_update, tolerance=1e-10, needed=None
+):
     return laplace.multi_start(
         Whitened(residual),
         jnp.asarray(starts),
@@ -97,8 +99,34 @@ def multi_start(residual, starts, rounds=0, update=no_update, tolerance=1e-10):
         arrowhead.Noise(jnp.ones(1), jnp.ones(1)),
         update,
         rounds=rounds,
+        needed=needed,
         tolerance=tolerance,
     )
+
+
+def test_a_start_that_is_no_number_costs_nothing():
+    """Padded to the same number of starts, a descent is the same, step by step."""
+    one, _, _ = multi_start(rosenbrock, [[-1.2, 1.0]])
+    two, _, costs = multi_start(rosenbrock, [[-1.2, 1.0], [np.nan, np.nan]])
+    np.testing.assert_array_equal(two.z, one.z)
+    assert int(two.steps) == int(one.steps)
+    assert np.isinf(costs[1])
+
+
+def test_rounds_beyond_those_needed_are_not_taken():
+    def update(fit, noise):
+        return arrowhead.Noise(0.5 * noise.sd, noise.weights)
+
+    def fit(rounds, needed=None):
+        fit, noise, _ = multi_start(
+            rosenbrock, [[-1.2, 1.0]], rounds, update, needed=needed
+        )
+        return int(fit.steps), float(noise.sd[0]), np.asarray(fit.z)
+
+    steps, sd, z = fit(6, jnp.asarray(2))
+    assert (steps, sd) == fit(2)[:2]
+    assert sd == 0.25
+    np.testing.assert_array_equal(z, fit(2)[2])
 
 
 def test_a_start_that_is_not_finite_never_wins():
@@ -328,9 +356,35 @@ def test_weights_of_outlying_windows_fall():
     count, floor = jnp.full((3, 2), 4.0), jnp.asarray([0.01, 0.02])
     new = em.expectation(count, floor, 4.0)(fit, noise)
     squares, spread = map(np.asarray, fit.squares())
-    variance = np.asarray(noise.weights) @ (squares + spread) + 2.0 * floor**2
+    weights = np.asarray(noise.weights)
+    variance = weights @ (squares + spread) / weights.mean() + 2.0 * floor**2
     np.testing.assert_allclose(new.sd**2, variance / 14.0, rtol=1e-12)
     misfit = np.sum(squares / np.asarray(new.sd) ** 2, axis=1)
     np.testing.assert_allclose(new.weights, 3.0 / (1.0 + misfit / 4.0), rtol=1e-12)
     off = em.expectation(count, floor)(fit, noise)
     np.testing.assert_array_equal(off.weights, 1.0)
+
+
+def test_student_noise_of_long_windows_is_found_in_a_few_rounds(monkeypatch):
+    """Against scipy's maximum of ``sum_w log t_4(r_w | sig)``, from a noise far off."""
+    rng = np.random.default_rng(3)
+    squares = np.sum(rng.standard_normal((12, 60)) ** 2, axis=1)
+    squares[7] *= 100.0
+
+    def cost(log_sd):
+        misfit = squares / np.exp(2.0 * log_sd)
+        return np.sum(60.0 * log_sd + 32.0 * np.log1p(misfit / 4.0))
+
+    best = np.exp(scipy.optimize.minimize_scalar(cost, bounds=(-3, 3)).x)
+    # A window without data has a weight, and no say.
+    count = jnp.asarray([60.0] * 12 + [0.0])[:, None]
+    found = jnp.asarray(np.append(squares, 0.0)[:, None])
+    monkeypatch.setattr(laplace.Fit, "squares", lambda fit: (found, 0.0 * found))
+    fit = fit_of_curves()
+    update = em.expectation(count, jnp.full(1, 1e-6), 4.0)
+    noise = arrowhead.Noise(jnp.full(1, 100.0), jnp.ones(13))
+    for _ in range(8):
+        noise = update(fit, noise)
+    assert float(noise.sd[0]) == pytest.approx(best, rel=0.01)
+    assert best == pytest.approx(1.0, abs=0.1)
+    assert float(noise.weights[7]) < 0.05

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from sim2gp.experiments import compare
+from sim2gp.project import load_project
 from sim2gp.runs import Progress
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -37,8 +38,10 @@ def test_a_residual_helps_the_arm_or_is_not_supported(
     project = ROOT / "examples" / "double_pendulum.toml"
     text = project.read_text().replace("../../shared/data", shared_data.as_posix())
     (tmp_path / "arm.toml").write_text(text)
+    found = load_project(tmp_path / "arm.toml")
     summary = compare.run(
-        tmp_path / "arm.toml",
+        found,
+        found.load_logs(alike=True),
         out=tmp_path / "run",
         seed=0,
         progress=Progress(quiet=True),

@@ -21,7 +21,8 @@ from sim2gp.models.stepping import (
     steps_of_grid,
     transitions,
 )
-from sim2gp.models.windows import Windows, simulate
+from sim2gp.models.stretch import simulate
+from sim2gp.models.windows import Windows
 from sim2gp.systems import AbstractSystem, Actuated, Furuta, actuator_prior
 from sim2gp.transitions import Transitions
 from sim2gp.types import Dynamics, in_float64

@@ -11,7 +11,7 @@ import pytest
 from sim2gp import arrowhead
 from sim2gp.gaussian import Gaussian
 from sim2gp.logs import Log
-from sim2gp.models import Sim2GP
+from sim2gp.models import Sim2GP, stretch
 from sim2gp.models import windows as likelihood
 from sim2gp.models.cutting import cut
 from sim2gp.models.grid import evaluation_windows
@@ -137,7 +137,7 @@ def test_window_zero_is_the_one_step_fit() -> None:
         atol=0.02 * sd.min(),
     )
     # Begun at the MAP, a descent ends there.
-    again = fit_windows(system, windows, key=key, near=ours.posterior.mean)
+    again = fit_windows(system, windows, key=key, near=ours)
     moved = np.asarray(again.posterior.mean) - np.asarray(ours.posterior.mean)
     assert np.all(np.abs(moved) < 1e-4 * sd)
 
@@ -252,10 +252,10 @@ def test_delayed_inputs_are_smooth_in_the_delay(short: Log) -> None:
         one = jax.tree.map(lambda x: jnp.asarray(x[0]), eqx.tree_at(
             lambda w: w.floor, windows, None))  # fmt: skip
         one = eqx.tree_at(lambda w: w.floor, one, jnp.ones(2), is_leaf=_none)
-        blur = likelihood.DELAY_BLUR
+        blur = stretch.DELAY_BLUR
 
         def mean(delay: float, width: float) -> jax.Array:
-            return likelihood.inputs_of(one, jnp.asarray([delay]), width)[1:]
+            return stretch.inputs_of(one, jnp.asarray([delay]), width)[1:]
 
         slope = jax.jacfwd(mean)
         h = 1e-7
@@ -265,6 +265,26 @@ def test_delayed_inputs_are_smooth_in_the_delay(short: Log) -> None:
         # Far from a change of the input the blur does nothing, and never in the mean.
         total = np.sum(mean(0.004, blur)) - np.sum(mean(0.004, 0.0))
         assert abs(total) < 4.0
+
+
+def test_a_fit_near_another_ends_where_its_own_windows_say(short: Log) -> None:
+    """Begun at the MAP of all windows, a fit of half of them forgets the others."""
+    system, key = pendulum(), jax.random.key(0)
+    windows, _ = cut([short], system, window=0.1)
+    seen = np.arange(len(windows)) < len(windows) // 2
+    half = eqx.tree_at(lambda w: w.mask, windows, windows.mask & seen[:, None, None])
+    whole = fit_windows(system, windows, key=key, robust=True)
+    alone = fit_windows(system, half, key=key, robust=True)
+    near = fit_windows(system, half, key=key, robust=True, near=whole)
+    with jax.enable_x64(True):
+        sd = np.asarray(alone.posterior.sd())
+        moved = np.asarray(near.posterior.mean - alone.posterior.mean) / sd
+        away = np.asarray(whole.posterior.mean - alone.posterior.mean) / sd
+    assert np.abs(moved).max() < 0.02
+    assert np.abs(away).max() > 0.2
+    np.testing.assert_allclose(near.noise, alone.noise, rtol=2e-3)
+    np.testing.assert_allclose(near.weights, alone.weights, rtol=0.02)
+    np.testing.assert_allclose(near.starts, alone.starts, atol=1e-3)
 
 
 def test_gaussian_prior_comes_back_without_data(short: Log) -> None:

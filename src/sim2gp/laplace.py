@@ -230,14 +230,16 @@ def multi_start(
     update: Callable[[Fit, Noise], Noise],
     *,
     rounds: int,
+    needed: Int[Array, ""] | None = None,
     tolerance: float = 1e-4,
 ) -> tuple[Fit, Noise, Float[Array, " starts"]]:
     """The best of several descents; then ``rounds`` of noise update and descent (EM).
 
     A descent ends where a step improves the cost by less than ``tolerance`` relative;
     one more turn, the last, goes on to a zero gradient. Every descent is a turn of the
-    same scan, so that the likelihood is compiled once. Returns the fit, its noise, and
-    the cost that each start reached.
+    same scan, so that the likelihood is compiled once; a start that is no number, and
+    rounds beyond those ``needed``, are compiled and not taken. Returns the fit, its
+    noise, and the cost that each start reached.
     """
     p = starts.shape[1]
     blank = jax.eval_shape(likelihood.blocks, starts[0], e)
@@ -255,19 +257,20 @@ def multi_start(
         best, noise, steps = carry
         start, index = x
         searching, last = index < count, index == count + rounds
+        taken = count + (rounds if needed is None else needed)
+        idle = jnp.where(searching, jnp.isnan(start).any(), ~last & (index >= taken))
         # The last turn only finishes the one before it.
         settled = update(_verdict(best, noise, steps), noise)
-        stay = searching | last
+        stay = searching | last | idle
         noise = jax.tree.map(lambda new, old: jnp.where(stay, old, new), settled, noise)
-        again = _point(best.z, best.e, best.blocks, best.known, noise)
+        again = point(best.z, best.e, best.blocks, best.known, noise)
         here = _select(searching, nowhere, again)
-        found, taken = _descend(
-            likelihood, here, (start, e), searching, noise, tolerance, last
-        )
+        kind = searching, last, idle
+        found, more = _descend(likelihood, here, (start, e), kind, noise, tolerance)
         # A cost that is not finite never wins; a comparison with NaN is false.
         better = jnp.where(searching, found.cost < best.cost, True)
         best = _select(better, found, best)
-        return (best, noise, jnp.where(last, taken, steps + taken)), found.cost
+        return (best, noise, jnp.where(last, more, steps + more)), found.cost
 
     carry = (nowhere, noise, jnp.zeros((), int))
     (best, noise, steps), costs = jax.lax.scan(turn, carry, (schedule, turns))
@@ -278,15 +281,17 @@ def _descend(
     likelihood: AbstractLikelihood,
     here: Point,
     start: tuple[Float[Array, " p"], Float[Array, "W n"]],
-    fresh: Bool[Array, ""],
+    kind: tuple[Bool[Array, ""], ...],
     noise: Noise,
     tolerance: float,
-    exact: Bool[Array, ""],
 ) -> tuple[Point, Int[Array, ""]]:
-    """Levenberg-Marquardt from ``start`` where it is ``fresh``, else from ``here``.
+    """Levenberg-Marquardt from ``start`` where that is fresh, else from ``here``.
 
-    The damping follows the ratio of gained to promised cost (Nielsen 1999).
+    A turn's ``kind``: fresh, to a zero gradient, none at all. The damping follows the
+    ratio of gained to promised cost (Nielsen 1999).
     """
+
+    fresh, exact, idle = kind
 
     def improve(carry: tuple) -> tuple:
         here, damping, count, _ = carry
@@ -294,7 +299,7 @@ def _descend(
         first = fresh & (count == 0)
         z = jnp.where(first, start[0], here.z + dz)
         e = jnp.where(first, start[1], here.e + de)
-        there = _point(z, e, likelihood.blocks(z, e), likelihood.known(z), noise)
+        there = point(z, e, likelihood.blocks(z, e), likelihood.known(z), noise)
         gained = here.cost - there.cost
         # Rounding in the cost must not refuse the last, gradient-only digits.
         slack = 1e-12 * (1.0 + there.cost)
@@ -316,7 +321,7 @@ def _descend(
         hopeless = (count > 0) & hopeless
         # Two steps at least: a gradient that is small beside a large cost is not zero.
         done = jnp.where(exact, small & (count >= 2), settled | small)
-        return ~done & ~hopeless
+        return ~done & ~hopeless & ~idle
 
     damping = jnp.where(exact, 0.0, jnp.where(fresh, FIRST_DAMPING, AGAIN_DAMPING))
     carry = (here, damping, jnp.zeros((), int), jnp.zeros((), bool))
@@ -346,13 +351,14 @@ def _step(
     return dz, de, promise
 
 
-def _point(
+def point(
     z: Float[Array, " p"],
     e: Float[Array, "W n"],
     blocks: Blocks,
     known: Float[Array, "q p1"],
     noise: Noise,
 ) -> Point:
+    """Cost and gradient under a noise, of a linearisation."""
     white, n = noise.scale(blocks), e.shape[1]
     r, apart = white[..., -1], known[:, -1]
     cost = 0.5 * (jnp.sum(r**2) + jnp.sum(e**2) + z @ z + apart @ apart)

@@ -101,19 +101,21 @@ class Identify(Reads):
     """Draws the starts of the fit."""
     check: bool = False
     """Hold the posterior against the exact one (Pareto k); takes as long again."""
+    nuts: bool = False
+    """Hold it against draws by NUTS, too (extra mcmc); takes minutes."""
     quick: bool = False
     """No second fit, which forecasts data that it has not seen."""
 
     def run(self, progress: Progress) -> dict[str, Any]:
         out = _out(self.out, self.project.stem)
-        _check_project(self.project)
+        read = _read(self.project, strict=self.strict)
         return _experiment("identify")(
-            self.project,
+            *read,
             out=out,
             seed=self.seed,
             check=self.check,
+            nuts=self.nuts,
             held_out=not self.quick,
-            strict=self.strict,
             progress=progress,
         )
 
@@ -134,7 +136,6 @@ class Evaluate(Reads, Chosen):
         how: dict[str, Any] = {
             "horizon": self.horizon,
             "out": _out(self.out, f"evaluate-{name}"),
-            "strict": self.strict,
             "progress": progress,
         }
         if self.run_or_project.suffix == ".toml":
@@ -143,13 +144,13 @@ class Evaluate(Reads, Chosen):
                     fix = f"leave --{option} out, or name a run"
                     expected = "a project file alone: its own logs are left out"
                     raise usage_error("too much", f"--{option}", expected, fix)
-            _check_project(self.run_or_project)
-            return _experiment("evaluate", "leave_one_out")(self.run_or_project, **how)
+            read = _read(self.run_or_project, strict=self.strict)
+            return _experiment("evaluate", "leave_one_out")(*read, **how)
         load_run(self.run_or_project)  # a folder that is no run fails before the work
         if not self.logs:
             expected, fix = "--logs FILE...", "name the logs to predict"
             raise usage_error("no logs", "no --logs", expected, fix)
-        how["configuration"] = self.configuration
+        how |= {"configuration": self.configuration, "strict": self.strict}
         return _experiment("evaluate")(self.run_or_project, list(self.logs), **how)
 
 
@@ -183,13 +184,12 @@ class Compare(Reads):
 
     def run(self, progress: Progress) -> dict[str, Any]:
         out = _out(self.out, f"compare-{self.project.stem}")
-        _check_project(self.project)
+        read = _read(self.project, strict=self.strict, alike=True)
         return _experiment("compare")(
-            self.project,
+            *read,
             horizons=self.horizon,
             out=out,
             seed=self.seed,
-            strict=self.strict,
             progress=progress,
         )
 
@@ -225,10 +225,11 @@ class Design(Writes, Chosen):
 
     def run(self, progress: Progress) -> dict[str, Any]:
         out = _out(self.out, f"design-{self.run_or_project.stem}")
-        if self.run_or_project.suffix == ".toml":
-            _check_project(self.run_or_project)
+        source: Any = self.run_or_project
+        if source.suffix == ".toml":
+            source = import_module("sim2gp.project").load_project(source)
         else:
-            load_run(self.run_or_project)  # a folder that is no run fails early
+            load_run(source)  # a folder that is no run fails early
         asked = import_module("sim2gp.experiments.design").Asked(
             seconds=self.seconds,
             kind=self.kind,
@@ -243,7 +244,7 @@ class Design(Writes, Chosen):
             configuration=self.configuration,
         )
         return _experiment("design")(
-            self.run_or_project, asked, out=out, seed=self.seed, progress=progress
+            source, asked, out=out, seed=self.seed, progress=progress
         )
 
 
@@ -363,9 +364,10 @@ def _out(out: Path | None, name: str) -> Path:
     return path
 
 
-def _check_project(path: Path) -> None:
-    """A misspelt key is told at once, before the simulators are loaded."""
-    import_module("sim2gp.project").read_spec(path)
+def _read(path: Path, *, strict: bool, alike: bool = False) -> tuple[Any, Any]:
+    """A project and its logs; a fault of theirs is told before the fits are loaded."""
+    project = import_module("sim2gp.project").load_project(path)
+    return project, project.load_logs(strict=strict, alike=alike)
 
 
 def _experiment(module: str, name: str = "run") -> Callable[..., dict[str, Any]]:

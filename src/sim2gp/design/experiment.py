@@ -20,7 +20,7 @@ from sim2gp.least_squares import over
 from sim2gp.linalg import triangular
 from sim2gp.models.cutting import TOLERANCE
 from sim2gp.models.linearized import value_and_jacobian
-from sim2gp.models.windows import DELAY_BLUR, Stretch, simulate
+from sim2gp.models.stretch import DELAY_BLUR, Stretch, simulate
 from sim2gp.systems.base import WINDOW_SUBSTEP, AbstractSystem
 
 #: Commands over each period, in the units of the inputs.

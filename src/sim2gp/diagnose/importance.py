@@ -28,7 +28,7 @@ from jaxtyping import Array, Bool, Float
 from sim2gp.arrowhead import Noise, eliminate
 from sim2gp.diagnose.words import digits, finite_or_none, listed
 from sim2gp.laplace import AbstractLikelihood
-from sim2gp.models.windows import Windows, WindowsBelief, likelihood
+from sim2gp.models.windows import Windows, WindowsBelief, at_map
 from sim2gp.types import Key, in_float64
 
 DRAWS = 256
@@ -65,8 +65,7 @@ class Checked:
 
     def far(self) -> Bool[np.ndarray, " p"]:
         """Constants whose mean or sd is another than the Gaussian's."""
-        same = (self.ratio > 1.0 / STRETCHED) & (self.ratio < STRETCHED)
-        return ~(same & (np.abs(self.shift) <= MOVED))
+        return different(self.shift, self.ratio)
 
     def as_dict(self, names: tuple[str, ...]) -> dict[str, Any]:
         """For summary.json; JSON has no infinity."""
@@ -97,25 +96,21 @@ class Checked:
         return f"{text}; it differs in {listed(told)}." if told else f"{text}."
 
 
+def different(
+    shift: Float[np.ndarray, " p"], ratio: Float[np.ndarray, " p"]
+) -> Bool[np.ndarray, " p"]:
+    """Whether a mean or an sd is another than the Gaussian's; a NaN is."""
+    same = (ratio > 1.0 / STRETCHED) & (ratio < STRETCHED)
+    return ~(same & (np.abs(shift) <= MOVED))
+
+
 @in_float64
 def check_windows(belief: WindowsBelief, cut: Windows, *, key: Key) -> Checked:
     """Laplace's posterior of a fit against the exact one, given the fit's noise."""
-    exact = jax.tree.map(jnp.asarray, cut)
-    sd = jnp.asarray(cut.start_sd)
-    away = jnp.asarray(belief.starts) - jnp.asarray(cut.start)
-    e = jnp.where(sd > 0.0, away / jnp.where(sd > 0.0, sd, 1.0), 0.0)
-    p = belief.prior.mean.size
-    white = jax.random.normal(key, (DRAWS, p))
+    likelihood, z, e, noise = at_map(belief, cut)
+    white = jax.random.normal(key, (DRAWS, z.size))
     scale = jnp.linalg.solve(belief.prior.scale, belief.posterior.scale)
-    mean = jnp.linalg.solve(
-        belief.prior.scale, belief.posterior.mean - belief.prior.mean
-    )
-    found = _log_posterior(
-        likelihood(belief.system, belief.prior, exact),
-        mean[None] + white @ scale.T,
-        e,
-        Noise(jnp.asarray(belief.noise), jnp.asarray(belief.weights)),
-    )
+    found = _log_posterior(likelihood, z[None] + white @ scale.T, e, noise)
     log_weights = np.asarray(found) + 0.5 * np.sum(np.asarray(white) ** 2, axis=1)
     unit = np.asarray(belief.posterior.scale)
     unit = unit / np.linalg.norm(unit, axis=1)[:, None]

@@ -22,7 +22,7 @@ from sim2gp.errors import InputError
 from sim2gp.experiments import scoring
 from sim2gp.experiments.compare_summary import Held, summarise
 from sim2gp.experiments.evaluate import check_horizon, windows_for
-from sim2gp.experiments.prediction import channels, cut_logs, load, recordings
+from sim2gp.experiments.prediction import channels, cut_logs, recordings
 from sim2gp.experiments.record import command, provenance
 from sim2gp.logs import Log
 from sim2gp.models import NLM, FunctionSpace, Residual, ResidualFunctionSpace, Sim2GP
@@ -43,7 +43,7 @@ from sim2gp.models.stepping import (
     transitions,
 )
 from sim2gp.models.windows import Windows, WindowsBelief, fit_windows
-from sim2gp.project import Project, load_project
+from sim2gp.project import Project
 from sim2gp.runs import Progress, new_run
 from sim2gp.systems.base import AbstractSystem
 
@@ -83,14 +83,14 @@ class Setup:
 
 
 def run(
-    project: Path,
+    project: Project,
+    logs: Sequence[Log],
     *,
     out: Path,
     seed: int,
     progress: Progress,
     horizons: Sequence[float] = HORIZONS,
     models: Makers = MODELS,
-    strict: bool = False,
 ) -> dict[str, Any]:
     """Fit, train and judge all models fold by fold; writes and returns the summary.
 
@@ -99,8 +99,7 @@ def run(
     started = time.perf_counter()
     for horizon in horizons:
         check_horizon(horizon)
-    found = load_project(project)
-    setup, folds = prepare(found, load(found, strict=strict), horizons)
+    setup, folds = prepare(project, logs, horizons)
     total = len(folds) * len(models) + 1
     with new_run(out, "compare") as writer, progress.task("compare", total) as task:
         key = jax.random.key(seed)
@@ -110,7 +109,7 @@ def run(
             parts.append(fold(setup, left, models, fold_key, task.advance))
         whole = _fit(setup, [], jax.random.fold_in(key, len(folds)))
         task.advance("evidence")
-        names = channels(found.system, setup.windows)
+        names = channels(project.system, setup.windows)
         summary, arrays = summarise(
             parts,
             list(models),
@@ -122,16 +121,16 @@ def run(
         )
         summary["models"]["SIM2GP"]["log_evidence"] = float(whole.log_evidence)
         asked = "--horizon", *(f"{h:g}" for h in horizons), "--seed", seed
-        line = command("sim2gp", "compare", project, *asked, "--out", out)
+        line = command("sim2gp", "compare", project.path, *asked, "--out", out)
         summary |= {
             "command": "compare",
-            "title": f"{found.name}: which model its logs support",
+            "title": f"{project.name}: which model its logs support",
             "seed": seed,
             "period": setup.period,
             "folds": len(folds),
             "n_logs": len(set(recordings(setup.logs))),
             "n_transitions": len(setup.samples.first),
-            "units": {c.name: c.unit for c in found.system.physical_states},
+            "units": {c.name: c.unit for c in project.system.physical_states},
         }
         summary["warnings"] += [str(note) for log in setup.logs for note in log.notes]
         summary |= provenance(line, started)

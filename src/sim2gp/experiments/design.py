@@ -40,7 +40,7 @@ from sim2gp.models.features import Encoding
 from sim2gp.models.informed import informed_prior
 from sim2gp.models.sim2gp import PRIOR_NOISE
 from sim2gp.parameters import unknown_parameter
-from sim2gp.project import Project, load_project
+from sim2gp.project import Project
 from sim2gp.runs import Progress, new_run
 from sim2gp.systems import alone
 from sim2gp.systems.base import AbstractSystem, index_of
@@ -90,7 +90,7 @@ class Asked:
 
 
 def run(
-    source: Path, asked: Asked, *, out: Path, seed: int, progress: Progress
+    source: Project | Path, asked: Asked, *, out: Path, seed: int, progress: Progress
 ) -> dict[str, Any]:
     """Choose the commands and write them; returns the summary.
 
@@ -117,9 +117,10 @@ def run(
         task.advance("limits and goal")
         found = design(experiment, goal, limits, signal, key=key, starts=asked.starts)
         task.advance(f"{found.nats:.1f} nats")
-        summary = _summarise(source, asked, experiment, goal, found, seed)
+        place = source.path if isinstance(source, Project) else source
+        summary = _summarise(place, asked, experiment, goal, found, seed)
         summary["warnings"] = notes
-        line = command("sim2gp", "design", source, *asked.words().split())
+        line = command("sim2gp", "design", place, *asked.words().split())
         line += " " + command("--seed", seed, "--out", out)
         summary |= provenance(line, started)
         arrays = _arrays(experiment, limits, found)
@@ -134,12 +135,13 @@ def run(
 
 
 @in_float64
-def setting(source: Path, asked: Asked) -> tuple[Project, Experiment, list[str]]:
+def setting(
+    source: Project | Path, asked: Asked
+) -> tuple[Project, Experiment, list[str]]:
     """The machine and what is believed of it; what the user should know of both."""
     notes: list[str] = []
-    if source.suffix == ".toml":
-        project = load_project(source)
-        system = project.system
+    if isinstance(source, Project):
+        project, system = source, source.system
         belief, names = informed_prior(system.parameters), _measured(project)
         noise, period = _stated_noise(project, names), PERIOD
         notes.append("no log was used: what is believed is the project's priors")
@@ -246,7 +248,7 @@ def expectation(experiment: Experiment, found: Designed) -> dict[str, dict[str, 
 
 @in_float64
 def _summarise(
-    source: Path,
+    place: Path,
     asked: Asked,
     experiment: Experiment,
     goal: AbstractGoal,
@@ -266,7 +268,7 @@ def _summarise(
         worth, reason = foretold(asked, ahead["before"], ahead["after"], found.nats)
     return {
         "command": "design",
-        "title": f"{source.stem}: the next experiment",
+        "title": f"{place.stem}: the next experiment",
         "headline": reason,
         "seed": seed,
         "trajectory": FILE,

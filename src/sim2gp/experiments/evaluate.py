@@ -42,7 +42,7 @@ from sim2gp.logs import Log, none_unused, shared_rows
 from sim2gp.models.forecast import forecast
 from sim2gp.models.grid import CURVE, Grid, evaluation_windows, steps_of
 from sim2gp.models.windows import Windows
-from sim2gp.project import Project, load_project
+from sim2gp.project import Project
 from sim2gp.runs import Progress, new_run
 from sim2gp.types import in_float64
 
@@ -110,38 +110,38 @@ def run(
 
 
 def leave_one_out(
-    project: Path,
+    project: Project,
+    logs: Sequence[Log],
     *,
     horizon: float,
     out: Path,
     progress: Progress,
-    strict: bool = False,
 ) -> dict[str, Any]:
     """Fit all recordings but one, predict that one, in turn; writes the summary."""
     started = time.perf_counter()
     check_horizon(horizon)
-    found = load_project(project)
-    logs = found.load_logs(strict=strict)
     files = list(dict.fromkeys(recordings(logs)))
     if len(files) < 2:
         raise InputError(
             "E160",
             "one recording cannot be left out",
-            where=found.source.where("logs"),
+            where=project.source.where("logs"),
             got=f"{len(files)} file",
             expected="at least two files",
             fix="record once more, or identify and evaluate RUN --logs",
         )
     with new_run(out, "evaluate") as writer, progress.task("logs", len(files)) as task:
-        windows, of = cut_logs(found, logs)
-        grid = windows_for(logs, found, max(horizon, CURVE[-1]), horizon)
-        names = channels(found.system, windows)
+        windows, of = cut_logs(project, logs)
+        grid = windows_for(logs, project, max(horizon, CURVE[-1]), horizon)
+        names = channels(project.system, windows)
         parts: list[Judged] = []
         arrays: dict[str, np.ndarray] = {}
         constants = []
         for file in files:
             left = [k for k, source in enumerate(recordings(logs)) if source == file]
-            part, traced, values = _fold(found, logs, windows, of, grid, left, horizon)
+            part, traced, values = _fold(
+                project, logs, windows, of, grid, left, horizon
+            )
             parts.append(part)
             arrays |= traced
             constants.append(values)
@@ -150,16 +150,16 @@ def leave_one_out(
         summary, curves = scores(whole, names, logs, horizon)
         summary["calibration"], shares = calibration(whole, names, horizon)
         arrays |= shares
-        summary["tables"].append(_constants_table(found, files, logs, constants))
+        summary["tables"].append(_constants_table(project, files, logs, constants))
         summary |= {
             "command": "evaluate",
-            "title": f"{found.name}: each log predicted by a fit of the others",
+            "title": f"{project.name}: each log predicted by a fit of the others",
             "folds": len(files),
             "warnings": [*_said(logs), *_repeated(logs, files)],
         }
         asked = "--horizon", f"{horizon:g}", "--out", out
-        line = command("sim2gp", "evaluate", project, *asked)
-        _write(writer, summary, curves | arrays, found, line, started)
+        line = command("sim2gp", "evaluate", project.path, *asked)
+        _write(writer, summary, curves | arrays, project, line, started)
     return summary
 
 

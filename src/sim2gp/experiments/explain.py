@@ -17,7 +17,7 @@ from sim2gp.diagnose.explain import explain
 from sim2gp.errors import InputError
 from sim2gp.experiments.explain_words import candidate_rows, headline, table
 from sim2gp.experiments.identify import PROJECT, project_of, stood
-from sim2gp.experiments.prediction import cut_logs, load
+from sim2gp.experiments.prediction import cut_logs
 from sim2gp.experiments.record import command, provenance
 from sim2gp.project import Project, load_project
 from sim2gp.project.amend import amend
@@ -100,7 +100,7 @@ def _data(run: Path, stored: Run, strict: bool = False) -> AbstractData:
 
 def window_data(project: Project, seed: int = 0, *, strict: bool = False) -> WindowData:
     """A project's logs as windows; those of one second may share an error."""
-    logs = load(project, strict=strict)
+    logs = project.load_logs(strict=strict, alike=True)
     windows, log = cut_logs(project, logs)
     span = max(project.spec.likelihood.window, 1e-9)
     first = np.concatenate([[0], np.flatnonzero(np.diff(log)) + 1])

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool
 
 from sim2gp.experiments.prediction import (
     Judged,
@@ -25,7 +25,7 @@ from sim2gp.gaussian import Gaussian
 from sim2gp.logs import Log
 from sim2gp.models.forecast import Band, fit_band, forecast
 from sim2gp.models.grid import CURVE, PERIOD, Grid, steps_of
-from sim2gp.models.windows import Windows, fit_windows
+from sim2gp.models.windows import Windows, WindowsBelief, fit_windows
 from sim2gp.project import Project
 from sim2gp.types import Key
 
@@ -98,9 +98,9 @@ def fold(
     *,
     key: Key,
     starts: int,
-    near: Float[Array, " p"] | None = None,
+    near: WindowsBelief | None = None,
 ) -> Fold:
-    """The fit of what ``part`` may see, begun ``near`` its MAP, judged by the rest.
+    """The fit of what ``part`` may see, begun ``near`` another, judged by the rest.
 
     Raises as `sim2gp.models.windows.fit_windows` does.
     """

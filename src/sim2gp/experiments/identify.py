@@ -20,6 +20,7 @@ from sim2gp import diagnose
 from sim2gp.diagnose import intervals
 from sim2gp.diagnose.importance import check_windows
 from sim2gp.diagnose.intervals import Corrected, corrected_windows
+from sim2gp.diagnose.nuts import sample_windows, sampler
 from sim2gp.diagnose.residuals import misfit_of_windows
 from sim2gp.errors import InputError
 from sim2gp.experiments.configurations import told
@@ -57,54 +58,53 @@ _SHORTEST = 4  # windows: a film of fewer held-out ones is not worth watching
 
 
 def run(
-    project: Path,
+    project: Project,
+    logs: Sequence[Log],
     *,
     out: Path,
     seed: int,
     progress: Progress,
     check: bool = False,
+    nuts: bool = False,
     held_out: bool = True,
-    strict: bool = False,
 ) -> dict[str, Any]:
     """Fit the logs of a project file and write the run; returns its summary.
 
-    ``check`` holds Laplace's posterior against the exact one by importance sampling;
-    ``held_out`` fits once more without some of the data, and forecasts those;
-    ``strict`` refuses columns that nothing takes (E105).
+    ``check`` holds Laplace's posterior against the exact one by importance sampling,
+    ``nuts`` against draws of it (E135 without the extra ``mcmc``); ``held_out`` fits
+    once more without some of the data, and forecasts those.
     """
     started = time.perf_counter()
-    found = load_project(project)
-    logs = found.load_logs(strict=strict)
+    if nuts:
+        sampler()  # before the work
     with new_run(out, "identify") as writer, progress.task("identify", 4) as task:
-        windows, places = cut_places(found, logs)
+        windows, places = cut_places(project, logs)
         of = np.asarray([k for k, _ in places])
         task.advance(f"{len(windows)} windows")
-        key, robust = jax.random.key(seed), found.spec.likelihood.robust
-        grid = evaluation_windows(logs, found.system, longest=CURVE[-1])
-        compile_forecast(found.system, grid.windows)
-        compile_linearise(found.system, windows)
-        fitted = belief = fit_windows(found.system, windows, key=key, robust=robust)
+        key, robust = jax.random.key(seed), project.spec.likelihood.robust
+        grid = evaluation_windows(logs, project.system, longest=CURVE[-1])
+        compile_forecast(project.system, grid.windows)
+        compile_linearise(project.system, windows)
+        fitted = belief = fit_windows(project.system, windows, key=key, robust=robust)
         task.advance("posterior")
         band = band_of(belief, grid, logs)
         belief = belief.informed()
         honest = corrected_windows(belief, windows, of)
-        summary = _summarise(found, logs, windows, belief, honest, band, seed)
+        summary = _summarise(project, logs, windows, belief, honest, band, seed)
         arrays = _stored(belief, honest.posterior, band, seed)
         other = None
         if held_out:
-            other = unseen(found, logs, windows, places, grid, belief)
-        said, drawings = _drawings(found, logs, belief, band, grid, other)
+            other = unseen(project, logs, windows, places, grid, belief)
+        said, drawings = _drawings(project, logs, belief, band, grid, other)
         summary, arrays = summary | said, arrays | drawings
         task.advance("forecasts")
         options = ["--out", out, "--seed", seed, "" if held_out else "--quick"]
-        line = command("sim2gp", "identify", project, *options, "--check" * check)
-        if check:
-            key = jax.random.fold_in(jax.random.key(seed), 2)
-            exact = check_windows(fitted, windows, key=key)
-            summary["check"] = exact.as_dict(found.system.parameters.names)
-        folder = Path(os.path.abspath(project)).parent
+        options += ["--check" * check, "--nuts" * nuts]
+        line = command("sim2gp", "identify", project.path, *options)
+        summary |= _held_against(fitted, windows, seed, check=check, nuts=nuts)
+        folder = Path(os.path.abspath(project.path)).parent
         summary["project"] = {
-            "file": project.name,
+            "file": project.path.name,
             "folder": os.path.relpath(folder, os.path.abspath(out)),
         }
         summary |= provenance(line, started)
@@ -112,10 +112,25 @@ def run(
 
         writer.write_summary(summary)
         writer.write_arrays("arrays.npz", arrays)
-        writer.write_text(PROJECT, found.source.text)
+        writer.write_text(PROJECT, project.source.text)
         writer.write_text("report.html", write_report(summary, arrays))
         task.advance("report")
     return summary
+
+
+def _held_against(
+    belief: WindowsBelief, windows: Windows, seed: int, *, check: bool, nuts: bool
+) -> dict[str, Any]:
+    """What the exact posterior says of Laplace's, where it is asked."""
+    names, key = belief.system.parameters.names, jax.random.key(seed)
+    out: dict[str, Any] = {}
+    if check:
+        weighed = check_windows(belief, windows, key=jax.random.fold_in(key, 2))
+        out["check"] = weighed.as_dict(names)
+    if nuts:
+        sampled = sample_windows(belief, windows, key=jax.random.fold_in(key, 3))
+        out["nuts"] = sampled.as_dict(names)
+    return out
 
 
 def _drawings(

@@ -14,7 +14,6 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sim2gp.errors import InputError
 from sim2gp.gaussian import Gaussian
 from sim2gp.logs import Log
 from sim2gp.models.cutting import cut
@@ -27,21 +26,6 @@ from sim2gp.systems.base import AbstractSystem
 TRACE = 0.5  # s, the windows that are drawn
 _TRACE_ROWS = np.arange(0, steps_of(TRACE) + 1, 5)
 _EVERY = 5  # of the windows, 0.1 s apart, are drawn
-
-
-def load(project: Project, *, strict: bool = False) -> tuple[Log, ...]:
-    """The logs of a project whose machine has one configuration (else E160)."""
-    for group, spec in enumerate(project.spec.logs):
-        if spec.fixed or spec.free:
-            raise InputError(
-                "E160",
-                "several configurations, which only identify and evaluate take",
-                where=project.source.where("logs", group),
-                got=", ".join(project.spec.configurations),
-                expected="the same constants in all groups",
-                fix="write a project file of one configuration's logs",
-            )
-    return project.load_logs(strict=strict)
 
 
 def cut_logs(project: Project, logs: Sequence[Log]) -> tuple[Windows, np.ndarray]:

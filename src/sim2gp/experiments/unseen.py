@@ -42,8 +42,8 @@ def unseen(
 ) -> Unseen:
     """A second fit, of a part of the windows, and its forecasts of the rest.
 
-    It begins where the ``whole`` logs put the constants, from as many starts as that
-    fit: the two share their compilation.
+    It begins where the ``whole`` logs put constants, starts and noise, and has as many
+    starts to choose from as that fit: the two share their compilation.
     """
     part = held_out(logs, windows, places, grid)
     if part is None:
@@ -51,9 +51,8 @@ def unseen(
     horizon = _horizon(grid, part.test)
     try:
         key = jax.random.key(0)  # of starts that it does not draw
-        near = whole.posterior.mean
         found = fold(
-            project, windows, grid, part, horizon, key=key, starts=2, near=near
+            project, windows, grid, part, horizon, key=key, starts=2, near=whole
         )
     except (NotConverged, NotFinite, DeadParameters) as error:
         return _none(f"a fit without {part.words} failed ({error}).")

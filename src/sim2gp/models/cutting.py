@@ -14,7 +14,8 @@ from jaxtyping import Bool, Float
 
 from sim2gp.errors import InputError
 from sim2gp.logs import Log
-from sim2gp.models.windows import DELAY_BLUR, Windows
+from sim2gp.models.stretch import DELAY_BLUR
+from sim2gp.models.windows import Windows
 from sim2gp.systems.base import AbstractSystem
 
 HALF_WIDTH = 0.025  # s, half the span of the local parabola that guesses a start
@@ -137,7 +138,7 @@ def assemble(
     spread = np.where(spread > 0.0, spread, 1.0)
     sd = np.broadcast_to(spread, x0.shape)
     which = np.asarray([logs[k].group for k, _, _ in pieces], np.int32)
-    return Windows(y, mask, span, knots, area, x0, sd, floor, which, outputs)
+    return Windows(span, knots, area, y, mask, x0, sd, floor, which, outputs)
 
 
 def inputs_since(

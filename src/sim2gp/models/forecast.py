@@ -32,7 +32,8 @@ from sim2gp.ahead import ahead
 from sim2gp.gaussian import LOG_2PI, Gaussian
 from sim2gp.models.grid import Grid
 from sim2gp.models.linearized import value_and_jacobian
-from sim2gp.models.windows import Windows, simulate
+from sim2gp.models.stretch import simulate
+from sim2gp.models.windows import Windows
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import in_float64
 

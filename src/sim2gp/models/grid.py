@@ -79,11 +79,11 @@ def evaluation_windows(
     span = np.full(y.shape[:2], PERIOD)
     span[:, 0] = 0.0
     windows = Windows(
-        y,
-        mask,
         span,
         knots,
         area,
+        y,
+        mask,
         start,
         np.zeros_like(start),
         np.asarray([resolution(logs, name) for name in measured]),

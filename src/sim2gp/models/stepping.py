@@ -32,7 +32,8 @@ from sim2gp.models.grid import (
     parabola,
     states_from,
 )
-from sim2gp.models.windows import Windows, simulate
+from sim2gp.models.stretch import simulate
+from sim2gp.models.windows import Windows
 from sim2gp.systems.actuator import Actuated
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.configured import Configured
@@ -130,11 +131,11 @@ def samples_of(logs: Sequence[Log], stepper: AbstractSystem, period: float) -> S
     local = _parabolas(y)
     start = _state(local, -PERIOD * half, names, measured)
     windows = Windows(
-        y,
-        np.ones(y.shape, bool),
         span,
         knots,
         area,
+        y,
+        np.ones(y.shape, bool),
         start,
         np.zeros_like(start),
         np.zeros(len(measured)),

@@ -30,31 +30,29 @@ from sim2gp.laplace import AbstractLikelihood, Fit, multi_start
 from sim2gp.least_squares import factor
 from sim2gp.models.informed import informed
 from sim2gp.models.linearized import jacobian_by_columns, value_and_jacobian
+from sim2gp.models.stretch import Stretch, inputs_of, simulate
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import AnyArray, Key, Scalar, in_float64
 
 NOISE_ROUNDS = 8  # fewer leave noise and starts of real logs short of a fixed point
+NEAR_ROUNDS = 3  # of a fit that begins with the noise of another one
 FREEDOM = 4.0  # degrees of freedom of the Student-t weight
-DELAY_BLUR = 4e-3  # s, of inputs that may be delayed
 
 
-class Windows(eqx.Module):
+class Windows(Stretch):
     """Padded windows, a row for each end of an integration step.
 
     Row 0 is the start, padding rows have zero length, and a row without a sample (where
-    the clock left a gap too long for one step) has a false mask. ``span`` is the time
-    since the previous row, s. ``knots`` and ``area`` are the times and values at which
-    the integral of the held input bends; between them it is straight, so its mean over
-    any delayed interval is exact. ``outputs`` are the indices of the measured states,
-    ``floor`` the sensors' resolution. ``configuration`` is the machine's, an index into
-    its table's.
+    the clock left a gap too long for one step) has a false mask. ``outputs`` are the
+    indices of the measured states, ``floor`` the sensors' resolution. ``configuration``
+    is the machine's, an index into its table's.
     """
 
-    y: Float[AnyArray, "W L c"]
-    mask: Bool[AnyArray, "W L c"]
     span: Float[AnyArray, "W L"]
     knots: Float[AnyArray, "W H"]
     area: Float[AnyArray, "W H m"]
+    y: Float[AnyArray, "W L c"]
+    mask: Bool[AnyArray, "W L c"]
     start: Float[AnyArray, "W n"]
     start_sd: Float[AnyArray, "W n"]
     floor: Float[AnyArray, " c"]
@@ -68,78 +66,6 @@ class Windows(eqx.Module):
         """``f`` of one window (and of one row of each argument), for all windows."""
         axes = eqx.tree_at(lambda w: w.floor, jax.tree.map(lambda _: 0, self), None)
         return jax.vmap(f, in_axes=(axes, *[0] * len(per_window)))(self, *per_window)
-
-
-class Stretch(eqx.Module):
-    """What a simulation needs of a window: its steps, and the inputs that reach it."""
-
-    span: Float[AnyArray, " L"]
-    knots: Float[AnyArray, " H"]
-    area: Float[AnyArray, "H m"]
-
-
-def inputs_of(
-    window: Windows | Stretch, delays: Float[Array, " m"], blur: float = 0.0
-) -> Float[Array, "L m"]:
-    """Mean delayed input over the step that ends at each row of one window.
-
-    Where every step is as long as the input is held, all of these means bend at the
-    same delays, and a fit is caught in the kink. ``blur`` (s) averages the held input
-    over that width around each time first, which makes them smooth in the delay.
-    """
-    end = jnp.cumsum(window.span)
-    # A row without length has no mean; its input does not matter but must be finite.
-    h = jnp.where(window.span > 0.0, window.span, 1.0)
-
-    def channel(area: Array, delay: Array) -> Array:
-        def integral(t: Array) -> Array:
-            if not blur:
-                return jnp.interp(t, window.knots, area)
-            twice = _second_integral(window.knots, area)
-            return (twice(t + 0.5 * blur) - twice(t - 0.5 * blur)) / blur
-
-        before = integral(-delay[None])
-        return jnp.diff(jnp.concatenate([before, integral(end - delay)])) / h
-
-    return jax.vmap(channel, in_axes=(1, 0), out_axes=1)(window.area, delays)
-
-
-def _second_integral(
-    knots: Float[Array, " H"], area: Float[Array, " H"]
-) -> Callable[[Array], Array]:
-    """The integral of a piecewise straight function, as a function of its end."""
-    length = jnp.diff(knots)
-    slope = jnp.diff(area) / length
-    whole = jnp.cumsum(length * 0.5 * (area[1:] + area[:-1]))
-    whole = jnp.concatenate([jnp.zeros_like(whole[:1]), whole])
-
-    def at(t: Array) -> Array:
-        k = jnp.clip(jnp.searchsorted(knots, t, side="right") - 1, 0, slope.size - 1)
-        x = t - knots[k]
-        return whole[k] + x * (area[k] + 0.5 * x * slope[k])
-
-    return at
-
-
-def simulate(
-    system: AbstractSystem,
-    params: Any,
-    window: Windows | Stretch,
-    x0: Float[Array, " n"],
-) -> Float[Array, "L n"]:
-    """States at the rows of one window, from ``x0`` at its first."""
-
-    def step(x: Array, row: tuple[Array, Array]) -> tuple[Array, Array]:
-        h, u = row
-        x = system.flow(params, x, u, h)
-        return x, x
-
-    blur = DELAY_BLUR if system.longest_delay else 0.0
-    inputs = inputs_of(window, system.delays(params), blur)
-    # A gradient's way back takes each step again: a third of the time that it takes to
-    # keep and fetch what every step has seen. What runs forward alone is not touched.
-    again = jax.checkpoint(step, prevent_cse=False)
-    return jax.lax.scan(again, x0, (window.span, inputs))[1]
 
 
 class WindowsBelief(eqx.Module):
@@ -156,6 +82,11 @@ class WindowsBelief(eqx.Module):
     weights: Float[Array, " W"]
     starts: Float[Array, "W n"]
     log_evidence: Scalar
+
+    @property
+    def known(self) -> Noise:
+        """What a descent holds fixed."""
+        return Noise(jnp.asarray(self.noise), jnp.asarray(self.weights))
 
     @in_float64
     def informed(self) -> "WindowsBelief":
@@ -222,23 +153,20 @@ def _fit(
     prior: Gaussian,
     windows: Windows,
     starts: Float[Array, "starts p"],
+    e: Float[Array, "W n"],
+    noise: Noise,
+    rounds: Int[Array, ""],
     freedom: Scalar,
 ) -> tuple[Fit, WindowsBelief]:
     count = jnp.sum(windows.mask.astype(windows.y.dtype), axis=1)  # (W, c)
-    N = jnp.sum(count, axis=0)
-    # Start from a large noise, so that the first MAP is not trapped.
-    mean = jnp.sum(jnp.where(windows.mask, windows.y, 0.0), axis=1)
-    mean = mean / jnp.maximum(count, 1)
-    away = jnp.where(windows.mask, windows.y - mean[:, None], 0.0)
-    sd = jnp.sqrt(jnp.sum(away**2, axis=(0, 1)) / jnp.maximum(N, 1)) + windows.floor
-    W, n = windows.start.shape
     fit, noise, _ = multi_start(
         likelihood(system, prior, windows),
         starts,
-        jnp.zeros((W, n)),
-        Noise(sd, jnp.ones(W)),
+        e,
+        noise,
         expectation(count, windows.floor, freedom),
         rounds=NOISE_ROUNDS,
+        needed=rounds,
     )
     belief = WindowsBelief(
         system,
@@ -251,6 +179,32 @@ def _fit(
         fit.log_evidence(noise, count),
     )
     return fit, belief
+
+
+def _large(windows: Windows) -> Noise:
+    """The measurements' own sd about each window's mean: it traps no first MAP."""
+    mask = windows.mask.astype(windows.y.dtype)
+    y = jnp.where(windows.mask, windows.y, 0.0)
+    mean = jnp.sum(y, axis=1) / jnp.maximum(jnp.sum(mask, axis=1), 1)
+    squares = jnp.sum(mask * (y - mean[:, None]) ** 2, axis=(0, 1))
+    sd = jnp.sqrt(squares / jnp.maximum(jnp.sum(mask, axis=(0, 1)), 1)) + windows.floor
+    return Noise(sd, jnp.ones(len(windows)))
+
+
+def at_map(
+    belief: WindowsBelief, windows: Windows
+) -> tuple[AbstractLikelihood, Float[Array, " p"], Float[Array, "W n"], Noise]:
+    """The likelihood of a fit; constants, starts and noise where the fit stands."""
+    exact = jax.tree.map(jnp.asarray, windows)
+    z = jnp.linalg.solve(belief.prior.scale, belief.posterior.mean - belief.prior.mean)
+    e = _whitened(exact, jnp.asarray(belief.starts))
+    return likelihood(belief.system, belief.prior, exact), z, e, belief.known
+
+
+def _whitened(windows: Windows, starts: Float[Array, "W n"]) -> Float[Array, "W n"]:
+    """Start states as nuisances; one that is known has none."""
+    sd = windows.start_sd
+    return jnp.where(sd > 0.0, (starts - windows.start) / jnp.where(sd > 0.0, sd, 1), 0)
 
 
 class Linearised(NamedTuple):
@@ -324,8 +278,7 @@ def information_at(
 
     def information(tt: Float[Array, " p"]) -> Float[Array, "p p"]:
         found = linearise(belief, windows, tt)
-        noise = Noise(belief.noise, belief.weights)
-        return _information(found.jacobian, found.residual, noise, n)
+        return _information(found.jacobian, found.residual, belief.known, n)
 
     return in_float64(information)
 
@@ -347,29 +300,31 @@ def fit_windows(
     prior: Gaussian | None = None,
     robust: bool = False,
     starts: int = 2,
-    near: Float[Array, " p"] | None = None,
+    near: WindowsBelief | None = None,
 ) -> WindowsBelief:
     """Posterior of the constants given windows of logs.
 
     Noise by EM, one Student-t weight per window where ``robust``. A ``prior`` is what
     is believed but for what was weighed. The descent begins at the prior's mean and
-    elsewhere, or at virtual values ``near`` the MAP alone. Raises `NotConverged`,
+    elsewhere, or where another fit of windows like these stands, ``near`` this one's:
+    that is quick, and with as many ``starts`` compiles nothing. Raises `NotConverged`,
     `NotFinite` or `DeadParameters`.
     """
     prior = system.parameters.prior() if prior is None else prior
     p = prior.mean.size
-    first = jnp.zeros((starts, p))
-    if near is not None:
-        z = jnp.linalg.solve(prior.scale, jnp.asarray(near, float) - prior.mean)
-        first = first + z[None]
-    elif starts > 1:
-        first = first.at[1:].set(0.7 * jax.random.normal(key, (starts - 1, p)))
+    exact = jax.tree.map(jnp.asarray, windows)
+    if near is None:
+        first = jnp.zeros((starts, p))
+        if starts > 1:
+            first = first.at[1:].set(0.7 * jax.random.normal(key, (starts - 1, p)))
+        e, noise, rounds = jnp.zeros(windows.start.shape), _large(exact), NOISE_ROUNDS
+    else:
+        z = jnp.linalg.solve(prior.scale, near.posterior.mean - prior.mean)
+        first = jnp.full((starts, p), jnp.nan).at[0].set(z)
+        e, noise, rounds = _whitened(exact, near.starts), near.known, NEAR_ROUNDS
+    freedom = jnp.asarray(FREEDOM if robust else jnp.inf)
     fit, belief = _fit(
-        system,
-        prior,
-        jax.tree.map(jnp.asarray, windows),
-        first,
-        jnp.asarray(FREEDOM if robust else jnp.inf),
+        system, prior, exact, first, e, noise, jnp.asarray(rounds), freedom
     )
     names = system.parameters.names
     fit.raise_unless_converged(names, f"{len(windows)} windows")

@@ -55,11 +55,16 @@ class Project:
         """The machine with the file's options, priors and actuators."""
         return self.system
 
-    def load_logs(self, *, strict: bool = False) -> tuple[Log, ...]:
+    def load_logs(
+        self, *, strict: bool = False, alike: bool = False
+    ) -> tuple[Log, ...]:
         """Every log of every group, cut at gaps; names are unique (E101 to E131).
 
-        ``strict``: every column is taken, or E105.
+        ``strict``: every column is taken, or E105. ``alike``: of a machine in one
+        configuration, or E160.
         """
+        if alike:
+            self._check_alike()
         seen: dict[str, int] = {}
         logs: list[Log] = []
         for group, spec in enumerate(self.spec.logs):
@@ -115,6 +120,18 @@ class Project:
             else:
                 raise first or _no_group(self.source)
         return tuple(_uniquely_named(logs))
+
+    def _check_alike(self) -> None:
+        for group, spec in enumerate(self.spec.logs):
+            if spec.fixed or spec.free:
+                raise InputError(
+                    "E160",
+                    "several configurations, which only identify and evaluate take",
+                    where=self.source.where("logs", group),
+                    got=", ".join(self.spec.configurations),
+                    expected="the same constants in all groups",
+                    fix="write a project file of one configuration's logs",
+                )
 
     def files(self, group: int) -> list[Path]:
         """The files of a group, in the order of their names (E130 if there is none)."""

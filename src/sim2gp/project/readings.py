@@ -26,7 +26,8 @@ from sim2gp.errors import NotConverged, NotFinite
 from sim2gp.logs import Column, Log
 from sim2gp.logs.units import factor
 from sim2gp.models.cutting import cut
-from sim2gp.models.windows import Windows, fit_windows, simulate
+from sim2gp.models.stretch import simulate
+from sim2gp.models.windows import Windows, fit_windows
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import Key, in_float64
 

@@ -110,6 +110,7 @@ def parameter_table(summary: Summary) -> Raw:
         ),
         _why(summary.get("intervals")),
         _checked(summary.get("check")),
+        _checked(summary.get("nuts")),
         table(columns, rows, words=(0, 1, last), cards=True),
     )
 
@@ -122,7 +123,7 @@ def _why(about: object) -> Raw:
 
 
 def _checked(check: object) -> Raw:
-    """What importance sampling said of the posterior, where it was asked."""
+    """What importance sampling or NUTS said of the posterior, where it was asked."""
     if not isinstance(check, Mapping) or not check.get("text"):
         return Raw("")
     return paragraph(check["text"])

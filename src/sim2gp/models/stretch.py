@@ -1,0 +1,95 @@
+"""A stretch of recorded input, and the machine simulated under it.
+
+A machine's inputs are held between samples and reach it late: what an integration step
+sees is the mean of the delayed input over it, exactly.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sim2gp.systems.base import AbstractSystem
+from sim2gp.types import AnyArray
+
+DELAY_BLUR = 4e-3  # s, of inputs that may be delayed
+
+
+class Stretch(eqx.Module):
+    """The steps of a simulation, and the inputs that reach it.
+
+    ``span`` is the time since the previous row, s. ``knots`` and ``area`` are the times
+    and values at which the integral of the held input bends; between them it is
+    straight, so its mean over any delayed interval is exact.
+    """
+
+    span: Float[AnyArray, " L"]
+    knots: Float[AnyArray, " H"]
+    area: Float[AnyArray, "H m"]
+
+
+def inputs_of(
+    window: Stretch, delays: Float[Array, " m"], blur: float = 0.0
+) -> Float[Array, "L m"]:
+    """Mean delayed input over the step that ends at each row of one window.
+
+    Where every step is as long as the input is held, all of these means bend at the
+    same delays, and a fit is caught in the kink. ``blur`` (s) averages the held input
+    over that width around each time first, which makes them smooth in the delay.
+    """
+    end = jnp.cumsum(window.span)
+    # A row without length has no mean; its input does not matter but must be finite.
+    h = jnp.where(window.span > 0.0, window.span, 1.0)
+
+    def channel(area: Array, delay: Array) -> Array:
+        def integral(t: Array) -> Array:
+            if not blur:
+                return jnp.interp(t, window.knots, area)
+            twice = _second_integral(window.knots, area)
+            return (twice(t + 0.5 * blur) - twice(t - 0.5 * blur)) / blur
+
+        before = integral(-delay[None])
+        return jnp.diff(jnp.concatenate([before, integral(end - delay)])) / h
+
+    return jax.vmap(channel, in_axes=(1, 0), out_axes=1)(window.area, delays)
+
+
+def _second_integral(
+    knots: Float[Array, " H"], area: Float[Array, " H"]
+) -> Callable[[Array], Array]:
+    """The integral of a piecewise straight function, as a function of its end."""
+    length = jnp.diff(knots)
+    slope = jnp.diff(area) / length
+    whole = jnp.cumsum(length * 0.5 * (area[1:] + area[:-1]))
+    whole = jnp.concatenate([jnp.zeros_like(whole[:1]), whole])
+
+    def at(t: Array) -> Array:
+        k = jnp.clip(jnp.searchsorted(knots, t, side="right") - 1, 0, slope.size - 1)
+        x = t - knots[k]
+        return whole[k] + x * (area[k] + 0.5 * x * slope[k])
+
+    return at
+
+
+def simulate(
+    system: AbstractSystem,
+    params: Any,
+    window: Stretch,
+    x0: Float[Array, " n"],
+) -> Float[Array, "L n"]:
+    """States at the rows of one window, from ``x0`` at its first."""
+
+    def step(x: Array, row: tuple[Array, Array]) -> tuple[Array, Array]:
+        h, u = row
+        x = system.flow(params, x, u, h)
+        return x, x
+
+    blur = DELAY_BLUR if system.longest_delay else 0.0
+    inputs = inputs_of(window, system.delays(params), blur)
+    # A gradient's way back takes each step again: a third of the time that it takes to
+    # keep and fetch what every step has seen. What runs forward alone is not touched.
+    again = jax.checkpoint(step, prevent_cse=False)
+    return jax.lax.scan(again, x0, (window.span, inputs))[1]
