@@ -34,6 +34,7 @@ def identify(
     seed: int,
     progress: Progress,
     check: bool = False,
+    nuts: bool = False,
     held_out: bool = True,
 ) -> dict[str, Any]:
     """What an identification says of its input, and no fit."""
@@ -42,6 +43,7 @@ def identify(
         "parameters": {p.name: {"sd": p.sd} for p in project.system.parameters.free},
         "seed": seed,
         "check": check,
+        "nuts": nuts,
         "held_out": held_out,
         "warnings": [str(note) for log in logs for note in log.notes],
     }
