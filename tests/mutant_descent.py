@@ -67,8 +67,8 @@ DESCENTS = (
     Mutant(
         "last turn no better than the others",
         LAPLACE,
-        "jnp.where(exact, small & (count >= 2), settled | small)",
-        "settled | small",
+        "jnp.where(exact, small & (count >= 2), small)",
+        "small",
         DESCENT,
     ),
     Mutant(

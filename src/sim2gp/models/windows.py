@@ -322,10 +322,10 @@ def fit_windows(
         z = jnp.linalg.solve(prior.scale, near.posterior.mean - prior.mean)
         first = jnp.full((starts, p), jnp.nan).at[0].set(z)
         e, noise, rounds = _whitened(exact, near.starts), near.known, NEAR_ROUNDS
-    freedom = jnp.asarray(FREEDOM if robust else jnp.inf)
-    fit, belief = _fit(
-        system, prior, exact, first, e, noise, jnp.asarray(rounds), freedom
-    )
+    begin = first, e, noise, rounds, FREEDOM if robust else np.inf
+    # By way of NumPy: JAX compiles anew for numbers whose type it calls weak.
+    begin = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)), begin)
+    fit, belief = _fit(system, prior, exact, *begin)
     names = system.parameters.names
     fit.raise_unless_converged(names, f"{len(windows)} windows")
     return belief
