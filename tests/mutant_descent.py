@@ -197,4 +197,11 @@ DESCENTS = (
         "_whitened(exact, near.starts), near.known, 0",
         ("test_windows.py", "near_another"),
     ),
+    Mutant(
+        "steps in vain are tried for ever",
+        LAPLACE,
+        "vain & (here.gradient <= flat)",
+        "vain & (here.gradient <= 0.0)",
+        ("test_laplace.py", "rounding_hides"),
+    ),
 )

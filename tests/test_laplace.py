@@ -147,6 +147,20 @@ def test_nothing_finite_is_a_typed_error():
         fit.raise_unless_converged(("k",), "here")
 
 
+def test_steps_whose_gain_rounding_hides_are_not_tried_for_ever():
+    """Derivatives with an error of their own, as differences on the host have it."""
+
+    def residual(z):
+        exact = 30.0 * jnp.stack([jnp.sin(z[0]) - 0.3, z[0] * z[1] - 0.1, z[1] - 0.4])
+        error = 1e-6 * jnp.sin(1e12 * jax.lax.stop_gradient(z)) * z
+        return exact + (error - jax.lax.stop_gradient(error))[jnp.asarray([0, 1, 1])]
+
+    fit, _, _ = multi_start(residual, [[0.0, 0.0]], tolerance=1e-4)
+    assert int(fit.status) == laplace.CONVERGED
+    assert float(fit.gradient) > 1e-9
+    assert int(fit.steps) <= 20
+
+
 def test_the_best_of_several_descents_wins():
     def residual(z):
         return jnp.stack([20.0 * (z[0] ** 2 - 4.0), 1.0 * (z[0] - 2.0)])
