@@ -167,14 +167,14 @@ DESCENTS = (
         NOISE,
         "jnp.where(mean > 0, mean, 1.0)",
         "jnp.where(mean > 0, 1.0, 1.0)",
-        ("test_laplace.py", "student"),
+        ("test_em.py", "student"),
     ),
     Mutant(
         "windows without data have a say in the noise",
         NOISE,
         "jnp.mean(noise.weights, where=seen)",
         "jnp.mean(noise.weights)",
-        ("test_laplace.py", "student"),
+        ("test_em.py", "student"),
     ),
     Mutant(
         "a start that is no number is descended",
