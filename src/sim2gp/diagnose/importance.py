@@ -74,10 +74,7 @@ class Checked:
             "k": finite_or_none(self.k),
             "draws": self.draws,
             "text": self.words(names),
-            "constants": {
-                name: {"shift": finite_or_none(s), "sd_ratio": finite_or_none(r)}
-                for name, s, r in zip(names, self.shift, self.ratio, strict=True)
-            },
+            "constants": moments(names, self.shift, self.ratio),
         }
 
     def words(self, names: tuple[str, ...]) -> str:
@@ -89,10 +86,7 @@ class Checked:
         text = f"{head} ({k}, {self.draws:.0f} effective draws of {DRAWS})"
         if self.draws < ENOUGH:
             return f"{text}: too few to say how it differs."
-        told = [
-            f"{names[j]} (mean by {self.shift[j]:.1f} sd, sd times {self.ratio[j]:.2f})"
-            for j in np.flatnonzero(self.far())
-        ]
+        told = moved(names, self.shift, self.ratio)
         return f"{text}; it differs in {listed(told)}." if told else f"{text}."
 
 
@@ -104,6 +98,37 @@ def different(
     return ~(same & (np.abs(shift) <= MOVED))
 
 
+def moved(
+    names: tuple[str, ...],
+    shift: Float[np.ndarray, " p"],
+    ratio: Float[np.ndarray, " p"],
+) -> list[str]:
+    """The constants that differ, and how."""
+    return [
+        f"{names[j]} (mean by {shift[j]:.1f} sd, sd times {ratio[j]:.2f})"
+        for j in np.flatnonzero(different(shift, ratio))
+    ]
+
+
+def moments(
+    names: tuple[str, ...],
+    shift: Float[np.ndarray, " p"],
+    ratio: Float[np.ndarray, " p"],
+) -> dict[str, Any]:
+    """Of all constants, for summary.json."""
+    return {
+        name: {"shift": finite_or_none(s), "sd_ratio": finite_or_none(r)}
+        for name, s, r in zip(names, shift, ratio, strict=True)
+    }
+
+
+def directions(belief: WindowsBelief) -> Float[np.ndarray, "p p"]:
+    """A row for each constant: its direction among the standardised unknowns."""
+    scale = np.asarray(belief.posterior.scale)
+    found: np.ndarray = scale / np.linalg.norm(scale, axis=1)[:, None]
+    return found
+
+
 @in_float64
 def check_windows(belief: WindowsBelief, cut: Windows, *, key: Key) -> Checked:
     """Laplace's posterior of a fit against the exact one, given the fit's noise."""
@@ -112,8 +137,7 @@ def check_windows(belief: WindowsBelief, cut: Windows, *, key: Key) -> Checked:
     scale = jnp.linalg.solve(belief.prior.scale, belief.posterior.scale)
     found = _log_posterior(likelihood, z[None] + white @ scale.T, e, noise)
     log_weights = np.asarray(found) + 0.5 * np.sum(np.asarray(white) ** 2, axis=1)
-    unit = np.asarray(belief.posterior.scale)
-    unit = unit / np.linalg.norm(unit, axis=1)[:, None]
+    unit = directions(belief)
     return checked(log_weights, np.asarray(white) @ unit.T)
 
 

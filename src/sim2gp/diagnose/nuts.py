@@ -30,7 +30,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from sim2gp.arrowhead import Noise, eliminate
-from sim2gp.diagnose.importance import different
+from sim2gp.diagnose.importance import different, directions, moments, moved
 from sim2gp.diagnose.words import finite_or_none, listed
 from sim2gp.errors import missing_extra
 from sim2gp.laplace import AbstractLikelihood, point
@@ -74,10 +74,7 @@ class Sampled:
             "draws": finite_or_none(self.draws),
             "divergent": self.divergent,
             "text": self.words(names),
-            "constants": {
-                name: {"shift": finite_or_none(s), "sd_ratio": finite_or_none(r)}
-                for name, s, r in zip(names, self.shift, self.ratio, strict=True)
-            },
+            "constants": moments(names, self.shift, self.ratio),
         }
 
     def words(self, names: tuple[str, ...]) -> str:
@@ -88,10 +85,7 @@ class Sampled:
                 f"NUTS did not settle ({about}, {self.divergent} divergent): "
                 "it says nothing of the Gaussian."
             )
-        told = [
-            f"{names[j]} (mean by {self.shift[j]:.1f} sd, sd times {self.ratio[j]:.2f})"
-            for j in np.flatnonzero(self.far())
-        ]
+        told = moved(names, self.shift, self.ratio)
         if told:
             return f"NUTS ({about}) differs from the Gaussian in {listed(told)}."
         return f"NUTS ({about}) agrees with the Gaussian in every constant."
@@ -115,8 +109,7 @@ def sample_windows(belief: WindowsBelief, cut: Windows, *, key: Key) -> Sampled:
     """
     likelihood, z, e, noise = at_map(belief, cut)
     draws, divergent = sampled(likelihood, z, e, noise, key)
-    unit = np.asarray(belief.posterior.scale)
-    unit = unit / np.linalg.norm(unit, axis=1)[:, None]
+    unit = directions(belief)
     return judged(np.asarray(draws), np.asarray(divergent), unit)
 
 
