@@ -1,15 +1,18 @@
 """Do 95 % intervals hold? Coverage under coloured noise and under missing friction.
 
-    python benchmarks/intervals.py [--sets N] [--workers N] [--sysid] [--out DIR]
+    python benchmarks/intervals.py [--sets N] [--workers N] [--also NAME...] [--out DIR]
 
 Ten seconds of a hidden two-link arm (`interval_arms.py`) are fitted with the likelihood
 of `sim2gp identify`; masses and dampings are unknown. Beside the plain intervals
 (Laplace) and the library's stand what it was chosen from (`interval_candidates.py`) and
 an oracle that knows what is wrong: the noise's true covariance, or a simulator with the
-missing term; `--sysid` adds mujoco.sysid (`interval_sysid.py`, extra `bench`), which is
-told the start. Coverage with its 95 % interval (Clopper-Pearson), the mean interval
-score (Gneiting and Raftery 2007; lower is better) over the oracle's, and the median
-width over the plain one's. Finished cells are not computed again.
+missing term. `--also longer` adds the library's on windows of 1 s instead of .2 s, and
+what comes of those where the misfit tests of both fits are silent, as `sim2gp identify
+--longer` advises; `--also sysid` those of mujoco.sysid (`interval_sysid.py`, extra
+`bench`), which takes all ten seconds in one piece and is told their start. Coverage
+with its 95 % interval (Clopper-Pearson), the mean interval score (Gneiting and Raftery
+2007; lower is better) over the oracle's, and the median width over the plain one's.
+Finished cells are not computed again.
 """
 
 import argparse
@@ -21,19 +24,27 @@ from typing import Any, NamedTuple
 import interval_candidates as candidates
 import jax
 import numpy as np
-from interval_arms import CONDITIONS, NAMES, NOISE, recordings, with_friction
+from interval_arms import (
+    CONDITIONS,
+    NAMES,
+    NOISE,
+    Recordings,
+    recordings,
+    with_friction,
+)
 from interval_sysid import intervals
-from scipy.stats import beta
+from scipy.stats import beta, norm
 
 from sim2gp.diagnose.intervals import corrected, pulls_of_windows
+from sim2gp.diagnose.residuals import misfit_of_windows
 from sim2gp.models.cutting import cut
-from sim2gp.models.windows import fit_windows
+from sim2gp.models.windows import WindowsBelief, fit_windows
 from sim2gp.runs.cells import Cells
 from sim2gp.runs.workers import cores, spread
 from sim2gp.systems import UniformRodArm
 from sim2gp.types import in_float64
 
-WINDOW = 0.2  # s, the default of a project file
+WINDOW, LONGER = 0.2, 1.0  # s; the first is the default of a project file
 CHUNK = 20  # sets of a cell
 METHODS = {
     "plain": "plain (Laplace)",
@@ -43,7 +54,14 @@ METHODS = {
     "five_parts": "five parts",
     "oracle": "oracle",
 }
-SYSID = {"sysid": "mujoco.sysid"}
+ALSO = {
+    "longer": f"sim2gp, windows of {LONGER:g} s",
+    "advised": "sim2gp, longer where silent",  # of "corrected" and "longer"
+    "sysid": "mujoco.sysid",
+}
+FLOWN = ("longer", "sysid")  # of these, the ones with cells
+#: Entry of a cell: of which sets the misfit tests speak, in windows of a length.
+SPEAK = {WINDOW: "speak", LONGER: "speak_longer"}
 ASKED = {"white": (0.92, 0.98)}  # of the others:
 ASKED_ELSE, ASKED_SCORE = (0.90, 0.99), 1.5
 Z = 1.959963984540054
@@ -53,12 +71,18 @@ class Job(NamedTuple):
     condition: str
     chunk: int
     out: Path
-    sysid: bool = False
+    also: str = ""  # a key of `ALSO`, alone
 
     @property
     def name(self) -> str:
         """Of its cell."""
-        return f"{self.condition}_{self.chunk}{'_sysid' * self.sysid}"
+        return f"{self.condition}_{self.chunk}" + (self.also and f"_{self.also}")
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """What its cell rests on."""
+        ours = {} if self.also == "sysid" else {"longer": LONGER}
+        return {"window": WINDOW, "sets": CHUNK, **ours}
 
 
 @in_float64
@@ -68,20 +92,16 @@ def work(job: Job) -> dict[str, Any]:
     data = recordings(condition, CHUNK, job.chunk)
     system, key = UniformRodArm(), jax.random.key(job.chunk)
     prior_sd = np.asarray(system.parameters.prior().sd())
-    if job.sysid:
-        theirs = [intervals(data, s, system.parameters) for s in range(CHUNK)]
-        pairs = zip(theirs, data.truth / prior_sd, strict=True)
-        return {"sysid": [[_rounded(c - t), _rounded(sd)] for (c, sd), t in pairs]}
-    found: dict[str, list[Any]] = {name: [] for name in METHODS}
+    if job.also:
+        return _also(job, data, prior_sd, key)
+    found: dict[str, list[Any]] = {name: [] for name in (*METHODS, SPEAK[WINDOW])}
     for s in range(CHUNK):
-        windows, of = cut([data.log(s)], system, window=WINDOW)
-        belief = fit_windows(system, windows, key=key)
-        pulls = pulls_of_windows(belief, windows, np.asarray([k for k, _ in of]))
+        belief, windows, pulls = _fitted(data, s, WINDOW, key)
+        found[SPEAK[WINDOW]].append(misfit_of_windows(belief, windows).alarm)
         x = candidates.linear(belief, windows, pulls)
-        mine = corrected(belief.prior, belief.posterior, pulls).posterior
         each = {
             "plain": (x.z, np.asarray(belief.posterior.sd()) / prior_sd),
-            "corrected": (np.asarray(mine.mean) / prior_sd, mine.sd() / prior_sd),
+            "corrected": _corrected(belief, pulls),
             "clusters": candidates.clusters(x),
             "mixture": candidates.mixture(x),
             "five_parts": candidates.five_parts(x),
@@ -101,12 +121,62 @@ def work(job: Job) -> dict[str, Any]:
     return found
 
 
+def _also(job: Job, data: Recordings, prior_sd: Any, key: Any) -> dict[str, Any]:
+    """Like `work`, of one method alone."""
+    found: dict[str, list[Any]] = {job.also: []}
+    for s in range(CHUNK):
+        if job.also == "sysid":
+            centre, sd = intervals(data, s, UniformRodArm().parameters)
+        else:
+            belief, windows, pulls = _fitted(data, s, LONGER, key)
+            alarm = misfit_of_windows(belief, windows).alarm
+            found.setdefault(SPEAK[LONGER], []).append(alarm)
+            centre, sd = _corrected(belief, pulls)
+        error = centre - data.truth[s] / prior_sd
+        found[job.also].append([_rounded(error), _rounded(sd)])
+    return found
+
+
+def _fitted(data: Recordings, s: int, window: float, key: Any) -> tuple[Any, Any, Any]:
+    """Belief, windows and their pulls, of one set."""
+    system = UniformRodArm()
+    windows, of = cut([data.log(s)], system, window=window)
+    belief = fit_windows(system, windows, key=key)
+    pulls = pulls_of_windows(belief, windows, np.asarray([k for k, _ in of]))
+    return belief, windows, pulls
+
+
+def _corrected(belief: WindowsBelief, pulls: Any) -> tuple[np.ndarray, np.ndarray]:
+    prior_sd = np.asarray(belief.prior.sd())
+    mine = corrected(belief.prior, belief.posterior, pulls).posterior
+    return np.asarray(mine.mean) / prior_sd, np.asarray(mine.sd()) / prior_sd
+
+
 def _rounded(x: np.ndarray) -> list[float]:
     return [float(f"{v:.4g}") for v in x]
 
 
+def figures(joined: dict[str, list[Any]]) -> dict[str, Any]:
+    """Of one condition: its table, and what the misfit tests of both fits say.
+
+    ``apart`` is the share of sets where the two fits lie further apart in some constant
+    than the short windows' intervals say, at 5 % for all constants together.
+    """
+    found = {name: np.asarray(v) for name, v in joined.items()}
+    speak = {w: found.pop(key) for w, key in SPEAK.items() if key in found}
+    if "longer" not in found:
+        return {"methods": table(found)}
+    silent = ~(speak[WINDOW] | speak[LONGER])[:, None, None]
+    found["advised"] = np.where(silent, found["longer"], found["corrected"])
+    (short, sd), long = np.moveaxis(found["corrected"], 1, 0), found["longer"][:, 0]
+    far = np.max(np.abs(long - short) / sd, axis=1) > norm.isf(0.025 / len(NAMES))
+    about = {"apart": far.mean(), "advised": silent.mean()}
+    about |= {key: speak[w].mean() for w, key in SPEAK.items()}
+    return {"methods": table(found), **{k: float(v) for k, v in about.items()}}
+
+
 def table(found: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Figures of one condition: of every method, an entry per constant."""
+    """Of every method, an entry per constant."""
     scores = {name: _score(*np.moveaxis(v, 1, 0)) for name, v in found.items()}
     out: dict[str, Any] = {}
     for name, values in found.items():
@@ -150,7 +220,7 @@ def lines(summary: dict[str, Any]) -> list[str]:
         out.append(f"{'':30s}{titles}")
         head = f"{'coverage':>14s}{'width':>6s}{'score':>6s} "
         out.append(f"{'':30s}{head * len(NAMES)}")
-        for method, title in (METHODS | SYSID).items():
+        for method, title in (METHODS | ALSO).items():
             if method not in entry["methods"]:
                 continue
             row = f"{title:30s}"
@@ -160,6 +230,12 @@ def lines(summary: dict[str, Any]) -> list[str]:
                 row += f"{c['width']:6.2f}{c['score']:6.2f} "
             out.append(row)
         out.append(_goal(name, entry["methods"]["corrected"]))
+        if "advised" in entry:
+            out.append(
+                f"misfit tests speak: windows of {WINDOW:g} s {entry['speak']:.3f}, of "
+                f"{LONGER:g} s {entry['speak_longer']:.3f}; longer advised: "
+                f"{entry['advised']:.3f}; fits apart: {entry['apart']:.3f}"
+            )
     return out
 
 
@@ -181,20 +257,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sets", type=int, default=200)
     parser.add_argument("--workers", type=int, default=cores())
-    parser.add_argument("--sysid", action="store_true")
+    parser.add_argument("--also", nargs="+", choices=FLOWN, default=[])
     parser.add_argument("--out", type=Path, default=Path("results/intervals"))
     options = parser.parse_args()
     chunks = -(-options.sets // CHUNK)
-    cells, arguments = Cells(options.out), {"window": WINDOW, "sets": CHUNK}
-    groups, found = [], {}
+    cells, groups, found = Cells(options.out), [], {}
     for name in CONDITIONS:
-        for sysid in (False, True)[: 1 + options.sysid]:
-            jobs = [Job(name, k, options.out, sysid) for k in range(chunks)]
-            done = {j: cells.load(j.name, arguments) for j in jobs}
-            found |= {j: v for j, v in done.items() if v is not None}
-            groups.append([j for j in jobs if done[j] is None])
+        for also in ("", *FLOWN):
+            jobs = [Job(name, k, options.out, also) for k in range(chunks)]
+            done = {j: cells.load(j.name, j.arguments) for j in jobs}
+            missing = [j for j in jobs if done[j] is None]
+            if not missing or also in ("", *options.also):
+                found |= {j: v for j, v in done.items() if v is not None}
+                groups.append(missing)
     for job, values in spread(work, groups, options.workers):
-        found[job] = cells.save(job.name, arguments, values)
+        found[job] = cells.save(job.name, job.arguments, values)
         print(f"{len(found)}", end="\r", file=sys.stderr)
     summary: dict[str, Any] = {"sets": chunks * CHUNK, "conditions": {}}
     for name, condition in CONDITIONS.items():
@@ -202,8 +279,7 @@ def main() -> None:
         for job in sorted(found, key=lambda j: j.chunk):
             for method, values in found[job].items() if job.condition == name else ():
                 joined.setdefault(method, []).extend(values)
-        figures = table({method: np.asarray(v) for method, v in joined.items()})
-        summary["conditions"][name] = {"title": condition.title, "methods": figures}
+        summary["conditions"][name] = {"title": condition.title, **figures(joined)}
     text = "\n".join(lines(summary))
     print(text)
     options.out.mkdir(parents=True, exist_ok=True)

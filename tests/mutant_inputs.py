@@ -92,7 +92,7 @@ INPUTS = (
     ),
     Mutant(
         "inputs: a run's project may change",
-        "experiments/identify.py",
+        "experiments/identified.py",
         "    if now == fitted:",
         "    if True:",
         (TESTS, "changed"),

@@ -4,6 +4,7 @@ from mutant_list import Mutant
 
 PULLS, WEIGHTS = "diagnose/intervals.py", "diagnose/importance.py"
 HERE, TAILS = "test_intervals.py", "test_importance.py"
+LONGER = "experiments/longer.py"
 
 INTERVALS = (
     Mutant(
@@ -89,5 +90,19 @@ INTERVALS = (
         "np.sum(R[:, n:, n] ** 2)",
         "np.sum(R[..., n] ** 2)",
         (HERE, "where_the_gaussian_says"),
+    ),
+    Mutant(
+        "longer: missing physics refuses nothing",
+        LONGER,
+        "alarm = misfit_of_windows(belief, windows).alarm",
+        "alarm = False",
+        ("test_longer.py", "too_slow"),
+    ),
+    Mutant(
+        "longer: windows are as long as before",
+        LONGER,
+        "cut_logs(project, logs, TIMES)",
+        "cut_logs(project, logs)",
+        ("test_longer.py", "how_much_more"),
     ),
 )

@@ -226,7 +226,7 @@ ON_THE_HOST = (
     ),
     Mutant(
         "apply: the file may be another one",
-        "experiments/identify.py",
+        "experiments/identified.py",
         "    _check_fitted(project, x)\n",
         "",
         ("test_project_model.py", "changed_in_place"),

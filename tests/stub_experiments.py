@@ -35,6 +35,7 @@ def identify(
     progress: Progress,
     check: bool = False,
     nuts: bool = False,
+    longer: bool = False,
     held_out: bool = True,
 ) -> dict[str, Any]:
     """What an identification says of its input, and no fit."""
@@ -44,6 +45,7 @@ def identify(
         "seed": seed,
         "check": check,
         "nuts": nuts,
+        "longer": longer,
         "held_out": held_out,
         "warnings": [str(note) for log in logs for note in log.notes],
     }

@@ -257,9 +257,11 @@ def test_identify_of_a_small_project(
     assert main(words) == 0
     said = json.loads(capsys.readouterr().out)
     assert (said["check"], said["held_out"]) == (True, True)
-    words = ["identify", "arm.toml", "--quick", "--json", "--quiet"]
-    assert main([*words, "--out", "three"]) == 0
-    assert not json.loads(capsys.readouterr().out)["held_out"]
+    words = ["identify", "arm.toml", "--quick", "--longer", "--nuts", "--json"]
+    assert main([*words, "--quiet", "--out", "three"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    asked = [said[key] for key in ("held_out", "longer", "nuts", "check")]
+    assert asked == [False, True, True, False]
 
 
 @pytest.mark.parametrize("unbuffered", ["", "1"])

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -136,8 +137,8 @@ def test_a_designed_experiment_beats_random_ones(found) -> None:
     assert best.nats > max(nats) + 0.3
     # The scale that is told is that of its own commands.
     U = jnp.asarray(best.commands)
-    states = TRAJECTORY(e, nowhere, U)
-    A = np.asarray(INFORMATION(e, nowhere, U, states))
+    states = eqx.filter_jit(d.trajectory)(e, nowhere, U)
+    A = np.asarray(eqx.filter_jit(d.information)(e, nowhere, U, states))
     np.testing.assert_allclose(best.states, states, atol=1e-9)
     np.testing.assert_allclose(best.scale, d.after(e.belief, jnp.asarray(A)), rtol=1e-9)
 

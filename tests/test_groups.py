@@ -11,6 +11,7 @@ from sim2gp.configurations import Configuration
 from sim2gp.errors import InputError
 from sim2gp.experiments import apply, design, evaluate, explain, identify
 from sim2gp.experiments.configurations import told
+from sim2gp.experiments.identified import restored
 from sim2gp.logs import Log
 from sim2gp.project import load_project
 from sim2gp.runs import Progress, load_run
@@ -184,21 +185,21 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def identified(path: Path, out: Path) -> None:
+def identified(path: Path, out: Path, *, held_out: bool = True) -> None:
     project = load_project(path)
-    identify.run(project, project.load_logs(), out=out, seed=0, progress=QUIET)
+    logs = project.load_logs()
+    identify.run(project, logs, out=out, seed=0, progress=QUIET, held_out=held_out)
 
 
 @pytest.fixture(scope="module")
 def run(folder: Path) -> Path:
-    identified(folder / "arm.toml", folder / "run")
+    identified(folder / "arm.toml", folder / "run", held_out=False)
     return folder / "run"
 
 
 NAMES = ("joint/shoulder/damping", "body/arm/mass", "body/hand/mass @ loaded")
 
 
-@pytest.mark.nightly
 def test_a_joint_fit_names_each_column(run: Path) -> None:
     summary = load_run(run).summary
     found = summary["parameters"]
@@ -221,6 +222,10 @@ def test_a_joint_fit_names_each_column(run: Path) -> None:
     page = (run / "report.html").read_text()
     assert "configurations</" in page
     assert "body/hand/mass @ loaded" in page
+    assert summary["animation"]["title"].endswith("; the machine bare")
+    marks = [mark["text"] for mark in summary["animation"]["marks"]]
+    assert marks
+    assert all(text.startswith("bare, ") for text in marks)  # one machine, not two
 
 
 @pytest.mark.nightly
@@ -229,8 +234,16 @@ def test_held_out_logs_are_of_one_configuration(
 ) -> None:
     def error(name: str | None) -> dict[str, Any]:
         held, out = [folder / "held.csv"], tmp_path / f"{name}"
+        fit = restored(run)
+        logs = fit.read(held, name, strict=False)
         return evaluate.run(
-            run, held, horizon=0.2, out=out, progress=QUIET, configuration=name
+            fit,
+            logs,
+            files=held,
+            horizon=0.2,
+            out=out,
+            progress=QUIET,
+            configuration=name,
         )
 
     right, wrong = error("loaded"), error("bare")
@@ -293,7 +306,7 @@ def test_commands_for_one_configuration_say_so(
     run: Path, folder: Path, tmp_path: Path
 ) -> None:
     path, out = folder / "arm.toml", tmp_path / "out"
-    one = "E160 several configurations, which only identify and evaluate take"
+    one = "E160 several configurations, which explain and compare do not take"
     with pytest.raises(InputError, match=one):
         load_project(path).load_logs(alike=True)
     with pytest.raises(InputError, match=one):

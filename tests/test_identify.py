@@ -2,12 +2,16 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from sim2gp.cli import main
 from sim2gp.errors import InputError
-from sim2gp.experiments import evaluate, identify
+from sim2gp.experiments import evaluate, identify, longer
+from sim2gp.experiments.identified import restored
+from sim2gp.experiments.longer import Longer
 from sim2gp.logs import Log
 from sim2gp.project import load_project
 from sim2gp.runs import Progress, load_run
@@ -63,7 +67,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def run(folder: Path) -> Path:
     project, out = load_project(project_in(folder)), folder / "run"
     logs = project.load_logs()
-    identify.run(project, logs, out=out, seed=0, progress=QUIET, check=True)
+    with pytest.MonkeyPatch.context() as patch:  # that fit is test_longer's
+        found = Longer(1.0, {"viscous": 0.25})
+        patch.setattr(longer, "lengthened", lambda *given, **how: found)
+        identify.run(
+            project, logs, out=out, seed=0, progress=QUIET, check=True, longer=True
+        )
     return folder / "run"
 
 
@@ -104,7 +113,7 @@ def test_identify_checks_laplace_against_the_exact_posterior(run: Path) -> None:
     for entry in check["constants"].values():
         assert abs(entry["shift"]) < 0.2
         assert entry["sd_ratio"] == pytest.approx(1.0, abs=0.15)
-    assert summary["command_line"].endswith("--check")
+    assert summary["command_line"].endswith("--check --longer")
 
 
 def test_belief_and_intervals_are_both_kept(run: Path) -> None:
@@ -125,6 +134,7 @@ def test_identify_writes_a_report_with_traces(run: Path) -> None:
     assert 'id="traces"' in text
     assert text.count('<span class="why">plain: ') == len(FREE)
     assert "Gaussian is fine (Pareto k" in text
+    assert "likelihood.window = 1 makes them the run" in text
     assert "white noise would" in text
     assert "nan" not in text.lower().replace("nanos", "")
     arrays = load_run(run).arrays
@@ -148,7 +158,7 @@ def test_identify_forecasts_a_log_that_it_left_out(run: Path) -> None:
         assert words in text
     command = stored.summary["command_line"]
     assert command == f"sim2gp identify {run.parent / 'machine.toml'} --out {run} " + (
-        "--seed 0 --check"
+        "--seed 0 --check --longer"
     )
     assert {"python", "sim2gp", "jax", "numpy"} <= set(stored.summary["versions"])
 
@@ -171,17 +181,22 @@ def test_a_film_shows_what_was_recorded_and_forecast(run: Path) -> None:
             np.testing.assert_allclose(x[f"animation/{kind}"][:, row], drawn, atol=1e-6)
 
 
+def _evaluated(run: Path, folder: Path, *, horizon: float, out: Path) -> Any:
+    fit, files = restored(run), [folder / "held" / "log3.csv"]
+    logs = fit.read(files, None, strict=False)
+    return evaluate.run(
+        fit, logs, files=files, horizon=horizon, out=out, progress=QUIET
+    )
+
+
 def test_evaluate_predicts_a_log_from_anywhere(
     run: Path, folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    summary = evaluate.run(
-        run,
-        [folder / "held" / "log3.csv"],
-        horizon=0.2,
-        out=tmp_path / "out",
-        progress=QUIET,
-    )
+    log, out = folder / "held" / "log3.csv", tmp_path / "out"
+    words = ["evaluate", run, "--logs", log, "--out", out, "--quiet"]
+    assert main([str(word) for word in words]) == 0
+    summary = load_run(out).summary
     json.dumps(summary, allow_nan=False)
     for key in ("open_loop_rmse", "one_step_rmse", "nll", "coverage90", "coverage95"):
         assert set(summary[key]) == {"theta", "alpha"}
@@ -190,6 +205,9 @@ def test_evaluate_predicts_a_log_from_anywhere(
     assert summary["one_step_rmse"]["alpha"] < 0.01
     assert [row[0] for row in summary["tables"][1]["rows"]] == ["log3", "pooled"]
     assert "training logs" not in " ".join(summary["warnings"])
+    assert summary["command_line"] == (
+        f"sim2gp evaluate {run} --logs {log} --horizon 0.2 --out {out}"
+    )
 
 
 def test_leave_one_out_predicts_every_log(folder: Path, tmp_path: Path) -> None:
@@ -210,13 +228,7 @@ def test_leave_one_out_predicts_every_log(folder: Path, tmp_path: Path) -> None:
 def test_no_horizon_longer_than_the_log(run: Path, folder: Path) -> None:
     for horizon, code in ((5.0, "E116"), (0.0, "E160"), (float("nan"), "E160")):
         with pytest.raises(InputError) as caught:
-            evaluate.run(
-                run,
-                [folder / "held" / "log3.csv"],
-                horizon=horizon,
-                out=folder / "none",
-                progress=QUIET,
-            )
+            _evaluated(run, folder, horizon=horizon, out=folder / "none")
         assert caught.value.code == code
     assert not (folder / "none").exists()
 

@@ -10,7 +10,7 @@ import pytest
 from sim2gp.cli import main
 from sim2gp.errors import InputError
 from sim2gp.experiments import apply
-from sim2gp.experiments.identify import restored
+from sim2gp.experiments.identified import restored
 from sim2gp.project import load_project
 from sim2gp.runs import load_run
 from sim2gp.systems.mjcf_load import compiled_all

@@ -6,6 +6,7 @@ checkout) or `nightly` (too long for `make test`).
 """
 
 import itertools
+import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,36 +56,39 @@ BLOCKS = [block for page in PAGES if page.is_file() for block in blocks_of(page)
 
 
 class Reader:
-    """Someone who types in a page from the top; each block runs once."""
+    """Someone who types in a page from the top; each block runs once.
 
-    def __init__(self, page: Path) -> None:
-        self.waiting = blocks_of(page)
+    ``folder`` is where he stands: a block may go elsewhere, and he stays there.
+    """
+
+    def __init__(self, page: Path, folder: Path) -> None:
+        self.waiting, self.folder = blocks_of(page), folder
         self.names: dict[str, object] = {"__name__": "__main__"}
 
     def read_to(self, block: Block) -> None:
         """Run what stands before the block and has not run yet, then the block."""
+        os.chdir(self.folder)
         due = [b for b in self.waiting if b.line <= block.line]
         self.waiting = [b for b in self.waiting if b.line > block.line]
         for each in due:
             # Empty lines in front make a traceback name the page's own line.
             code = "\n" * (each.line - 1) + each.code
             exec(compile(code, str(each.page), "exec"), self.names)
+        self.folder = Path.cwd()
 
 
-Readers = dict[Path, tuple[Reader, Path]]
+Readers = dict[Path, Reader]
 
 
 @pytest.fixture(scope="module")
-def readers(
-    tmp_path_factory: pytest.TempPathFactory,
-) -> dict[Path, tuple[Reader, Path]]:
+def readers(tmp_path_factory: pytest.TempPathFactory) -> Readers:
     """A reader and an empty folder for each page; examples/ is at hand."""
     found = {}
     for page in {block.page for block in BLOCKS}:
         folder = tmp_path_factory.mktemp(page.stem)
         if (ROOT / "examples").is_dir():
             (folder / "examples").symlink_to(ROOT / "examples")
-        found[page] = (Reader(page), folder)
+        found[page] = Reader(page, folder)
     return found
 
 
@@ -97,9 +101,8 @@ def test_block_runs(
 ) -> None:
     if "logs" in block.needs:
         request.getfixturevalue("shared_data")
-    reader, folder = readers[block.page]
-    monkeypatch.chdir(folder)
-    reader.read_to(block)
+    monkeypatch.chdir(ROOT)  # where the next test begins
+    readers[block.page].read_to(block)
 
 
 def test_blocks_ask_only_for_known_things() -> None:
@@ -129,13 +132,16 @@ def test_make_targets_in_the_pages_exist() -> None:
     assert named <= targets
 
 
-def test_a_page_is_read_in_order_and_once(tmp_path: Path) -> None:
+def test_a_page_is_read_in_order_and_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     page = tmp_path / "page.md"
     fence = "```"
     texts = ["seen = [1]", "seen.append(2)", "seen.append(missing)"]
     page.write_text("".join(f"{fence}python\n{text}\n{fence}\n" for text in texts))
     first, second, third = blocks_of(page)
-    reader = Reader(page)
+    reader = Reader(page, tmp_path)
     for block in itertools.chain([second], [first, second]):
         reader.read_to(block)
     assert reader.names["seen"] == [1, 2]

@@ -102,7 +102,9 @@ class Identify(Reads):
     check: bool = False
     """Hold the posterior against the exact one (Pareto k); takes as long again."""
     nuts: bool = False
-    """Hold it against draws by NUTS, too (extra mcmc); takes minutes."""
+    """Hold it against draws by NUTS, too (extra mcmc); half an hour and more."""
+    longer: bool = False
+    """Fit windows five times as long, too: do they tell more?"""
     quick: bool = False
     """No second fit, which forecasts data that it has not seen."""
 
@@ -115,6 +117,7 @@ class Identify(Reads):
             seed=self.seed,
             check=self.check,
             nuts=self.nuts,
+            longer=self.longer,
             held_out=not self.quick,
             progress=progress,
         )
@@ -150,8 +153,10 @@ class Evaluate(Reads, Chosen):
         if not self.logs:
             expected, fix = "--logs FILE...", "name the logs to predict"
             raise usage_error("no logs", "no --logs", expected, fix)
-        how |= {"configuration": self.configuration, "strict": self.strict}
-        return _experiment("evaluate")(self.run_or_project, list(self.logs), **how)
+        fit = _experiment("identified", "restored")(self.run_or_project)
+        tested = fit.read(self.logs, self.configuration, strict=self.strict)
+        how |= {"configuration": self.configuration, "files": self.logs}
+        return _experiment("evaluate")(fit, tested, **how)
 
 
 @dataclass(kw_only=True)
@@ -370,8 +375,8 @@ def _read(path: Path, *, strict: bool, alike: bool = False) -> tuple[Any, Any]:
     return project, project.load_logs(strict=strict, alike=alike)
 
 
-def _experiment(module: str, name: str = "run") -> Callable[..., dict[str, Any]]:
-    found: Callable[..., dict[str, Any]] = getattr(
+def _experiment(module: str, name: str = "run") -> Callable[..., Any]:
+    found: Callable[..., Any] = getattr(
         import_module(f"sim2gp.experiments.{module}"), name
     )
     return found

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from sim2gp.errors import InputError
-from sim2gp.experiments.identify import PROJECT, project_of
+from sim2gp.experiments.identified import PROJECT, project_of
 from sim2gp.project import Project
 from sim2gp.project.project import is_model
 from sim2gp.project.replace import replace_file

@@ -33,7 +33,7 @@ from sim2gp.design import (
 from sim2gp.diagnose.table import physical_moments
 from sim2gp.diagnose.words import digits, listed
 from sim2gp.errors import InputError
-from sim2gp.experiments.identify import restored
+from sim2gp.experiments.identified import restored
 from sim2gp.experiments.prediction import units
 from sim2gp.experiments.record import command, provenance
 from sim2gp.models.features import Encoding

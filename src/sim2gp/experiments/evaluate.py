@@ -6,7 +6,6 @@ project's logs but one and predicts that one, in turn. The protocol is that of
 training logs alone.
 """
 
-import os
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,11 +15,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from sim2gp.configurations import index_of
 from sim2gp.errors import InputError
 from sim2gp.experiments.calibration import calibration
 from sim2gp.experiments.folds import fold, without
-from sim2gp.experiments.identify import PROJECT, restored
+from sim2gp.experiments.identified import Identified, stood
 from sim2gp.experiments.motion import film
 from sim2gp.experiments.prediction import (
     Judged,
@@ -38,7 +36,7 @@ from sim2gp.experiments.prediction import (
 )
 from sim2gp.experiments.record import command, provenance
 from sim2gp.gaussian import Gaussian
-from sim2gp.logs import Log, none_unused, shared_rows
+from sim2gp.logs import Log, shared_rows
 from sim2gp.models.forecast import forecast
 from sim2gp.models.grid import CURVE, Grid, evaluation_windows, steps_of
 from sim2gp.models.windows import Windows
@@ -48,32 +46,27 @@ from sim2gp.types import in_float64
 
 
 def run(
-    run: Path,
-    logs: list[Path],
+    fit: Identified,
+    tested: Sequence[Log],
     *,
+    files: Sequence[Path],
     horizon: float,
     out: Path,
     progress: Progress,
     configuration: str | None = None,
-    strict: bool = False,
 ) -> dict[str, Any]:
-    """Predict ``logs`` by an identify run; writes and returns the summary.
+    """Predict logs by an identify run; writes and returns the summary.
 
-    They are of the machine in one ``configuration``, where it has several (E152).
+    They were read from ``files``, as `Identified.read` does for a ``configuration``.
     """
     started = time.perf_counter()
     check_horizon(horizon)
-    fit = restored(run)
     found, system = fit.project, fit.project.system
-    index_of(configuration, system.parameters.configurations)
-    tested = found.read_logs(logs, configuration)
-    if strict:
-        none_unused(tested)
     with new_run(out, "evaluate") as writer, progress.task("evaluate", 2) as task:
         rows, longest = rows_for(horizon), max(horizon, CURVE[-1])
         grid = windows_for(tested, found, longest, horizon)
         result = forecast(system, fit.posterior, grid.windows, rows)
-        train = _training(found, fit.summary, run)
+        train = _training(fit)
         linear = None
         if train is not None:
             known = evaluation_windows(train, system, longest=longest)
@@ -96,12 +89,12 @@ def run(
         if about:
             summary["animation"] = about
             arrays |= moves
-        asked = ["--logs", *logs, "--horizon", f"{horizon:g}", "--out", out]
+        asked = ["--logs", *files, "--horizon", f"{horizon:g}", "--out", out]
         asked += ["--configuration", configuration] if configuration else []
-        line = command("sim2gp", "evaluate", run, *asked)
+        line = command("sim2gp", "evaluate", fit.run, *asked)
         summary |= {
             "command": "evaluate",
-            "title": f"{run.name}: prediction of logs it was not fitted to",
+            "title": f"{fit.run.name}: prediction of logs it was not fitted to",
             "warnings": notes,
         }
         _write(writer, summary, arrays, found, line, started)
@@ -238,14 +231,10 @@ def _repeated(logs: Sequence[Log], files: Sequence[str]) -> list[str]:
     return notes
 
 
-def _training(
-    project: Project, summary: dict[str, Any], run: Path
-) -> tuple[Log, ...] | None:
+def _training(fit: Identified) -> tuple[Log, ...] | None:
     """The logs that a run was fitted to, where they still stand."""
-    about = summary.get("project", {})
-    place = run / about.get("folder", "") / about.get("file", PROJECT)
     try:
-        return replace(project, path=Path(os.path.normpath(place))).load_logs()
+        return replace(fit.project, path=stood(fit.run, fit.summary)).load_logs()
     except InputError:
         return None
 

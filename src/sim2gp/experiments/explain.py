@@ -16,7 +16,7 @@ from sim2gp.diagnose.evidence import AbstractData, OneStepData, WindowData
 from sim2gp.diagnose.explain import explain
 from sim2gp.errors import InputError
 from sim2gp.experiments.explain_words import candidate_rows, headline, table
-from sim2gp.experiments.identify import PROJECT, project_of, stood
+from sim2gp.experiments.identified import PROJECT, project_of, stood
 from sim2gp.experiments.prediction import cut_logs
 from sim2gp.experiments.record import command, provenance
 from sim2gp.project import Project, load_project
@@ -130,7 +130,7 @@ def _flown(stored: Run) -> OneStepData:
 
 def _project(run: Path, stored: Run) -> Project:
     """The run's own copy of the project, its logs where the file stood."""
-    return dataclasses.replace(project_of(run, stored), path=stood(run, stored))
+    return dataclasses.replace(project_of(run, stored), path=stood(run, stored.summary))
 
 
 def _project_file(run: Path, stored: Run, add: bool) -> Path | None:
@@ -146,7 +146,7 @@ def _project_file(run: Path, stored: Run, add: bool) -> Path | None:
             expected="the folder of sim2gp identify",
             fix="leave --add out",
         )
-    place = stood(run, stored)
+    place = stood(run, stored.summary)
     if load_project(place).source.text != load_project(run / PROJECT).source.text:
         raise InputError(
             "E160",

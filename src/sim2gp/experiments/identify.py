@@ -9,12 +9,10 @@ import os
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from sim2gp import diagnose
 from sim2gp.diagnose import intervals
@@ -22,8 +20,9 @@ from sim2gp.diagnose.importance import check_windows
 from sim2gp.diagnose.intervals import Corrected, corrected_windows
 from sim2gp.diagnose.nuts import sample_windows, sampler
 from sim2gp.diagnose.residuals import misfit_of_windows
-from sim2gp.errors import InputError
 from sim2gp.experiments.configurations import told
+from sim2gp.experiments.identified import PROJECT, physical
+from sim2gp.experiments.longer import advice
 from sim2gp.experiments.motion import film
 from sim2gp.experiments.prediction import (
     channels,
@@ -47,13 +46,9 @@ from sim2gp.models.windows import (
     fit_windows,
     information_at,
 )
-from sim2gp.parameters import Parameters
-from sim2gp.project import Project, load_project
-from sim2gp.runs import Progress, load_run, new_run
-from sim2gp.runs.store import Run
-from sim2gp.types import in_float64
+from sim2gp.project import Project
+from sim2gp.runs import Progress, new_run
 
-PROJECT = "project.toml"  # the file's name in a run
 _SHORTEST = 4  # windows: a film of fewer held-out ones is not worth watching
 
 
@@ -66,13 +61,15 @@ def run(
     progress: Progress,
     check: bool = False,
     nuts: bool = False,
+    longer: bool = False,
     held_out: bool = True,
 ) -> dict[str, Any]:
     """Fit the logs of a project file and write the run; returns its summary.
 
     ``check`` holds Laplace's posterior against the exact one by importance sampling,
-    ``nuts`` against draws of it (E135 without the extra ``mcmc``); ``held_out`` fits
-    once more without some of the data, and forecasts those.
+    ``nuts`` against draws of it (E135 without the extra ``mcmc``); ``longer`` asks
+    what longer windows would tell; ``held_out`` fits once more without some of the
+    data, and forecasts those.
     """
     started = time.perf_counter()
     if nuts:
@@ -98,16 +95,15 @@ def run(
         said, drawings = _drawings(project, logs, belief, band, grid, other)
         summary, arrays = summary | said, arrays | drawings
         task.advance("forecasts")
-        options = ["--out", out, "--seed", seed, "" if held_out else "--quick"]
-        options += ["--check" * check, "--nuts" * nuts]
+        asked = {"quick": not held_out, "check": check, "nuts": nuts, "longer": longer}
+        options = ["--out", out, "--seed", seed, *(f"--{k}" * asked[k] for k in asked)]
         line = command("sim2gp", "identify", project.path, *options)
         summary |= _held_against(fitted, windows, seed, check=check, nuts=nuts)
-        folder = Path(os.path.abspath(project.path)).parent
-        summary["project"] = {
-            "file": project.path.name,
-            "folder": os.path.relpath(folder, os.path.abspath(out)),
-        }
-        summary |= provenance(line, started)
+        if longer:
+            progress.say("fitting longer windows")
+        alarm = summary["misfit"]["alarm"]
+        summary |= advice(project, logs, honest, alarm=alarm, key=key, asked=longer)
+        summary |= provenance(line, started) | {"project": _place(project, out)}
         from sim2gp.report import write_report
 
         writer.write_summary(summary)
@@ -116,6 +112,13 @@ def run(
         writer.write_text("report.html", write_report(summary, arrays))
         task.advance("report")
     return summary
+
+
+def _place(project: Project, out: Path) -> dict[str, str]:
+    """Where the project file stands, seen from the run."""
+    folder = Path(os.path.abspath(project.path)).parent
+    place = os.path.relpath(folder, os.path.abspath(out))
+    return {"file": project.path.name, "folder": place}
 
 
 def _held_against(
@@ -171,7 +174,7 @@ def _stored(
     key = jax.random.fold_in(jax.random.key(seed), 1)
     return {
         "belief/mean": np.asarray(belief.posterior.mean),
-        "belief/theta": np.asarray(_theta(table, belief.posterior.mean)),
+        "belief/theta": np.asarray(physical(table, belief.posterior.mean)),
         "belief/scale": np.asarray(belief.posterior.scale),
         "belief/prior_mean": np.asarray(belief.prior.mean),
         "belief/prior_scale": np.asarray(belief.prior.scale),
@@ -188,103 +191,6 @@ def _stored(
         "band/inflation": np.asarray(band.inflation),
         **diagnose.arrays(table, belief.prior, honest, key=key),
     }
-
-
-class Identified(NamedTuple):
-    """A finished identification, read back from its run."""
-
-    project: Project
-    summary: dict[str, Any]
-    posterior: Gaussian
-    outputs: list[str]  # the measured channels, in the order of `noise`
-    noise: list[float]
-    period: float  # s, median of the logs
-    band: Band
-
-
-@in_float64
-def _theta(table: Parameters, tt: Array) -> Array:
-    """The constants at the posterior's mode, in physical units."""
-    return table.constrain(jnp.asarray(tt, float))
-
-
-def stood(run: Path, stored: Run) -> Path:
-    """Where the project file of an identification stood."""
-    about = stored.summary.get("project", {})
-    place = run / about.get("folder", "") / about.get("file", PROJECT)
-    return Path(os.path.normpath(place))
-
-
-def project_of(run: Path, stored: Run, model: Path | None = None) -> Project:
-    """The run's own copy of its project, its model's file where it was (or another)."""
-    return load_project(run / PROJECT, stood(run, stored).parent, model)
-
-
-@in_float64
-def restored(run: Path) -> Identified:
-    """What `run` wrote (E130 for another folder, E184 for other constants)."""
-    stored = load_run(run)
-    if "belief/mean" not in stored.arrays or not (run / PROJECT).exists():
-        raise InputError(
-            "E130",
-            "not an identification",
-            where=str(run),
-            got=str(stored.summary.get("command", "a run without a belief")),
-            expected="the folder of sim2gp identify",
-            fix="run sim2gp identify first",
-        )
-    x, noise = stored.arrays, stored.summary["noise"]
-    project = project_of(run, stored)
-    _check_constants(run, project, stored.summary)
-    _check_fitted(project, x)
-    return Identified(
-        project,
-        stored.summary,
-        Gaussian(jnp.asarray(x["belief/mean"]), jnp.asarray(x["belief/scale"])),
-        list(noise),
-        [float(sd) for sd in noise.values()],
-        float(f"{stored.summary['period']:.3g}"),  # clocks jitter
-        Band(
-            x["band/start_sd"],
-            x["band/input_sd"],
-            x["band/resolution"],
-            x["band/rows"],
-            x["band/shape"],
-            float(x["band/inflation"]),
-        ),
-    )
-
-
-def _check_constants(run: Path, project: Project, summary: dict[str, Any]) -> None:
-    """The run's copy of its project still opens the constants that it holds (E184)."""
-    now, fitted = project.system.parameters.names, tuple(summary["parameters"])
-    if now == fitted:
-        return
-    raise InputError(
-        "E184",
-        "another set of constants than was fitted",
-        where=str(run / PROJECT),
-        got=", ".join(n for n in now if n not in fitted) or ", ".join(now),
-        expected=", ".join(n for n in fitted if n not in now) or ", ".join(fitted),
-        fix="identify again, or take back the change of the run's project file",
-    )
-
-
-def _check_fitted(project: Project, x: dict[str, np.ndarray]) -> None:
-    """A model's file still has the numbers that its default priors are about (E170)."""
-    table = project.system.parameters
-    now = _theta(table, jnp.asarray(x["belief/mean"]))
-    theta = x.get("belief/theta", now)
-    for name, is_, was in zip(table.names, np.asarray(now), theta, strict=True):
-        if not np.isclose(is_, was, rtol=1e-9, atol=1e-12):
-            raise InputError(
-                "E170",
-                f"another machine than was fitted: {name}",
-                where=project.spec.system,
-                got=f"{is_:.9g} at the posterior's mode",
-                expected=f"{was:.9g}",
-                fix="identify again, or take back the change of the model's file",
-            )
 
 
 def _summarise(

@@ -44,37 +44,40 @@ def film(
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Summary entry "animation" and its arrays; both empty for an unknown machine.
 
-    ``picture`` is what `sim2gp.experiments.prediction.drawn` made of ``grid``.
+    ``picture`` is what `sim2gp.experiments.prediction.drawn` made of ``grid``. Of a
+    machine in several configurations the film keeps to that of its first window.
     """
     machine = system
     while hasattr(machine, "system"):
         machine = machine.system
-    which = picture["which"][0][:MOST]
+    (which,) = picture["which"]
     if not len(which):
         return {}, {}
-    time, y, mean, _ = (x[:MOST, :-1] for x in picture["trace"])
+    configuration = np.asarray(grid.windows.configuration)[which]
+    shown = np.flatnonzero(configuration == configuration[0])[:MOST]
+    which = which[shown]
+    time, y, mean, _ = (x[shown, :-1] for x in picture["trace"])
     names = [c.name for c in system.physical_states]
     joints = [n for n in names if not n.endswith((".velocity", ".activation"))]
     columns = {names[i]: c for c, i in enumerate(grid.windows.outputs)}
     motion = [_motion(x, y, columns, joints) for x in (mean, y)]
-    about, arrays = _drawing(machine, _constants(system, posterior), motion)
+    constants = _constants(system, posterior, int(configuration[0]))
+    about, arrays = _drawing(machine, constants, motion)
     if not about:
         return {}, {}
+    several = system.parameters.configurations
+    if several:
+        title = f"{title}; the machine {several[configuration[0]].name}"
     unseen = [n for n in joints if n not in columns]
     if unseen:
         title = f"{title}; {', '.join(unseen)} was not measured and is drawn at zero"
     dt = float(time[0, 1] - time[0, 0])
     actions = [c.name for c in system.actions][:2]
-    held = [
-        logs[k].commanded([c.name for c in system.actions])[
-            np.searchsorted(logs[k].time, t + 1e-9, side="right") - 1, :2
-        ]
-        for k, t in zip(grid.log[which], time, strict=True)
-    ]
-    starts = enumerate(zip(grid.log[which], time[:, 0], strict=True))
+    each = list(zip(grid.log[which], time, strict=True))
+    held = np.concatenate([_held(logs[k], t, system)[:, :2] for k, t in each])
     marks = [
-        {"time": n * dt * time.shape[1], "text": f"{logs[k].name}, from {t:.1f} s"}
-        for n, (k, t) in starts
+        {"time": n * dt * len(t), "text": f"{logs[k].name}, from {t[0]:.1f} s"}
+        for n, (k, t) in enumerate(each)
     ]
     units = {c.name: c.unit for c in (*system.physical_states, *system.actions)}
     about |= {
@@ -87,13 +90,26 @@ def film(
     return about, arrays | {
         "animation/state": motion[0].astype(np.float32),
         "animation/recorded": motion[1].astype(np.float32),
-        "animation/action": np.concatenate(held).astype(np.float32),
+        "animation/action": held.astype(np.float32),
     }
 
 
+def _held(
+    log: Log, time: Float[np.ndarray, " T"], system: AbstractSystem
+) -> Float[np.ndarray, "T m"]:
+    """The inputs of a log at some times."""
+    given = log.commanded([c.name for c in system.actions])
+    rows = np.searchsorted(log.time, time + 1e-9, side="right") - 1
+    held: np.ndarray = given[rows]
+    return held
+
+
 @in_float64
-def _constants(system: AbstractSystem, posterior: Gaussian) -> dict[str, float]:
-    values = system.parameters.values(jnp.asarray(posterior.mean, float))
+def _constants(
+    system: AbstractSystem, posterior: Gaussian, configuration: int
+) -> dict[str, float]:
+    mean = jnp.asarray(posterior.mean, float)
+    values = system.parameters.values(mean, configuration)
     return {name: float(value) for name, value in values.items()}
 
 

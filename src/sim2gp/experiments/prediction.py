@@ -28,23 +28,28 @@ _TRACE_ROWS = np.arange(0, steps_of(TRACE) + 1, 5)
 _EVERY = 5  # of the windows, 0.1 s apart, are drawn
 
 
-def cut_logs(project: Project, logs: Sequence[Log]) -> tuple[Windows, np.ndarray]:
-    """Training windows as the project states them, and the log of each."""
-    windows, places = cut_places(project, logs)
+def cut_logs(
+    project: Project, logs: Sequence[Log], times: float = 1.0
+) -> tuple[Windows, np.ndarray]:
+    """Training windows as `cut_places` makes them, and the log of each."""
+    windows, places = cut_places(project, logs, times)
     return windows, np.asarray([k for k, _ in places])
 
 
 def cut_places(
-    project: Project, logs: Sequence[Log]
+    project: Project, logs: Sequence[Log], times: float = 1.0
 ) -> tuple[Windows, list[tuple[int, int]]]:
-    """Training windows as the project states them, and log and first row of each."""
+    """Training windows as the project states them, and log and first row of each.
+
+    Or so many ``times`` as long.
+    """
     stated = project.spec.likelihood
     names = [channel.name for channel in project.system.physical_states]
     measured = [n for n in names if any(n in log.channels for log in logs)]
     return cut(
         logs,
         project.system,
-        window=stated.window,
+        window=times * stated.window,
         start_sd=_each(stated.start_sd, names),
         floor=_each(stated.noise_floor, measured),
         start=stated.start,

@@ -11,7 +11,6 @@ sums, linearised where the posterior is:
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.optimize
 from jaxtyping import Array, Float
 
 from sim2gp.gaussian import Gaussian
@@ -33,6 +32,8 @@ def informed(table: Parameters, prior: Gaussian, tt: Float[Array, " p"]) -> Gaus
 @in_float64
 def informed_prior(table: Parameters) -> Gaussian:
     """What is known before any log, linearised at its mode."""
+    import scipy.optimize  # a third of a second that a refused project need not wait
+
     prior = table.prior()
     if not table.weighed:
         return prior

@@ -126,7 +126,7 @@ class Project:
             if spec.fixed or spec.free:
                 raise InputError(
                     "E160",
-                    "several configurations, which only identify and evaluate take",
+                    "several configurations, which explain and compare do not take",
                     where=self.source.where("logs", group),
                     got=", ".join(self.spec.configurations),
                     expected="the same constants in all groups",

@@ -108,25 +108,16 @@ def parameter_table(summary: Summary) -> Raw:
             "prior's.",
             "soft",
         ),
-        _why(summary.get("intervals")),
-        _checked(summary.get("check")),
-        _checked(summary.get("nuts")),
+        *(_said(summary.get(key)) for key in ("intervals", "longer", "check", "nuts")),
         table(columns, rows, words=(0, 1, last), cards=True),
     )
 
 
-def _why(about: object) -> Raw:
-    """Which intervals these are."""
+def _said(about: object) -> Raw:
+    """Which intervals these are; what --longer, --check and --nuts found beside."""
     if not isinstance(about, Mapping) or not about.get("text"):
         return Raw("")
     return paragraph(about["text"])
-
-
-def _checked(check: object) -> Raw:
-    """What importance sampling or NUTS said of the posterior, where it was asked."""
-    if not isinstance(check, Mapping) or not check.get("text"):
-        return Raw("")
-    return paragraph(check["text"])
 
 
 def _area(axes: svg.Axes, draws: np.ndarray, axis: densities.View, css: str) -> str:

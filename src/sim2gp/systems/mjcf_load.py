@@ -12,10 +12,13 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from sim2gp.errors import InputError
+from sim2gp.errors import InputError, missing_extra
 
 SECONDS = 60  # that a model may take to compile
 _BYTES = 50_000_000  # of one file of text
@@ -23,15 +26,17 @@ _NAMED = re.compile(r'<\s*(\w+)[^>]*?\b(?:file|filename)\s*=\s*["\']([^"\']*)["\
 #: MuJoCo's words for masses and inertias; not for a mesh that encloses no volume.
 _IMPOSSIBLE = re.compile(r"mass and inertia|inertia must|mass, inertia or density")
 _FOLDER = re.compile(r'\b(meshdir|texturedir|assetdir)\s*=\s*["\']([^"\']*)["\']')
+_UNREAD = "a MuJoCo model cannot be read"
 _CHILD = os.path.join(os.path.dirname(__file__), "mjcf_child.py")
 
 
 def compiled(path: Path, root: Path | None = None) -> Any:
     """The model of an MJCF or URDF file.
 
-    Raises `InputError` E130 where there is no such file, E147 or E170 with MuJoCo's
-    words where it is no possible body or no model, E171 where it names files outside
-    ``root`` (its own folder) or the parser crashed or took more than a minute.
+    Raises `InputError` E130 where there is no such file, E135 where MuJoCo is not
+    installed, E147 or E170 with MuJoCo's words where it is no possible body or no
+    model, E171 where it names files outside ``root`` (its own folder) or the parser
+    crashed or took more than a minute.
     """
     check_paths(path, path.parent if root is None else root)
     return compiled_all([path])[0]
@@ -39,11 +44,15 @@ def compiled(path: Path, root: Path | None = None) -> Any:
 
 def compiled_all(paths: Sequence[Path]) -> list[Any]:
     """The models of several files whose paths were checked, in one child process."""
-    import mujoco
-
-    with tempfile.TemporaryDirectory() as folder:
+    if find_spec("mujoco") is None:
+        missing = ModuleNotFoundError("No module named 'mujoco'", name="mujoco")
+        raise missing_extra(_UNREAD, missing, "mujoco")
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(1) as aside:
+        # Half a second, while the child has the other core.
+        mujoco = aside.submit(import_module, "mujoco")
         made = _made(paths, folder, "mjb")
-        return [mujoco.MjModel.from_binary_path(str(each)) for each in made]
+        read = mujoco.result().MjModel.from_binary_path
+        return [read(str(each)) for each in made]
 
 
 def as_mjcf(path: Path) -> str:
@@ -65,8 +74,10 @@ def _made(paths: Sequence[Path], folder: str, form: str) -> list[Path]:
         said = " ".join(done.stderr.split("REFUSED ", 1)[-1].split())
         raise _refused(where, said)
     if done.returncode != 0:
-        last = done.stderr.strip().splitlines()[-1:] or ["no words"]
-        raise _died(where, f"exit {done.returncode}, {last[0]}")
+        last = (done.stderr.strip().splitlines() or ["no words"])[-1]
+        if last.startswith(("ImportError", "ModuleNotFoundError")):
+            raise missing_extra(_UNREAD, ImportError(last, name="mujoco"), "mujoco")
+        raise _died(where, f"exit {done.returncode}, {last}")
     return [Path(folder, f"{i}.{form}") for i in range(len(paths))]
 
 

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sim2gp.errors import InputError, missing_extra
+from sim2gp.errors import InputError
 from sim2gp.parameters import Parameter, Parameters
 from sim2gp.systems.actuator import LONGEST_MEAN
 from sim2gp.systems.base import AbstractPlant, Channel
@@ -145,17 +145,10 @@ class MuJoCo(AbstractPlant):
 def loaded(model: Any, root: Path | None = None) -> Any:
     """A compiled model, of a file or of one that is compiled already.
 
-    Raises `InputError` E135 where MuJoCo is not installed.
+    Raises `InputError` as `compiled` does, E172 where a joint has a quaternion.
     """
-    try:
-        import mujoco
-    except ImportError as error:
-        raise missing_extra("a MuJoCo model cannot be read", error, "mujoco") from error
-
-    if isinstance(model, mujoco.MjModel):
-        found = copy.copy(model)
-    else:
-        found = compiled(Path(model), root)
+    is_file = isinstance(model, str | os.PathLike)
+    found = compiled(Path(model), root) if is_file else copy.copy(model)
     for j in range(found.njnt):
         if found.jnt_type[j] not in (2, 3):
             raise InputError(

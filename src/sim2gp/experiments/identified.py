@@ -1,0 +1,135 @@
+"""A finished identification, read back from its run.
+
+A command reads a run, and logs to hold it against, before it imports its experiment.
+"""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from sim2gp.configurations import index_of
+from sim2gp.errors import InputError
+from sim2gp.gaussian import Gaussian
+from sim2gp.logs import Log, none_unused
+from sim2gp.models.forecast import Band
+from sim2gp.parameters import Parameters
+from sim2gp.project import Project, load_project
+from sim2gp.runs import load_run
+from sim2gp.runs.store import Run
+from sim2gp.types import in_float64
+
+PROJECT = "project.toml"  # the file's name in a run
+
+
+class Identified(NamedTuple):
+    """A finished identification, read back from its run."""
+
+    run: Path
+    project: Project
+    summary: dict[str, Any]
+    posterior: Gaussian
+    outputs: list[str]  # the measured channels, in the order of `noise`
+    noise: list[float]
+    period: float  # s, median of the logs
+    band: Band
+
+    def read(
+        self, logs: Sequence[Path], configuration: str | None, *, strict: bool
+    ) -> tuple[Log, ...]:
+        """Logs of the machine in one configuration (E152 where it has several)."""
+        index_of(configuration, self.project.system.parameters.configurations)
+        found = self.project.read_logs(logs, configuration)
+        if strict:
+            none_unused(found)
+        return found
+
+
+@in_float64
+def physical(table: Parameters, tt: Array) -> Array:
+    """The constants at the posterior's mode, in physical units."""
+    return table.constrain(jnp.asarray(tt, float))
+
+
+def stood(run: Path, summary: dict[str, Any]) -> Path:
+    """Where the project file of an identification stood."""
+    about = summary.get("project", {})
+    place = run / about.get("folder", "") / about.get("file", PROJECT)
+    return Path(os.path.normpath(place))
+
+
+def project_of(run: Path, stored: Run, model: Path | None = None) -> Project:
+    """The run's own copy of its project, its model's file where it was (or another)."""
+    return load_project(run / PROJECT, stood(run, stored.summary).parent, model)
+
+
+@in_float64
+def restored(run: Path) -> Identified:
+    """What `identify.run` wrote (E130 for another folder, E184 for other constants)."""
+    stored = load_run(run)
+    if "belief/mean" not in stored.arrays or not (run / PROJECT).exists():
+        raise InputError(
+            "E130",
+            "not an identification",
+            where=str(run),
+            got=str(stored.summary.get("command", "a run without a belief")),
+            expected="the folder of sim2gp identify",
+            fix="run sim2gp identify first",
+        )
+    x, noise = stored.arrays, stored.summary["noise"]
+    project = project_of(run, stored)
+    _check_constants(run, project, stored.summary)
+    _check_fitted(project, x)
+    return Identified(
+        run,
+        project,
+        stored.summary,
+        Gaussian(jnp.asarray(x["belief/mean"]), jnp.asarray(x["belief/scale"])),
+        list(noise),
+        [float(sd) for sd in noise.values()],
+        float(f"{stored.summary['period']:.3g}"),  # clocks jitter
+        Band(
+            x["band/start_sd"],
+            x["band/input_sd"],
+            x["band/resolution"],
+            x["band/rows"],
+            x["band/shape"],
+            float(x["band/inflation"]),
+        ),
+    )
+
+
+def _check_constants(run: Path, project: Project, summary: dict[str, Any]) -> None:
+    """The run's copy of its project still opens the constants that it holds (E184)."""
+    now, fitted = project.system.parameters.names, tuple(summary["parameters"])
+    if now == fitted:
+        return
+    raise InputError(
+        "E184",
+        "another set of constants than was fitted",
+        where=str(run / PROJECT),
+        got=", ".join(n for n in now if n not in fitted) or ", ".join(now),
+        expected=", ".join(n for n in fitted if n not in now) or ", ".join(fitted),
+        fix="identify again, or take back the change of the run's project file",
+    )
+
+
+def _check_fitted(project: Project, x: dict[str, np.ndarray]) -> None:
+    """A model's file still has the numbers that its default priors are about (E170)."""
+    table = project.system.parameters
+    now = physical(table, jnp.asarray(x["belief/mean"]))
+    theta = x.get("belief/theta", now)
+    for name, is_, was in zip(table.names, np.asarray(now), theta, strict=True):
+        if not np.isclose(is_, was, rtol=1e-9, atol=1e-12):
+            raise InputError(
+                "E170",
+                f"another machine than was fitted: {name}",
+                where=project.spec.system,
+                got=f"{is_:.9g} at the posterior's mode",
+                expected=f"{was:.9g}",
+                fix="identify again, or take back the change of the model's file",
+            )
