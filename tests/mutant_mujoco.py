@@ -8,6 +8,34 @@ SAY = "systems/mjcf_say.py"
 
 ON_THE_HOST = (
     Mutant(
+        "forecasts are stepped finer than fits",
+        "models/grid.py",
+        "if whole % k == 0 and k <= longest)",
+        "if k == 1)",
+        ("test_forecast.py", "stepped_as_in_a_fit"),
+    ),
+    Mutant(
+        "forecasts are stepped coarser than the log",
+        "models/grid.py",
+        "min(system.window_substep, stamps) / PERIOD",
+        "system.window_substep / PERIOD",
+        ("test_forecast.py", "stepped_as_in_a_fit"),
+    ),
+    Mutant(
+        "the host is asked for one column after the other",
+        "models/windows.py",
+        "at_once=on_host(system)",
+        "at_once=False",
+        ("test_black_box.py", "asked_for_once"),
+    ),
+    Mutant(
+        "each rounding of a span has a rollout",
+        "systems/mujoco_engine.py",
+        "h = np.round(h, 12)",
+        "h = np.asarray(h)",
+        ("test_mujoco_system.py", "differ_by_rounding"),
+    ),
+    Mutant(
         "external: a one-sided difference",
         EXTERNAL,
         "points = np.concatenate([x[None], x + sides, x - sides])",

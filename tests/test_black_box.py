@@ -10,8 +10,11 @@ import pytest
 
 from sim2gp.errors import InputError
 from sim2gp.flight import episode, oracle_world
+from sim2gp.logs import Log
 from sim2gp.loops import psrl
 from sim2gp.models import Sim2GP
+from sim2gp.models.cutting import cut
+from sim2gp.models.windows import WindowsBelief, linearise
 from sim2gp.parameters import Parameter, Parameters
 from sim2gp.planning import AbstractPlanner
 from sim2gp.robot.export import export_model
@@ -121,6 +124,44 @@ def test_jax_takes_its_derivatives_both_ways(rows: Any) -> None:
     _, along = jax.jvp(lambda *x: black_box().transition(*x, 2 * DT), args, tangent)
     total = sum(J.sum(axis=1) for J in expected)
     np.testing.assert_allclose(along, total, rtol=1e-6, atol=1e-8)
+
+
+@in_float64
+def test_all_slopes_of_a_window_are_asked_for_once() -> None:
+    """And they are those of the equation, which is asked for one after the other."""
+    calls = []
+
+    def counted(*x: Any) -> Any:
+        calls.append(1)
+        return step(*x)
+
+    rng, L = np.random.default_rng(1), 6
+    log = Log(
+        name="walk",
+        source="walk.csv",
+        time=0.01 * np.arange(L + 1),
+        channels={"q": 0.1 * rng.standard_normal(L + 1)},
+        inputs={"torque": rng.uniform(-5.0, 5.0, L + 1)},
+        mask={"q": np.ones(L + 1, bool)},
+    )
+    boxes = black_box(counted, batched=True), EXACT
+    found = []
+    for system in boxes:
+        windows, _ = cut([log], system, window=0.06, start_sd=None, floor=None)
+        prior, n, p = TABLE_OF.prior(), len(STATES), len(TABLE)
+        nothing = jnp.ones(1), jnp.zeros((p, p)), jnp.ones(1)
+        belief = WindowsBelief(
+            system, prior, prior, *nothing, jnp.zeros((1, n)), jnp.asarray(0.0)
+        )
+        calls.clear()
+        found.append(linearise(belief, windows, prior.mean))
+        if system is boxes[0]:
+            assert 0 < len(calls) <= windows.span.shape[1]
+    box, exact = found  # steps of 10 ms, and of 2
+    np.testing.assert_allclose(box.state, exact.state[:, ::5], atol=1e-6)
+    right = exact.jacobian[:, ::5]
+    scale = np.abs(right).max()
+    np.testing.assert_allclose(box.jacobian, right, atol=1e-5 * scale)
 
 
 @pytest.mark.nightly

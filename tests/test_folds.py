@@ -13,13 +13,20 @@ from sim2gp.experiments import folds
 from sim2gp.experiments.calibration import LEVELS, calibration
 from sim2gp.experiments.folds import fold, held_out
 from sim2gp.experiments.motion import film
-from sim2gp.experiments.prediction import Judged, drawn, trace_arrays
+from sim2gp.experiments.prediction import (
+    Judged,
+    drawn,
+    predicted,
+    rows_for,
+    trace_arrays,
+)
 from sim2gp.logs import Log
 from sim2gp.models.cutting import cut
 from sim2gp.models.forecast import Band, Forecast
 from sim2gp.models.grid import evaluation_windows
 from sim2gp.project import load_project
 from sim2gp.systems import CartPole
+from sim2gp.types import in_float64
 
 
 def log(source: str, seconds: float, start: float = 0.0) -> Log:
@@ -134,8 +141,9 @@ def test_neither_fit_nor_band_sees_what_is_held_out(
         given["kept"] = kept
         return SimpleNamespace(posterior=None)
 
-    def forecasts(system: Any, posterior: Any, some: Any, rows: np.ndarray) -> Any:
-        valid = np.asarray(some.mask)[:, rows]
+    def forecasts(system: Any, posterior: Any, grid: Any, horizon: float) -> Any:
+        rows = rows_for(horizon)
+        valid = np.asarray(grid.windows.mask)[:, rows]
         none = np.zeros(valid.shape)
         slopes = [np.zeros((*valid.shape, k)) for k in (4, 1)]
         return Forecast(none, none, valid, *slopes, none, tuple(rows.tolist()))
@@ -145,7 +153,7 @@ def test_neither_fit_nor_band_sees_what_is_held_out(
         one = np.ones(2)
         return Band(np.ones(4), np.ones(1), one, np.array([0.0]), one[None], 1.0)
 
-    for name, stub in (("fit_windows", fitted), ("forecast", forecasts)):
+    for name, stub in (("fit_windows", fitted), ("predicted", forecasts)):
         monkeypatch.setattr(folds, name, stub)
     monkeypatch.setattr(folds, "fit_band", band)
     path = tmp_path / "cart.toml"
@@ -168,6 +176,7 @@ def test_neither_fit_nor_band_sees_what_is_held_out(
     assert found.judged.valid.shape[0] == part.test.sum()
 
 
+@in_float64
 def test_windows_too_short_to_be_drawn_are_not() -> None:
     """A log of less than half a second has scores, and no picture."""
     short = (log("a.csv", 0.45),)
@@ -176,6 +185,7 @@ def test_windows_too_short_to_be_drawn_are_not() -> None:
     one = np.ones(2)
     band = Band(np.ones(4), np.ones(1), one, np.array([0.0]), one[None], 1.0)
     prior = CartPole().parameters.prior()
-    picture = drawn(CartPole(), prior, band, grid)
+    found = predicted(CartPole(), prior, grid, 0.1)
+    picture = drawn(found, band, grid)
     assert trace_arrays(picture, grid, short, ["x", "theta"]) == {}
     assert film(CartPole(), prior, picture, grid, short, "none") == ({}, {})

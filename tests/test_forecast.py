@@ -1,5 +1,6 @@
 """Held-out forecasts against the protocol's own oracle, and what their bands cover."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -21,6 +22,7 @@ from sim2gp.models.forecast import (
 from sim2gp.models.grid import CURVE, evaluation_windows, slopes, steps_of
 from sim2gp.systems import TwoLink
 from sim2gp.types import in_float64
+from test_black_box import EXACT, TABLE_OF, TRUTH, black_box, step
 
 ROWS = np.asarray([steps_of(h) for h in CURVE])
 
@@ -97,7 +99,7 @@ def test_errors_are_the_protocols() -> None:
     system = arm(NUMBERS)
     log = moved(0, noise=2e-4, disturbance=0.1)
     grid = evaluation_windows([log], system, longest=CURVE[-1])
-    found = forecast(system, certain(system, NUMBERS[5]), grid.windows, ROWS)
+    found = forecast(system, certain(system, NUMBERS[5]), grid, ROWS)
     gridded = protocol.on_grid(recording(log))
     model = plain.bound(plain.arm_acceleration, np.asarray(NUMBERS))
     for i, horizon in enumerate(CURVE):
@@ -126,13 +128,13 @@ def test_a_forecast_compiled_in_advance_is_the_same(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     system = arm(NUMBERS)
-    windows = evaluation_windows([moved(2)], system, longest=0.2).windows
+    grid = evaluation_windows([moved(2)], system, longest=0.2)
     belief, rows = certain(system, NUMBERS[5]), np.asarray([50])
-    plain = forecast(system, belief, windows, rows)
-    compile_forecast(system, windows)
-    forecast(system, belief, windows, rows)
+    plain = forecast(system, belief, grid, rows)
+    compile_forecast(system, grid)
+    forecast(system, belief, grid, rows)
     monkeypatch.setattr(_forecast, "_jitted", None)  # nothing is left to compile with
-    again = forecast(system, belief, windows, rows)
+    again = forecast(system, belief, grid, rows)
     np.testing.assert_array_equal(again.mean, plain.mean)
     np.testing.assert_array_equal(again.by_constants, plain.by_constants)
 
@@ -142,13 +144,14 @@ def test_sensitivities_are_differences() -> None:
     grid = evaluation_windows([moved(2)], system, longest=0.3)
     rows = np.asarray([50, 150])
     belief = certain(system, NUMBERS[5])
-    found = forecast(system, belief, grid.windows, rows)
+    found = forecast(system, belief, grid, rows)
     h = 1e-5
 
     def shifted(**changes: np.ndarray) -> np.ndarray:
         windows = grid.windows
         fields = {f: getattr(windows, f) for f in windows.__dataclass_fields__}
-        return forecast(system, belief, type(windows)(**fields | changes), rows).mean
+        other = replace(grid, windows=type(windows)(**fields | changes))
+        return forecast(system, belief, other, rows).mean
 
     for i in range(4):
         unit = h * np.eye(4)[i]
@@ -158,6 +161,54 @@ def test_sensitivities_are_differences() -> None:
         more = h * grid.windows.knots[..., None] * np.eye(2)[i]
         slope = shifted(area=grid.windows.area + more) - found.mean
         np.testing.assert_allclose(slope / h, found.by_input[..., i], atol=2e-2)
+
+
+def swing(every: int) -> Log:
+    """A pendulum under a held torque, every so many samples of 2 ms."""
+    rng = np.random.default_rng(4)
+    held = np.repeat(rng.uniform(-5.0, 5.0, 11), 50)
+    s, q = np.zeros((1, 2)), []
+    for u in held:
+        q.append(s[0, 0])
+        constants = {name: np.asarray([value]) for name, value in TRUTH.items()}
+        s = step(constants, s, np.asarray([[u]]), np.asarray([2e-3]))
+    time = 2e-3 * np.arange(len(held))[::every]
+    good = {"q": np.ones(len(time), bool)}
+    inputs = {"torque": held[::every]}
+    return Log("swing", "swing.csv", time, {"q": np.asarray(q)[::every]}, inputs, good)
+
+
+@in_float64
+def test_a_simulator_is_stepped_as_in_a_fit() -> None:
+    """As its own window asks and as often as was sampled, and its forecasts are right.
+
+    Oracle: the same pendulum as an equation, in steps of 2 ms.
+    """
+    spans: set[float] = set()
+
+    def recorded(params, s, a, h):
+        spans.update(np.round(h, 9).tolist())
+        return step(params, s, a, h)
+
+    box, log, rows = black_box(recorded, batched=True), swing(5), np.arange(0, 251, 50)
+    grid = evaluation_windows([log], box, longest=0.5)
+    assert grid.every == 5
+    assert evaluation_windows([swing(1)], box, longest=0.5).every == 1
+    tt = TABLE_OF.unconstrain(jnp.asarray(list(TRUTH.values())))
+    belief = Gaussian(tt, 0.1 * jnp.eye(2))
+    found = forecast(box, belief, grid, rows)
+    assert spans == {2e-3, 8e-3, 1e-2}  # the first sample is one of all forecasts
+    fine = evaluation_windows([log], EXACT, longest=0.5)
+    assert fine.every == 1
+    exact = forecast(EXACT, belief, fine, rows)
+    np.testing.assert_array_equal(found.valid, exact.valid)
+    for mine, right in zip(jax.tree.leaves(found), jax.tree.leaves(exact), strict=True):
+        np.testing.assert_allclose(mine, right, rtol=1e-5, atol=1e-6)
+    assert np.abs(found.error[found.valid]).max() < 2e-2  # starts are differences
+    one = forecast(box, belief, grid, np.asarray([1])).mean
+    np.testing.assert_allclose(
+        one, forecast(EXACT, belief, fine, np.asarray([1])).mean, atol=1e-9
+    )
 
 
 def test_a_masked_past_starts_no_window() -> None:
@@ -180,7 +231,7 @@ def disturbed():
     # Gentle: a band is a linearisation, and an arm that turns over is not.
     logs = [moved(s, torque=0.4, disturbance=0.05, noise=2e-4) for s in range(10, 40)]
     grid = evaluation_windows(logs, system, longest=CURVE[-1])
-    return grid, forecast(system, certain(system, NUMBERS[5]), grid.windows, ROWS)
+    return grid, forecast(system, certain(system, NUMBERS[5]), grid, ROWS)
 
 
 def some_logs(grid, which):
@@ -214,7 +265,7 @@ def test_band_has_the_errors_own_shape(disturbed) -> None:
     assert band.inflation == 1.5
     z = np.where(found.valid, found.error / band.scale(found), np.nan)
     np.testing.assert_allclose(np.nanmean(z**2, axis=0), 1.0 / 1.5, rtol=1e-9)
-    fewer = found.only(np.arange(len(ROWS)) % 2 == 0)
+    fewer = found.at(ROWS[::2])
     assert fewer.rows == tuple(ROWS[::2].tolist())
     scale = band.scale(fewer)
     # A running maximum knows the rows before it, so the shape alone is compared.
@@ -257,6 +308,6 @@ def test_published_models_score_as_known(
     ]
     grid = evaluation_windows(logs, system, longest=0.2)
     rows = np.asarray([100])
-    found = forecast(system, certain(system, numbers[5]), grid.windows, rows)
+    found = forecast(system, certain(system, numbers[5]), grid, rows)
     np.testing.assert_allclose(found.rmse()[0], pooled, rtol=0.01)
     assert not jax.config.jax_enable_x64

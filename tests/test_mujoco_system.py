@@ -181,6 +181,23 @@ def test_an_uneven_span_is_divided_evenly(tmp_path):
     np.testing.assert_allclose(found[0], expected, atol=1e-12)
 
 
+def test_spans_that_differ_by_rounding_are_one(tmp_path, monkeypatch):
+    """Differences of time stamps are; each other span is a rollout of its own."""
+    engine = crawler(tmp_path, constants=["body/torso/mass"]).engine
+    stamps = 0.01 * np.arange(60, 101)
+    h = np.append(np.diff(stamps), 0.02)
+    assert len(np.unique(h)) > 2
+    rollouts, rolled = [], engine._rolled
+    monkeypatch.setattr(
+        engine, "_rolled", lambda *x: rollouts.append(x[-1]) or rolled(*x)
+    )
+    rows = [np.tile(x, (len(h), 1)) for x in (np.array([0.8]), STATE, ACTION)]
+    found = engine.flow(*rows, h)
+    assert rollouts == [0.01, 0.02]
+    np.testing.assert_array_equal(found[1:-1], found[:-2])
+    assert np.isfinite(found).all()
+
+
 @in_float64
 def test_slopes_are_those_of_our_own_equations(tmp_path):
     """The same arm, integrated alike: its exact derivative, both ways."""

@@ -211,7 +211,7 @@ def test_its_report_has_a_stick_figure(identified: Path) -> None:
     assert [strip[1] for strip in about["strips"]] == ["shoulder", "elbow"]
     model = mujoco.MjModel.from_xml_string(MODEL)
     data = mujoco.MjData(model)
-    for row in (0, 60, 120):
+    for row in (0, 30, 60):
         data.qpos[:] = x["animation/recorded"][row]
         mujoco.mj_kinematics(model, data)
         found = x["animation/recorded_points"][row]

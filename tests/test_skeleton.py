@@ -263,7 +263,7 @@ def test_mujoco_sees_the_machine_where_the_figure_is(text: str) -> None:
     q = swing(33)
     figure = figure_of(model, q)
     scene = skeleton(figure_entry(figure), figure.moving)
-    about, arrays = _frames(model, [q + 0.3, q], scene)
+    about, arrays = _frames(model, [q + 0.3, q], scene, 8)
     if not about:
         pytest.skip("MuJoCo has no graphics back end here")
     every, size = (

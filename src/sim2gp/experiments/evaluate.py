@@ -27,6 +27,7 @@ from sim2gp.experiments.prediction import (
     drawn,
     joined,
     judged,
+    predicted,
     recordings,
     regression_errors,
     rows_for,
@@ -37,7 +38,6 @@ from sim2gp.experiments.prediction import (
 from sim2gp.experiments.record import command, provenance
 from sim2gp.gaussian import Gaussian
 from sim2gp.logs import Log, shared_rows
-from sim2gp.models.forecast import forecast
 from sim2gp.models.grid import CURVE, Grid, evaluation_windows, steps_of
 from sim2gp.models.windows import Windows
 from sim2gp.project import Project
@@ -65,7 +65,7 @@ def run(
     with new_run(out, "evaluate") as writer, progress.task("evaluate", 2) as task:
         rows, longest = rows_for(horizon), max(horizon, CURVE[-1])
         grid = windows_for(tested, found, longest, horizon)
-        result = forecast(system, fit.posterior, grid.windows, rows)
+        result = predicted(system, fit.posterior, grid, horizon)
         train = _training(fit)
         linear = None
         if train is not None:
@@ -77,7 +77,7 @@ def run(
         summary, arrays = scores(whole, names, tested, horizon)
         summary["calibration"], shares = calibration(whole, names, horizon)
         arrays |= shares
-        picture = drawn(system, fit.posterior, fit.band, grid)
+        picture = drawn(result, fit.band, grid)
         arrays |= trace_arrays(picture, grid, tested, names)
         notes = _said(tested) + list(map(str, shared_rows(train or (), tested)))
         if train is None:
@@ -170,7 +170,7 @@ def _fold(
     # One start: the folds are small changes of one problem.
     key = jax.random.key(0)
     found = fold(project, windows, grid, part, horizon, key=key, starts=1)
-    picture = drawn(project.system, found.posterior, found.band, found.tested)
+    picture = drawn(found.forecast, found.band, found.tested)
     names = channels(project.system, windows)
     traced = trace_arrays(picture, found.tested, logs, names)
     return found.judged, traced, _constrain(project.system, found.posterior)

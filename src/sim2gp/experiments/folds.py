@@ -16,6 +16,7 @@ from jaxtyping import Bool
 from sim2gp.experiments.prediction import (
     Judged,
     judged,
+    predicted,
     recordings,
     regression_errors,
     rows_for,
@@ -23,7 +24,7 @@ from sim2gp.experiments.prediction import (
 )
 from sim2gp.gaussian import Gaussian
 from sim2gp.logs import Log
-from sim2gp.models.forecast import Band, fit_band, forecast
+from sim2gp.models.forecast import Band, Forecast, fit_band
 from sim2gp.models.grid import CURVE, PERIOD, Grid, steps_of
 from sim2gp.models.windows import Windows, WindowsBelief, fit_windows
 from sim2gp.project import Project
@@ -54,6 +55,7 @@ class Fold(NamedTuple):
     band: Band
     judged: Judged
     tested: Grid
+    forecast: Forecast  # of what is tested
 
 
 def without(
@@ -104,18 +106,21 @@ def fold(
 
     Raises as `sim2gp.models.windows.fit_windows` does.
     """
-    system, rows = project.system, rows_for(horizon)
+    rows = rows_for(horizon)
     mask = np.asarray(windows.mask) & part.train[:, None, None]
     kept = eqx.tree_at(lambda w: w.mask, windows, mask)
     robust = project.spec.likelihood.robust
-    belief = fit_windows(system, kept, key=key, robust=robust, starts=starts, near=near)
-    result = forecast(system, belief.posterior, grid.windows, rows)
+    belief = fit_windows(
+        project.system, kept, key=key, robust=robust, starts=starts, near=near
+    )
+    result = predicted(project.system, belief.posterior, grid, horizon)
     train, tested = subset(grid, part.known), subset(grid, part.test)
-    curve = np.isin(rows, [steps_of(h) for h in CURVE])
-    before = train.since[:, None] + PERIOD * rows[curve] <= part.until
-    seen = result.of(part.known).only(curve)
+    curve = np.asarray([steps_of(h) for h in CURVE])
+    before = train.since[:, None] + PERIOD * curve <= part.until
+    seen = result.of(part.known).at(curve)
     seen = eqx.tree_at(lambda f: f.valid, seen, seen.valid & before[..., None])
     band = fit_band(seen, train, part.recordings)
     linear = regression_errors(train, tested, horizon)
-    found = judged(rows, tested, result.of(part.test), band, linear)
-    return Fold(belief.posterior, band, found, tested)
+    result = result.of(part.test)
+    found = judged(rows, tested, result, band, linear)
+    return Fold(belief.posterior, band, found, tested, result)

@@ -25,9 +25,11 @@ from sim2gp.experiments.identified import PROJECT, physical
 from sim2gp.experiments.longer import advice
 from sim2gp.experiments.motion import film
 from sim2gp.experiments.prediction import (
+    Picture,
     channels,
     cut_places,
     drawn,
+    predicted,
     recordings,
     rows_for,
     trace_arrays,
@@ -37,7 +39,7 @@ from sim2gp.experiments.record import command, provenance
 from sim2gp.experiments.unseen import Unseen, unseen
 from sim2gp.gaussian import Gaussian
 from sim2gp.logs import Log
-from sim2gp.models.forecast import Band, compile_forecast, fit_band, forecast
+from sim2gp.models.forecast import Band, compile_forecast, fit_band
 from sim2gp.models.grid import CURVE, Grid, evaluation_windows
 from sim2gp.models.windows import (
     Windows,
@@ -80,11 +82,11 @@ def run(
         task.advance(f"{len(windows)} windows")
         key, robust = jax.random.key(seed), project.spec.likelihood.robust
         grid = evaluation_windows(logs, project.system, longest=CURVE[-1])
-        compile_forecast(project.system, grid.windows)
+        compile_forecast(project.system, grid)
         compile_linearise(project.system, windows)
         fitted = belief = fit_windows(project.system, windows, key=key, robust=robust)
         task.advance("posterior")
-        band = band_of(belief, grid, logs)
+        band, picture = _own_forecasts(belief, grid, logs)
         belief = belief.informed()
         honest = corrected_windows(belief, windows, of)
         summary = _summarise(project, logs, windows, belief, honest, band, seed)
@@ -92,7 +94,7 @@ def run(
         other = None
         if held_out:
             other = unseen(project, logs, windows, places, grid, belief)
-        said, drawings = _drawings(project, logs, belief, band, grid, other)
+        said, drawings = _drawings(project, logs, belief, picture, grid, other)
         summary, arrays = summary | said, arrays | drawings
         task.advance("forecasts")
         asked = {"quick": not held_out, "check": check, "nuts": nuts, "longer": longer}
@@ -140,12 +142,11 @@ def _drawings(
     project: Project,
     logs: Sequence[Log],
     belief: WindowsBelief,
-    band: Band,
+    picture: Picture,
     grid: Grid,
     other: Unseen | None,
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Forecasts of the fitted logs and of held-out data, and a film of the latter."""
-    picture = drawn(project.system, belief.posterior, band, grid)
     arrays = trace_arrays(picture, grid, logs, channels(project.system, grid.windows))
     posterior, shown, data = belief.posterior, grid, "fitted"
     summary: dict[str, Any] = {}
@@ -160,11 +161,14 @@ def _drawings(
     return summary | ({"animation": about} if about else {}), arrays | moves
 
 
-def band_of(belief: WindowsBelief, grid: Grid, logs: Sequence[Log]) -> Band:
-    """The band of a fit, from its forecasts of the logs that it was fitted to."""
+def _own_forecasts(
+    belief: WindowsBelief, grid: Grid, logs: Sequence[Log]
+) -> tuple[Band, Picture]:
+    """Of the logs that were fitted: the band made of them, and what is drawn."""
+    found = predicted(belief.system, belief.posterior, grid, CURVE[0])
     rows = rows_for(CURVE[0])[1:]
-    found = forecast(belief.system, belief.posterior, grid.windows, rows)
-    return fit_band(found, grid, len(set(recordings(logs))))
+    band = fit_band(found.at(rows), grid, len(set(recordings(logs))))
+    return band, drawn(found, band, grid)
 
 
 def _stored(

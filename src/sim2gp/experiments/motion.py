@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from sim2gp.experiments.prediction import Picture
 from sim2gp.gaussian import Gaussian
 from sim2gp.logs import Log
 from sim2gp.models.grid import Grid
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from sim2gp.report.scenes import Scene
 
 MOST = 20  # windows: ten seconds
-FRAME = 8  # rows of the film between pictures of MuJoCo's own
+FRAME = 0.08  # s of the film between pictures of MuJoCo's own
 _STRIPS = 4
 _BUNDLED: tuple[tuple[type, str], ...] = (
     (Furuta, "furuta"),
@@ -31,7 +32,6 @@ _BUNDLED: tuple[tuple[type, str], ...] = (
     (TwoLink, "two_link"),
     (UniformRodArm, "two_link"),
 )
-Picture = dict[str, tuple[np.ndarray, ...]]
 
 
 def film(
@@ -62,7 +62,8 @@ def film(
     columns = {names[i]: c for c, i in enumerate(grid.windows.outputs)}
     motion = [_motion(x, y, columns, joints) for x in (mean, y)]
     constants = _constants(system, posterior, int(configuration[0]))
-    about, arrays = _drawing(machine, constants, motion)
+    dt = float(time[0, 1] - time[0, 0])
+    about, arrays = _drawing(machine, constants, motion, dt)
     if not about:
         return {}, {}
     several = system.parameters.configurations
@@ -71,7 +72,6 @@ def film(
     unseen = [n for n in joints if n not in columns]
     if unseen:
         title = f"{title}; {', '.join(unseen)} was not measured and is drawn at zero"
-    dt = float(time[0, 1] - time[0, 0])
     actions = [c.name for c in system.actions][:2]
     each = list(zip(grid.log[which], time, strict=True))
     held = np.concatenate([_held(logs[k], t, system)[:, :2] for k, t in each])
@@ -132,7 +132,7 @@ def _motion(
 
 
 def _drawing(
-    machine: Any, values: dict[str, float], motion: list[np.ndarray]
+    machine: Any, values: dict[str, float], motion: list[np.ndarray], dt: float
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """How the machine looks: a scene of the report's own, or a stick figure."""
     for kind, name in _BUNDLED:
@@ -155,7 +155,7 @@ def _drawing(
     points = figure.moving.astype(np.float32)
     half = len(motion[0])
     entry = figure_entry(figure)
-    frames = _frames(model, motion, skeleton(entry, points))
+    frames = _frames(model, motion, skeleton(entry, points), round(FRAME / dt))
     return {"system": "figure", "figure": entry} | frames[0], {
         "animation/points": points[:half],
         "animation/recorded_points": points[half:],
@@ -164,12 +164,15 @@ def _drawing(
 
 
 def _frames(
-    model: Any, motion: list[np.ndarray], scene: "Scene"
+    model: Any, motion: list[np.ndarray], scene: "Scene", least: int
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """MuJoCo's own pictures, seen as the stick figure is; empty where it has none."""
+    """MuJoCo's own pictures, seen as the stick figure is; empty where it has none.
+
+    One each ``least`` rows, or fewer if they would be too many.
+    """
     from sim2gp.systems.mujoco_film import MOST, rendered
 
-    every = max(FRAME, -(-len(motion[0]) // MOST))
+    every = max(1, least, -(-len(motion[0]) // MOST))
     width, height = scene.width * 3 // 4, scene.height * 3 // 4
     camera = scene.camera
     found = rendered(

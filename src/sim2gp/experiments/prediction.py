@@ -24,8 +24,9 @@ from sim2gp.project import Project
 from sim2gp.systems.base import AbstractSystem
 
 TRACE = 0.5  # s, the windows that are drawn
-_TRACE_ROWS = np.arange(0, steps_of(TRACE) + 1, 5)
+_FINEST = 5  # grid samples from one point of a curve to the next
 _EVERY = 5  # of the windows, 0.1 s apart, are drawn
+Picture = dict[str, tuple[np.ndarray, ...]]
 
 
 def cut_logs(
@@ -77,6 +78,19 @@ def rows_for(horizon: float) -> Int[np.ndarray, " R"]:
     return np.asarray(sorted(steps))
 
 
+def _rows_of_traces(grid: Grid) -> Int[np.ndarray, " R"]:
+    """Grid samples of a curve that is drawn, such as every simulation passes."""
+    return np.arange(0, steps_of(TRACE) + 1, int(np.lcm(_FINEST, grid.every)))
+
+
+def predicted(
+    system: AbstractSystem, posterior: Gaussian, grid: Grid, horizon: float
+) -> Forecast:
+    """Forecasts of ``grid``'s windows, at all that is judged or drawn of them."""
+    rows = np.union1d(rows_for(horizon), _rows_of_traces(grid))
+    return forecast(system, posterior, grid, rows)
+
+
 class Judged(eqx.Module):
     """Held-out forecasts with their bands, and the trivial predictors' errors."""
 
@@ -100,7 +114,7 @@ def judged(
     regression: np.ndarray | None,
 ) -> Judged:
     """Forecasts of ``grid``'s windows held against their band."""
-    y = np.asarray(grid.windows.y)
+    y, found = np.asarray(grid.windows.y), found.at(rows)
     start = np.asarray(grid.windows.start)[:, list(grid.windows.outputs)]
     scale, error = band.scale(found), np.abs(found.error)
     return Judged(
@@ -260,27 +274,18 @@ def _by_log(
     }
 
 
-def drawn(
-    system: AbstractSystem,
-    posterior: Gaussian,
-    band: Band,
-    grid: Grid,
-) -> dict[str, tuple[np.ndarray, ...]]:
+def drawn(found: Forecast, band: Band, grid: Grid) -> Picture:
     """Forecasts of half a second, for pictures: (which, time, measured, mean, half)."""
-    which = _pictured(grid)
-    if not len(which):  # all windows are shorter
-        none = np.zeros((0, len(_TRACE_ROWS), len(grid.windows.outputs)))
-        return {"which": (which,), "trace": (none[..., 0], none, none, none)}
-    windows = _some(grid.windows, which)
-    found = forecast(system, posterior, windows, _TRACE_ROWS)
-    half = band.half_width(0.9) * band.scale(found)
-    y = np.where(found.valid, np.asarray(windows.y)[:, _TRACE_ROWS], np.nan)
-    time = grid.since[which][:, None] + PERIOD * _TRACE_ROWS[None]
-    return {"which": (which,), "trace": (time, y, found.mean, half)}
+    which, rows = _pictured(grid), _rows_of_traces(grid)
+    shown = found.of(which).at(rows)
+    half = band.half_width(0.9) * band.scale(shown)
+    y = np.where(shown.valid, np.asarray(grid.windows.y)[which][:, rows], np.nan)
+    time = grid.since[which][:, None] + PERIOD * rows[None]
+    return {"which": (which,), "trace": (time, y, shown.mean, half)}
 
 
 def trace_arrays(
-    picture: dict[str, tuple[np.ndarray, ...]],
+    picture: Picture,
     grid: Grid,
     logs: Sequence[Log],
     names: Sequence[str],
@@ -318,24 +323,16 @@ def _pictured(grid: Grid) -> np.ndarray:
     return np.concatenate(chosen)
 
 
-def _some(windows: Windows, which: np.ndarray) -> Windows:
-    chosen: Windows = eqx.tree_at(
-        lambda w: w.floor, jax.tree.map(lambda x: x[which], _bare(windows)),
-        windows.floor, is_leaf=lambda x: x is None,
-    )  # fmt: skip
-    return chosen
-
-
-def _bare(windows: Windows) -> Windows:
-    bare: Windows = eqx.tree_at(lambda w: w.floor, windows, None)
-    return bare
-
-
 def subset(grid: Grid, which: np.ndarray) -> Grid:
     """The evaluation windows chosen by a mask."""
-    return Grid(
-        _some(grid.windows, which), grid.log[which], grid.since[which], grid.lag[which]
+    bare = eqx.tree_at(lambda g: g.windows.floor, grid, None)
+    chosen: Grid = eqx.tree_at(
+        lambda g: g.windows.floor,
+        jax.tree.map(lambda x: x[which], bare),
+        grid.windows.floor,  # of the sensors, it belongs to all
+        is_leaf=lambda x: x is None,
     )
+    return chosen
 
 
 def _flat(x: np.ndarray) -> np.ndarray:

@@ -13,14 +13,20 @@ import numpy as np
 from sim2gp.errors import DeadParameters, NotConverged, NotFinite
 from sim2gp.experiments.calibration import calibration
 from sim2gp.experiments.folds import Fold, fold, held_out
-from sim2gp.experiments.prediction import TRACE, channels, drawn, scores, trace_arrays
+from sim2gp.experiments.prediction import (
+    TRACE,
+    Picture,
+    channels,
+    drawn,
+    scores,
+    trace_arrays,
+)
 from sim2gp.logs import Log
 from sim2gp.models.grid import CURVE, Grid, steps_of
 from sim2gp.models.windows import Windows, WindowsBelief
 from sim2gp.project import Project
 
 PREFIX = "unseen"  # of the traces
-Picture = dict[str, tuple[np.ndarray, ...]]
 
 
 class Unseen(NamedTuple):
@@ -60,7 +66,7 @@ def unseen(
     summary, arrays = scores(found.judged, names, logs, horizon)
     summary["calibration"], shares = calibration(found.judged, names, horizon)
     del summary["tables"]
-    picture = drawn(project.system, found.posterior, found.band, found.tested)
+    picture = drawn(found.forecast, found.band, found.tested)
     traces = trace_arrays(picture, found.tested, logs, names, PREFIX)
     summary["left_out"] = part.words
     summary["text"] = (

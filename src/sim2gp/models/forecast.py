@@ -26,7 +26,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp.ahead import ahead
 from sim2gp.gaussian import LOG_2PI, Gaussian
@@ -37,7 +37,7 @@ from sim2gp.models.windows import Windows
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import in_float64
 
-_BATCH = 128  # windows at a time: bounds the memory of sensitivities
+_BATCH = 64  # windows at a time: bounds the memory of sensitivities
 
 
 class Forecast(eqx.Module):
@@ -51,16 +51,16 @@ class Forecast(eqx.Module):
     by_constants: Float[np.ndarray, "W R c"]  # variance
     rows: tuple[int, ...] = eqx.field(static=True)  # of the grid
 
-    def of(self, which: Bool[np.ndarray, " W"]) -> "Forecast":
-        """The forecasts of some of the windows."""
+    def of(self, which: Bool[np.ndarray, " W"] | Int[np.ndarray, " w"]) -> "Forecast":
+        """The forecasts of some of the windows, chosen by a mask or by number."""
         chosen: Forecast = jax.tree.map(lambda x: x[which], self)
         return chosen
 
-    def only(self, rows: Bool[np.ndarray, " R"]) -> "Forecast":
-        """The forecasts at some of the rows."""
-        chosen: Forecast = jax.tree.map(lambda x: x[:, rows], self)
-        at = tuple(np.asarray(self.rows)[rows].tolist())
-        return dataclasses.replace(chosen, rows=at)
+    def at(self, rows: Int[np.ndarray, " r"]) -> "Forecast":
+        """The forecasts at some of the rows, named as in the grid."""
+        places = [self.rows.index(row) for row in rows.tolist()]
+        chosen: Forecast = jax.tree.map(lambda x: x[:, places], self)
+        return dataclasses.replace(chosen, rows=tuple(rows.tolist()))
 
     def rmse(self) -> Float[np.ndarray, "R c"]:
         """Root mean square over windows; NaN where nothing was measured."""
@@ -73,20 +73,22 @@ class Forecast(eqx.Module):
 def forecast(
     system: AbstractSystem,
     posterior: Gaussian,
-    windows: Windows,
-    rows: Float[np.ndarray, " R"] | np.ndarray,
+    grid: Grid,
+    rows: Int[np.ndarray, " R"],
 ) -> Forecast:
-    """Simulate every window from its start at the posterior mean.
+    """Simulate every window from its start at the posterior mean, to some samples.
 
     Batches of one size, the last one filled up: all forecasts of a run share one
     compilation, and memory is bounded however long the logs are.
     """
-    rows, W = np.asarray(rows, int), len(windows)
+    windows, W = grid.windows, len(grid.windows)
+    passed = np.union1d(_passed(grid), rows)
+    places = np.searchsorted(passed, rows)
     parts = []
     for first in range(0, W, _BATCH):
         which = np.minimum(np.arange(first, first + _BATCH), W - 1)
-        found = _forecast(system, posterior, _some(windows, which))
-        parts.append([np.asarray(x)[: W - first, rows] for x in found])
+        found = _forecast(system, posterior, _some(windows, which, passed))
+        parts.append([np.asarray(x)[: W - first, places] for x in found])
     mean, by_start, by_input, by_constants = map(
         np.concatenate, zip(*parts, strict=True)
     )
@@ -96,10 +98,13 @@ def forecast(
 
 
 @in_float64
-def compile_forecast(system: AbstractSystem, windows: Windows) -> None:
-    """Start to compile `forecast` for windows like these and a posterior to come."""
-    prior = system.parameters.prior()
-    _forecast.compile_for(system, prior, _some(windows, np.zeros(_BATCH, int)))
+def compile_forecast(system: AbstractSystem, grid: Grid) -> None:
+    """Start to compile `forecast` for windows like these and a posterior to come.
+
+    It serves where the samples asked for are such as every simulation passes.
+    """
+    first = _some(grid.windows, np.zeros(_BATCH, int), _passed(grid))
+    _forecast.compile_for(system, system.parameters.prior(), first)
 
 
 @ahead
@@ -128,12 +133,28 @@ def _forecast(
     return found
 
 
-def _some(windows: Windows, which: np.ndarray) -> Windows:
-    """Some of the windows, as JAX arrays; the sensors' floor belongs to all."""
-    floor = jnp.asarray(windows.floor)
+def _passed(grid: Grid) -> Int[np.ndarray, " L"]:
+    """Samples that every simulation passes: of its own steps, and the first."""
+    return np.union1d([1], np.arange(0, grid.windows.span.shape[1], grid.every))
+
+
+def _some(windows: Windows, which: np.ndarray, rows: np.ndarray) -> Windows:
+    """Some of the windows, as JAX arrays, in steps from one of ``rows`` to the next."""
+    floor = jnp.asarray(windows.floor)  # of the sensors, it belongs to all
     rest = eqx.tree_at(lambda w: w.floor, windows, None)
     chosen = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[which]), rest)
-    return eqx.tree_at(lambda w: w.floor, chosen, floor, is_leaf=lambda x: x is None)
+    time = np.cumsum(np.asarray(windows.span)[which], axis=1)[:, rows]
+    return eqx.tree_at(
+        lambda w: (w.floor, w.span, w.y, w.mask),
+        chosen,
+        (
+            floor,
+            jnp.asarray(np.diff(time, axis=1, prepend=0.0)),
+            chosen.y[:, rows],
+            chosen.mask[:, rows],
+        ),
+        is_leaf=lambda x: x is None,
+    )
 
 
 @dataclass(frozen=True)

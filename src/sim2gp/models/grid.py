@@ -34,13 +34,15 @@ class Grid(eqx.Module):
     """Evaluation windows, and for each its log and how far a causal start is off.
 
     ``lag`` is the start used minus the centred estimate, which knows the future too
-    (NaN at the end of a log, where there is none).
+    (NaN at the end of a log, where there is none). Every ``every``-th sample is one
+    that a simulation passes: a simulator is not stepped finer than it is in a fit.
     """
 
     windows: Windows
     log: Int[np.ndarray, " W"]
     since: Float[np.ndarray, " W"]  # s, on the log's clock
     lag: Float[np.ndarray, "W n"]
+    every: int = eqx.field(static=True, default=1)
 
 
 def steps_of(horizon: float) -> int:
@@ -90,7 +92,19 @@ def evaluation_windows(
         np.asarray([logs[k].group for k, _, _ in spans], np.int32),
         tuple(states.index(name) for name in measured),
     )
-    return Grid(windows, which, np.asarray([s for _, s, _ in spans]), lag)
+    since = np.asarray([s for _, s, _ in spans])
+    return Grid(windows, which, since, lag, _every(logs, system))
+
+
+def _every(logs: Sequence[Log], system: AbstractSystem) -> int:
+    """Samples to a simulator's step; it is no longer than a log's own, either.
+
+    A divisor of the samples in 0.1 s, so that every horizon is passed.
+    """
+    stamps = min(float(np.median(np.diff(log.time))) for log in logs)
+    longest = max(1.0, min(system.window_substep, stamps) / PERIOD + 1e-6)
+    whole = steps_of(SPACING)
+    return max(k for k in range(1, whole + 1) if whole % k == 0 and k <= longest)
 
 
 def on_grid(

@@ -64,19 +64,24 @@ def value_and_jacobian(
 
 
 def jacobian_by_columns(
-    f: Callable[[Array], tuple[Array, ...]], x: Float[Array, " p"]
+    f: Callable[[Array], tuple[Array, ...]],
+    x: Float[Array, " p"],
+    *,
+    at_once: bool = False,
 ) -> tuple[Float[Array, "*d p"], tuple[Array, ...]]:
     """Jacobian of the first output of ``f`` at ``x``, and all of its values there.
 
     One column after the other: the code of a single one takes a third of the time to
-    compile. For what runs at few points.
+    compile. For what runs at few points. All ``at_once`` where a simulator on the host
+    would be asked the same for each.
     """
 
     def column(v: Array) -> tuple[Array, tuple[Array, ...]]:
         values, slopes = jax.jvp(f, (x,), (v,))
         return slopes[0], values
 
-    J, values = jax.lax.map(column, jnp.eye(x.size, dtype=x.dtype))
+    together = x.size if at_once else None
+    J, values = jax.lax.map(column, jnp.eye(x.size, dtype=x.dtype), batch_size=together)
     return jnp.moveaxis(J, 0, -1), jax.tree.map(lambda a: a[0], values)
 
 

@@ -32,6 +32,7 @@ from sim2gp.models.informed import informed
 from sim2gp.models.linearized import jacobian_by_columns, value_and_jacobian
 from sim2gp.models.stretch import Stretch, inputs_of, simulate
 from sim2gp.systems.base import AbstractSystem
+from sim2gp.systems.external import on_host
 from sim2gp.types import AnyArray, Key, Scalar, in_float64
 
 NOISE_ROUNDS = 8  # fewer leave noise and starts of real logs short of a fixed point
@@ -181,6 +182,7 @@ def _fit(
     return fit, belief
 
 
+@eqx.filter_jit
 def _large(windows: Windows) -> Noise:
     """The measurements' own sd about each window's mean: it traps no first MAP."""
     mask = windows.mask.astype(windows.y.dtype)
@@ -263,7 +265,7 @@ def _linearise(
         return found
 
     nowhere = jnp.zeros(prior.mean.size + n)
-    J, (r, states, inputs) = jacobian_by_columns(rows, nowhere)
+    J, (r, states, inputs) = jacobian_by_columns(rows, nowhere, at_once=on_host(system))
     return Linearised(r, J, states, inputs)
 
 

@@ -24,6 +24,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from sim2gp.parameters import Parameters
+from sim2gp.systems.actuator import bare
+from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import Action, Scalar, State
 
 #: What a constant changes by less, of the largest number, it does not change.
@@ -117,6 +119,13 @@ class AbstractSimulator(abc.ABC):
         moved[:p][np.abs(moved[:p]) <= nothing[:, None]] = 0.0
         J = moved / apart[..., None]
         return out[0], np.moveaxis(J, 0, -1)
+
+
+def on_host(system: AbstractSystem) -> bool:
+    """Whether a simulator here moves it, which tells all slopes or none."""
+    found = bare(system)
+    engine = isinstance(getattr(found, "engine", None), AbstractSimulator)
+    return engine and getattr(found, "mjx", None) is None
 
 
 def untouched(
