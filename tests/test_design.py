@@ -34,7 +34,13 @@ TRAJECTORY, INFORMATION = eqx.filter_jit(d.trajectory), eqx.filter_jit(d.informa
 ROWS = eqx.filter_jit(d.experiment.sensitivity_at)
 
 
-@pytest.mark.parametrize("system", [pendulum(), delayed()], ids=["plain", "delayed"])
+@pytest.mark.parametrize(
+    "system",
+    [
+        pytest.param(pendulum(), id="plain", marks=pytest.mark.nightly),
+        pytest.param(delayed(), id="delayed"),
+    ],
+)
 def test_it_tells_what_the_log_of_it_would(system) -> None:
     """Against `models.windows`, on the log that the experiment would leave."""
     e, U = experiment(system), commands()

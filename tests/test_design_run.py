@@ -10,13 +10,13 @@ import pytest
 
 from sim2gp.cli import main
 from sim2gp.design import Everything, Limits, Named, search
+from sim2gp.experiments import identify
 from sim2gp.experiments.design import Asked, foretold, goal_of, setting, verdict
 from sim2gp.project import load_project
-from sim2gp.runs import load_run
-from test_identify import folder, project_in, run
+from sim2gp.runs import Progress, load_run
+from test_identify import folder, project_in
 
-assert folder  # fixtures
-assert run
+assert folder  # a fixture
 
 SHORT = ["--seconds", "1", "--period", "0.01"]
 ASKED = Asked(10.0, "multisine", (), None, 2.0, {}, {}, {}, None)
@@ -24,6 +24,16 @@ LIMITS = ["--limit", "theta=-1:1", "theta.velocity=-15:15", "--rate", "voltage=2
 
 
 QUICK = {"BLOCK": 5, "BLOCKS": 2, "TRIALS": 40, "GUARDS": 8, "CHECKED": 100}
+
+
+@pytest.fixture(scope="module")
+def run(folder: Path) -> Path:
+    """A fit alone: nothing of it is held out."""
+    project, out = load_project(project_in(folder)), folder / "run"
+    quiet = Progress(quiet=True)
+    logs = project.load_logs()
+    identify.run(project, logs, out=out, seed=0, progress=quiet, held_out=False)
+    return out
 
 
 @pytest.fixture(autouse=True)

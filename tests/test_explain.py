@@ -66,6 +66,7 @@ def test_nothing_and_none_of_these() -> None:
     assert headline(outside).startswith("None of these")
 
 
+@pytest.mark.nightly  # `test_explain_run` finds what a score ranks first
 def test_a_score_is_the_evidence_of_a_weak_effect() -> None:
     """Close to nothing one linearisation is as good as a fit; far away it ranks."""
     data = flown(sy.Spring("theta", 1e-4), 6)

@@ -108,7 +108,7 @@ def test_a_policy_that_is_trained_has_cells_of_its_own():
 @pytest.mark.parametrize(
     "method",
     [
-        "domain randomisation",
+        pytest.param("domain randomisation", marks=pytest.mark.nightly),
         pytest.param("off-policy oracle", marks=pytest.mark.nightly),
     ],
 )

@@ -339,10 +339,11 @@ def test_nuisances_are_eliminated_exactly():
     """MAP, posterior and evidence against scipy's dense solver of the whole problem."""
     fit = fit_of_curves()
     x = jnp.concatenate([fit.z, fit.e.reshape(-1)])
+    residuals, slopes = jax.jit(stacked), jax.jit(jax.jacfwd(stacked))
     dense = scipy.optimize.least_squares(
-        lambda x: np.asarray(stacked(jnp.asarray(x))),
+        lambda x: np.asarray(residuals(jnp.asarray(x))),
         np.asarray(x) + 0.01,
-        jac=lambda x: np.asarray(jax.jacfwd(stacked)(jnp.asarray(x))),
+        jac=lambda x: np.asarray(slopes(jnp.asarray(x))),
         xtol=1e-15,
         ftol=1e-15,
         gtol=1e-14,
@@ -350,7 +351,7 @@ def test_nuisances_are_eliminated_exactly():
     np.testing.assert_allclose(x, dense.x, atol=1e-7)
     assert float(fit.cost) == pytest.approx(dense.cost, rel=1e-12)
     assert int(fit.status) == laplace.CONVERGED
-    J = np.asarray(jax.jacfwd(stacked)(x))
+    J = np.asarray(slopes(x))
     covariance = np.linalg.inv(J.T @ J)
     np.testing.assert_allclose(
         fit.scale() @ fit.scale().T, covariance[:2, :2], rtol=1e-8
@@ -363,9 +364,10 @@ def test_expected_squares_are_those_of_the_joint_posterior():
     """E||r||^2 per window and channel: at the MAP, plus J Sigma J^T of all unknowns."""
     fit = fit_of_curves()
     x = jnp.concatenate([fit.z, fit.e.reshape(-1)])
-    whole = np.asarray(jax.jacfwd(stacked)(x))
+    whole = np.asarray(jax.jit(jax.jacfwd(stacked))(x))
     covariance = np.linalg.inv(whole.T @ whole)
-    J = np.asarray(jax.jacfwd(lambda x: curves(x[:2], x[2:].reshape(3, 2)))(x))
+    each = jax.jit(jax.jacfwd(lambda x: curves(x[:2], x[2:].reshape(3, 2))))
+    J = np.asarray(each(x))
     r = np.asarray(curves(fit.z, fit.e))
     squares, spread = fit.squares()
     np.testing.assert_allclose(squares, np.sum(r**2, axis=1), rtol=1e-6)

@@ -91,8 +91,14 @@ def test_what_contradicts_the_model_already_is_not_lengthened(tmp_path: Path) ->
 
 
 def test_logs_must_be_long_enough(tmp_path: Path) -> None:
-    assert "too few" in asked(tmp_path, recording(rows=60)).refused
-    assert "E116" in asked(tmp_path, recording(rows=11)).refused
+    project, _, honest = fitted(tmp_path, recording())
+
+    def refused(rows: int) -> str:
+        short = [recording(rows=rows)]
+        return lengthened(project, short, honest, alarm=False, key=KEY).refused
+
+    assert "too few" in refused(60)
+    assert "E116" in refused(11)
 
 
 def test_who_did_not_ask_is_told_that_one_can(tmp_path: Path) -> None:

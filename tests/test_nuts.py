@@ -41,6 +41,7 @@ class Bent(AbstractLikelihood):
         return jnp.zeros((1, 1))
 
 
+@pytest.mark.nightly
 def test_moments_are_those_of_the_marginal_posterior() -> None:
     """``y_w ~ N(0, e^z + sd^2)``: Laplace's mode and sd of it are far off."""
     y, sd = np.asarray([-1.9, 0.4, 1.1, -0.7, 2.3, 0.2]), 0.3

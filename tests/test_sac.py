@@ -231,6 +231,7 @@ def test_episodes_begin_where_the_machine_has_been() -> None:
         assert np.mean(held == 5.0) == pytest.approx(share, abs=0.04)
 
 
+@pytest.mark.nightly
 def test_episodes_begin_where_no_machine_has_been() -> None:
     """As far as a policy sees, a turn for an angle; what it does not see stays.
 

@@ -111,6 +111,7 @@ def test_rows_said_twice_say_nothing_new():
     np.testing.assert_allclose(plain, 0.2, rtol=0.02)
 
 
+@pytest.mark.nightly
 def test_what_contradicts_itself_stays_wide():
     """Sixteen times the rows, and as much disagreement between the parts."""
     spreads, plain = [], []

@@ -70,7 +70,8 @@ def test_elimination_is_one_dense_system(short: Log) -> None:
             return (r / noise[None, None]).reshape(-1)
 
         x = jnp.concatenate([jnp.asarray(z), jnp.zeros(W * n)])
-        J, r = np.asarray(jax.jacfwd(residuals)(x)), np.asarray(residuals(x))
+        J = np.asarray(jax.jit(jax.jacfwd(residuals))(x))
+        r = np.asarray(jax.jit(residuals)(x))
     # Posterior: one dense least-squares system in z and all start states at once.
     whole = np.block([[J], [np.eye(p + W * n)[p:]]])
     rhs = np.concatenate([r, np.zeros(W * n)])
@@ -92,6 +93,7 @@ def test_elimination_is_one_dense_system(short: Log) -> None:
     np.testing.assert_allclose(2 * np.sum(np.log(pivots)), log_det, rtol=1e-10)
 
 
+@pytest.mark.nightly
 def test_window_zero_is_the_one_step_fit() -> None:
     log = simulated(seconds=0.4, seed=2, noise=1e-3, velocities=True)
     system = pendulum()
@@ -257,7 +259,7 @@ def test_delayed_inputs_are_smooth_in_the_delay(short: Log) -> None:
         def mean(delay: float, width: float) -> jax.Array:
             return stretch.inputs_of(one, jnp.asarray([delay]), width)[1:]
 
-        slope = jax.jacfwd(mean)
+        slope = jax.jit(jax.jacfwd(mean), static_argnums=1)
         h = 1e-7
         jump = np.abs(slope(0.004 + h, blur) - slope(0.004 - h, blur)).max()
         kink = np.abs(slope(0.004 + h, 0.0) - slope(0.004 - h, 0.0)).max()
