@@ -215,6 +215,7 @@ def descend(system: AbstractSystem, windows: Windows) -> Fit:
     return minimise(model, jnp.zeros(prior.mean.size), jnp.zeros((W, n)), noise)
 
 
+@pytest.mark.nightly
 @in_float64
 def test_sharing_nothing_is_two_fits(logs: tuple[Log, Log]) -> None:
     machine = arm()

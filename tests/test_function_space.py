@@ -23,7 +23,7 @@ from sim2gp.models.matching import OBJECTIVES, Objective
 
 P, D, M = 3, 2, 5
 KEY = jax.random.key(0)
-MODELS = (FunctionSpace, ResidualFunctionSpace)
+NIGHT = pytest.param(FunctionSpace, marks=pytest.mark.nightly)  # the same code
 
 
 pytestmark = pytest.mark.usefixtures("float64")
@@ -218,7 +218,7 @@ def model(kind, **options):
     return kind(Sim2GP(linear(P, D), dt=1.0), **{**own, **options})
 
 
-@pytest.fixture(scope="module", params=MODELS, ids=lambda kind: kind.__name__)
+@pytest.fixture(scope="module", params=[NIGHT, ResidualFunctionSpace])
 def fitted(request):
     with jax.enable_x64(True):
         recipe = model(request.param)

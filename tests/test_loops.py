@@ -201,7 +201,7 @@ def test_keys_differ_by_episode_and_purpose() -> None:
 @pytest.mark.parametrize(
     ("preset", "least"),
     [
-        (tasks.cartpole_swingup, 190.0 / 250.0),
+        pytest.param(tasks.cartpole_swingup, 190.0 / 250.0, marks=pytest.mark.nightly),
         pytest.param(tasks.furuta_swingup, 140.0 / 200.0, marks=pytest.mark.nightly),
     ],
 )

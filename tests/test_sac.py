@@ -127,6 +127,7 @@ def test_the_temperature_keeps_the_entropy_that_is_wanted() -> None:
     assert -float(jnp.mean(draw(keys))) == pytest.approx(-1.0, abs=0.15)
 
 
+@pytest.mark.nightly
 def test_a_policy_plans_ahead() -> None:
     """A double integrator: the cost is that of Riccati's, within a tenth."""
     reset = _anywhere_in_the_plane

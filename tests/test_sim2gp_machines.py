@@ -108,8 +108,8 @@ def test_draws_of_a_machine_have_the_moments_of_the_belief():
 @pytest.mark.parametrize(
     ("system", "rank"),
     [
-        (Furuta(), 6),
-        (CartPole(), 5),
+        pytest.param(Furuta(), 6, marks=pytest.mark.nightly),
+        pytest.param(CartPole(), 5, marks=pytest.mark.nightly),
         (machines.bare()["six"], 5),
         (UniformRodArm(), 4),
     ],
@@ -194,6 +194,7 @@ def test_coverage_on_well_specified_data(furuta_fits):
     assert 0.90 <= inside[1] <= 0.99
 
 
+@pytest.mark.nightly
 def test_coverage_in_every_direction_where_all_is_identified():
     """Four rods, rank 4, little noise: whitened errors are standard normal.
 

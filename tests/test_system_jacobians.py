@@ -69,7 +69,7 @@ def error(got, expected):
 
 def cases() -> list[Any]:
     """What is a part of another machine here waits for the night."""
-    whole = ("furuta/all", "two_link/actuated", "six")
+    whole = ("two_link/actuated", "six")
     night = pytest.mark.nightly
     return [n if n in whole else pytest.param(n, marks=night) for n in machines.every()]
 

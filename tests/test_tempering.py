@@ -198,6 +198,7 @@ def test_the_residual_model_is_as_wide_as_its_data_disagree(bent):
     )
 
 
+@pytest.mark.nightly
 def test_what_no_data_settle_is_not_acted_upon(bent):
     """Draws to act on: constants as wide as the rows say, the layer as it is."""
     belief, alone, (wide, _) = bent

@@ -189,6 +189,7 @@ def test_order_of_windows_and_masked_windows_do_not_matter(short: Log) -> None:
     np.testing.assert_allclose(*map(_sizes, (R1, R2)), rtol=1e-10, atol=1e-10)
 
 
+@pytest.mark.nightly
 def test_memory_is_linear_in_the_data() -> None:
     system = pendulum()
     log = simulated(seconds=0.6, seed=4, noise=1e-3)
