@@ -2,8 +2,10 @@
 
     python benchmarks/bad_inputs.py [NUMBER ...]
 
-Prints the slowest ones; the bar is 2 s on an idle machine. Inputs whose door is Python,
-and those that need a patched child process, are left out.
+Prints the slowest ones; the bar is 2 s on an idle machine. What takes longer is timed
+twice more and its least time counts: a machine that others use adds seconds, and takes
+none away. Inputs whose door is Python, and those that need a patched child process, are
+left out.
 """
 
 import subprocess
@@ -25,6 +27,7 @@ from sim2gp.errors import Sim2GPError  # noqa: E402
 
 CALL = "import sys; from sim2gp.cli import main; sys.exit(main(sys.argv[1:]))"
 BAR = 2.0  # s
+AGAIN = 2
 
 
 def seconds(given: Input) -> float | None:
@@ -58,12 +61,17 @@ def main() -> int:
         for i, given in enumerate(bad.inputs):
             took = seconds(given) if given.code[:1] == "E" else None
             if took is not None:
-                found.append((took, f"{bad.number} {bad.title} [{i}]"))
-    found.sort(reverse=True)
-    for took, name in found[:15]:
+                found.append((took, f"{bad.number} {bad.title} [{i}]", given))
+    at_first = sum(took > BAR for took, *_ in found)
+    for k, (took, name, given) in enumerate(found):
+        if took > BAR:
+            again = (seconds(given) for _ in range(AGAIN))
+            found[k] = min([took, *(x for x in again if x)]), name, given
+    found.sort(reverse=True, key=lambda each: each[0])
+    for took, name, _ in found[:15]:
         print(f"{took:5.2f} s  {name}")
-    late = sum(took > BAR for took, _ in found)
-    print(f"{len(found)} inputs, {late} over {BAR:g} s")
+    late = sum(took > BAR for took, *_ in found)
+    print(f"{len(found)} inputs, {at_first} over {BAR:g} s at first, {late} in the end")
     return 1 if late else 0
 
 
