@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -325,14 +324,13 @@ def _pictured(grid: Grid) -> np.ndarray:
 
 def subset(grid: Grid, which: np.ndarray) -> Grid:
     """The evaluation windows chosen by a mask."""
-    bare = eqx.tree_at(lambda g: g.windows.floor, grid, None)
-    chosen: Grid = eqx.tree_at(
-        lambda g: g.windows.floor,
-        jax.tree.map(lambda x: x[which], bare),
-        grid.windows.floor,  # of the sensors, it belongs to all
-        is_leaf=lambda x: x is None,
+    return Grid(
+        grid.windows.some(which),
+        grid.log[which],
+        grid.since[which],
+        grid.lag[which],
+        grid.every,
     )
-    return chosen
 
 
 def _flat(x: np.ndarray) -> np.ndarray:

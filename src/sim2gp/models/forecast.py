@@ -30,7 +30,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp.ahead import ahead
 from sim2gp.gaussian import LOG_2PI, Gaussian
-from sim2gp.models.grid import Grid
+from sim2gp.models.grid import PERIOD, Grid
 from sim2gp.models.linearized import value_and_jacobian
 from sim2gp.models.stretch import simulate
 from sim2gp.models.windows import Windows
@@ -87,7 +87,7 @@ def forecast(
     parts = []
     for first in range(0, W, _BATCH):
         which = np.minimum(np.arange(first, first + _BATCH), W - 1)
-        found = _forecast(system, posterior, _some(windows, which, passed))
+        found = _forecast(system, posterior, _some(grid, which, passed))
         parts.append([np.asarray(x)[: W - first, places] for x in found])
     mean, by_start, by_input, by_constants = map(
         np.concatenate, zip(*parts, strict=True)
@@ -103,7 +103,7 @@ def compile_forecast(system: AbstractSystem, grid: Grid) -> None:
 
     It serves where the samples asked for are such as every simulation passes.
     """
-    first = _some(grid.windows, np.zeros(_BATCH, int), _passed(grid))
+    first = _some(grid, np.zeros(_BATCH, int), _passed(grid))
     _forecast.compile_for(system, system.parameters.prior(), first)
 
 
@@ -138,23 +138,16 @@ def _passed(grid: Grid) -> Int[np.ndarray, " L"]:
     return np.union1d([1], np.arange(0, grid.windows.span.shape[1], grid.every))
 
 
-def _some(windows: Windows, which: np.ndarray, rows: np.ndarray) -> Windows:
+def _some(grid: Grid, which: np.ndarray, rows: np.ndarray) -> Windows:
     """Some of the windows, as JAX arrays, in steps from one of ``rows`` to the next."""
-    floor = jnp.asarray(windows.floor)  # of the sensors, it belongs to all
-    rest = eqx.tree_at(lambda w: w.floor, windows, None)
-    chosen = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[which]), rest)
-    time = np.cumsum(np.asarray(windows.span)[which], axis=1)[:, rows]
-    return eqx.tree_at(
-        lambda w: (w.floor, w.span, w.y, w.mask),
+    chosen = jax.tree.map(jnp.asarray, grid.windows.some(which))
+    span = jnp.tile(PERIOD * np.diff(rows, prepend=0), (len(which), 1))
+    thin: Windows = eqx.tree_at(
+        lambda w: (w.span, w.y, w.mask),
         chosen,
-        (
-            floor,
-            jnp.asarray(np.diff(time, axis=1, prepend=0.0)),
-            chosen.y[:, rows],
-            chosen.mask[:, rows],
-        ),
-        is_leaf=lambda x: x is None,
+        (span, chosen.y[:, rows], chosen.mask[:, rows]),
     )
+    return thin
 
 
 @dataclass(frozen=True)

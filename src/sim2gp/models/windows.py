@@ -63,6 +63,17 @@ class Windows(Stretch):
     def __len__(self) -> int:
         return len(self.y)
 
+    def some(self, which: Bool[np.ndarray, " W"] | Int[np.ndarray, " w"]) -> "Windows":
+        """The windows chosen by a mask or by number; the floor belongs to all."""
+        bare = eqx.tree_at(lambda w: w.floor, self, None)
+        chosen: Windows = eqx.tree_at(
+            lambda w: w.floor,
+            jax.tree.map(lambda x: np.asarray(x)[which], bare),
+            self.floor,
+            is_leaf=lambda x: x is None,
+        )
+        return chosen
+
     def each(self, f: Callable[..., Any], *per_window: Any) -> Any:
         """``f`` of one window (and of one row of each argument), for all windows."""
         axes = eqx.tree_at(lambda w: w.floor, jax.tree.map(lambda _: 0, self), None)
