@@ -4,7 +4,8 @@
 
 Ten seconds of a hidden two-link arm (`interval_arms.py`) are fitted with the likelihood
 of `sim2gp identify`; masses and dampings are unknown. Beside the plain intervals
-(Laplace) and the library's stand what it was chosen from (`interval_candidates.py`) and
+(Laplace) and the library's stand those without the effects that the simulator may lack
+(the windows' scatter alone), what they were chosen from (`interval_candidates.py`), and
 an oracle that knows what is wrong: the noise's true covariance, or a simulator with the
 missing term. `--also longer` adds the library's on windows of 1 s instead of .2 s, and
 what comes of those where the misfit tests of both fits are silent, as `sim2gp identify
@@ -35,7 +36,9 @@ from interval_arms import (
 from interval_sysid import intervals
 from scipy.stats import beta, norm
 
-from sim2gp.diagnose.intervals import corrected, pulls_of_windows
+from sim2gp.diagnose.discrepancy import corrected_windows
+from sim2gp.diagnose.intervals import Corrected
+from sim2gp.diagnose.pulls import pulls_of_windows
 from sim2gp.diagnose.residuals import misfit_of_windows
 from sim2gp.models.cutting import cut
 from sim2gp.models.windows import WindowsBelief, fit_windows
@@ -49,6 +52,7 @@ CHUNK = 20  # sets of a cell
 METHODS = {
     "plain": "plain (Laplace)",
     "corrected": "sim2gp",
+    "scatter": "windows' scatter alone",
     "clusters": "sandwich, windows as clusters",
     "mixture": "fitted covariance",
     "five_parts": "five parts",
@@ -62,6 +66,8 @@ ALSO = {
 FLOWN = ("longer", "sysid")  # of these, the ones with cells
 #: Entry of a cell: of which sets the misfit tests speak, in windows of a length.
 SPEAK = {WINDOW: "speak", LONGER: "speak_longer"}
+#: Of a cell, too: the probability that something is missing.
+MISSING = "missing"
 ASKED = {"white": (0.92, 0.98)}  # of the others:
 ASKED_ELSE, ASKED_SCORE = (0.90, 0.99), 1.5
 Z = 1.959963984540054
@@ -81,7 +87,7 @@ class Job(NamedTuple):
     @property
     def arguments(self) -> dict[str, Any]:
         """What its cell rests on."""
-        ours = {} if self.also == "sysid" else {"longer": LONGER}
+        ours = {} if self.also == "sysid" else {"longer": LONGER, "effects": True}
         return {"window": WINDOW, "sets": CHUNK, **ours}
 
 
@@ -94,14 +100,19 @@ def work(job: Job) -> dict[str, Any]:
     prior_sd = np.asarray(system.parameters.prior().sd())
     if job.also:
         return _also(job, data, prior_sd, key)
-    found: dict[str, list[Any]] = {name: [] for name in (*METHODS, SPEAK[WINDOW])}
+    about = SPEAK[WINDOW], MISSING
+    found: dict[str, list[Any]] = {name: [] for name in (*METHODS, *about)}
     for s in range(CHUNK):
-        belief, windows, pulls = _fitted(data, s, WINDOW, key)
+        belief, windows, group = _fitted(data, s, WINDOW, key)
         found[SPEAK[WINDOW]].append(misfit_of_windows(belief, windows).alarm)
+        pulls = pulls_of_windows(belief, windows, group)
         x = candidates.linear(belief, windows, pulls)
+        ours = corrected_windows(belief, windows, group)
+        found[MISSING].append(float(f"{ours.missing:.4g}"))
         each = {
             "plain": (x.z, np.asarray(belief.posterior.sd()) / prior_sd),
-            "corrected": _corrected(belief, pulls),
+            "corrected": _units(ours, prior_sd),
+            "scatter": _units(corrected_windows(belief, windows, group, ()), prior_sd),
             "clusters": candidates.clusters(x),
             "mixture": candidates.mixture(x),
             "five_parts": candidates.five_parts(x),
@@ -128,27 +139,26 @@ def _also(job: Job, data: Recordings, prior_sd: Any, key: Any) -> dict[str, Any]
         if job.also == "sysid":
             centre, sd = intervals(data, s, UniformRodArm().parameters)
         else:
-            belief, windows, pulls = _fitted(data, s, LONGER, key)
+            belief, windows, group = _fitted(data, s, LONGER, key)
             alarm = misfit_of_windows(belief, windows).alarm
             found.setdefault(SPEAK[LONGER], []).append(alarm)
-            centre, sd = _corrected(belief, pulls)
+            centre, sd = _units(corrected_windows(belief, windows, group), prior_sd)
         error = centre - data.truth[s] / prior_sd
         found[job.also].append([_rounded(error), _rounded(sd)])
     return found
 
 
 def _fitted(data: Recordings, s: int, window: float, key: Any) -> tuple[Any, Any, Any]:
-    """Belief, windows and their pulls, of one set."""
+    """Belief, windows and their recordings, of one set."""
     system = UniformRodArm()
     windows, of = cut([data.log(s)], system, window=window)
-    belief = fit_windows(system, windows, key=key)
-    pulls = pulls_of_windows(belief, windows, np.asarray([k for k, _ in of]))
-    return belief, windows, pulls
+    belief: WindowsBelief = fit_windows(system, windows, key=key)
+    return belief, windows, np.asarray([k for k, _ in of])
 
 
-def _corrected(belief: WindowsBelief, pulls: Any) -> tuple[np.ndarray, np.ndarray]:
-    prior_sd = np.asarray(belief.prior.sd())
-    mine = corrected(belief.prior, belief.posterior, pulls).posterior
+def _units(found: Corrected, prior_sd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centre and sd in prior sd."""
+    mine = found.posterior
     return np.asarray(mine.mean) / prior_sd, np.asarray(mine.sd()) / prior_sd
 
 
@@ -163,14 +173,15 @@ def figures(joined: dict[str, list[Any]]) -> dict[str, Any]:
     than the short windows' intervals say, at 5 % for all constants together.
     """
     found = {name: np.asarray(v) for name, v in joined.items()}
+    missing = {"missing": float(np.mean(found.pop(MISSING) > 0.5))}
     speak = {w: found.pop(key) for w, key in SPEAK.items() if key in found}
     if "longer" not in found:
-        return {"methods": table(found)}
+        return {"methods": table(found), **missing}
     silent = ~(speak[WINDOW] | speak[LONGER])[:, None, None]
     found["advised"] = np.where(silent, found["longer"], found["corrected"])
     (short, sd), long = np.moveaxis(found["corrected"], 1, 0), found["longer"][:, 0]
     far = np.max(np.abs(long - short) / sd, axis=1) > norm.isf(0.025 / len(NAMES))
-    about = {"apart": far.mean(), "advised": silent.mean()}
+    about = {"apart": far.mean(), "advised": silent.mean(), **missing}
     about |= {key: speak[w].mean() for w, key in SPEAK.items()}
     return {"methods": table(found), **{k: float(v) for k, v in about.items()}}
 
@@ -230,6 +241,7 @@ def lines(summary: dict[str, Any]) -> list[str]:
                 row += f"{c['width']:6.2f}{c['score']:6.2f} "
             out.append(row)
         out.append(_goal(name, entry["methods"]["corrected"]))
+        out.append(f"something is missing, it says: {entry['missing']:.3f}")
         if "advised" in entry:
             out.append(
                 f"misfit tests speak: windows of {WINDOW:g} s {entry['speak']:.3f}, of "

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from sim2gp.diagnose.intervals import corrected_windows
+from sim2gp.diagnose.discrepancy import corrected_windows
 from sim2gp.errors import InputError, NotConverged, NotFinite
 from sim2gp.experiments.prediction import cut_logs
 from sim2gp.models.windows import fit_windows

@@ -2,49 +2,50 @@
 
 from mutant_list import Mutant
 
-PULLS, WEIGHTS = "diagnose/intervals.py", "diagnose/importance.py"
-HERE, TAILS = "test_intervals.py", "test_importance.py"
+SCATTER, WEIGHTS = "diagnose/intervals.py", "diagnose/importance.py"
+PULLS, LACKING = "diagnose/pulls.py", "diagnose/discrepancy.py"
+HERE, TAILS, LACKS = "test_intervals.py", "test_importance.py", "test_discrepancy.py"
 LONGER = "experiments/longer.py"
 
 INTERVALS = (
     Mutant(
         "intervals: no small-sample factor",
-        PULLS,
+        SCATTER,
         "/ np.sqrt(np.maximum(left, 1e-12))",
         "/ np.sqrt(np.maximum(left, 1.0))",
         (HERE, "fishers_information"),
     ),
     Mutant(
         "intervals: the jackknife's factor",
-        PULLS,
+        SCATTER,
         "/ np.sqrt(np.maximum(left, 1e-12))",
         "/ np.maximum(left, 1e-12)",
         (HERE, "fishers_information"),
     ),
     Mutant(
         "intervals: recordings joined",
-        PULLS,
+        SCATTER,
         "pair = group[1:] == group[:-1]",
         "pair = group[1:] >= group[:-1]",
         (HERE, "lag_follows"),
     ),
     Mutant(
         "intervals: narrower than plain",
-        PULLS,
+        SCATTER,
         "np.maximum(size, 1.0)",
         "np.maximum(size, 0.1)",
         (HERE, "between_the_plain"),
     ),
     Mutant(
         "intervals: inflation as sd, not variance",
-        PULLS,
+        SCATTER,
         "weight = U / spread[:, None]",
         "weight = U / np.sqrt(spread)[:, None]",
         (HERE, "coloured_noise"),
     ),
     Mutant(
         "intervals: the MAP for the data's estimate",
-        PULLS,
+        SCATTER,
         "data = s * (Vt @ z) - (Vt @ pulls.scores.sum(axis=0)) / s",
         "data = s * (Vt @ z)",
         (HERE, "between_the_plain"),
@@ -79,9 +80,9 @@ INTERVALS = (
     ),
     Mutant(
         "intervals: a centre is believed wherever it lies",
-        PULLS,
-        "if there - before - told <= TRUSTED * max(found.inflation, 1.0):",
-        "if there < np.inf:",
+        LACKING,
+        "if cost_of_rows(found, cut) - before - told <= slack:",
+        "if cost_of_rows(found, cut) < np.inf:",
         (HERE, "at_its_bound"),
     ),
     Mutant(
@@ -90,6 +91,55 @@ INTERVALS = (
         "np.sum(R[:, n:, n] ** 2)",
         "np.sum(R[..., n] ** 2)",
         (HERE, "where_the_gaussian_says"),
+    ),
+    Mutant(
+        "intervals: effects believed as large as the library's",
+        SCATTER,
+        "D = np.where(effects, share, 1.0)",
+        "D = np.where(effects, share > 0.0, 1.0)",
+        (LACKS, "average_over_shares"),
+    ),
+    Mutant(
+        "intervals: effects cost nothing",
+        SCATTER,
+        "logs.append(0.5 * float(onto @ onto) - log_det)",
+        "logs.append(0.5 * float(onto @ onto))",
+        (LACKS, "average_over_shares"),
+    ),
+    Mutant(
+        "intervals: an average without the spread of its parts",
+        SCATTER,
+        "np.concatenate([C.T, [m - mean]])",
+        "np.concatenate([C.T, [0.0 * mean]])",
+        (LACKS, "average_over_shares"),
+    ),
+    Mutant(
+        "intervals: scores of another place than the MAP",
+        SCATTER,
+        "pulls = pulls.at(-np.linalg.solve(R, down))",
+        "pulls = pulls.at(0.0 * down)",
+        (LACKS, "where_a_linear_machine"),
+    ),
+    Mutant(
+        "discrepancy: constants in disguise are effects",
+        LACKING,
+        "if left > DISGUISE * np.linalg.norm(A[:, j]):",
+        "if left >= 0.0:",
+        (LACKS, "friction_that"),
+    ),
+    Mutant(
+        "discrepancy: one linearisation tells all",
+        LACKING,
+        "if len(order) == p or np.max(moved) <= SETTLED:",
+        "if True:",
+        (LACKS, "friction_that"),
+    ),
+    Mutant(
+        "discrepancy: a belief's own prior is dropped",
+        LACKING,
+        "scale = prior.scale.at[np.ix_(own, own)].set(belief.prior.scale)",
+        "scale = prior.scale",
+        (LACKS, "keeps_its_constants"),
     ),
     Mutant(
         "longer: missing physics refuses nothing",

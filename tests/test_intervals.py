@@ -13,8 +13,10 @@ from beliefs import believe, named, study
 from linear_system import Linear as Machine
 from linear_system import linear
 from sim2gp.diagnose import intervals
+from sim2gp.diagnose.discrepancy import corrected_windows
 from sim2gp.diagnose.importance import DRAWS, check_windows
-from sim2gp.diagnose.intervals import Pulls, corrected
+from sim2gp.diagnose.intervals import corrected
+from sim2gp.diagnose.pulls import Pulls, cost_of_windows, pulls_of_windows
 from sim2gp.errors import NotFinite
 from sim2gp.gaussian import Gaussian
 from sim2gp.logs import Log
@@ -306,18 +308,17 @@ def test_a_linear_machines_centre_is_where_the_gaussian_says(
     """The misfit is the linear one, starts included, however far away."""
     windows, belief = fitted
     of = np.zeros(len(windows), int)
-    pulls = intervals.pulls_of_windows(belief, windows, of)
+    pulls = pulls_of_windows(belief, windows, of)
     at = np.asarray(belief.posterior.mean)
     dz = np.array([0.8, -1.1])
     told = dz @ pulls.scores.sum(axis=0)
     told += 0.5 * np.sum((pulls.factors @ dz) ** 2)
     with jax.enable_x64(True):
         there, here = (
-            intervals.cost_of_windows(belief, windows, jnp.asarray(x))
-            for x in (at + dz, at)
+            cost_of_windows(belief, windows, jnp.asarray(x)) for x in (at + dz, at)
         )
     assert there - here == pytest.approx(told, rel=1e-6)
-    ours = intervals.corrected_windows(belief, windows, of)
+    ours = corrected_windows(belief, windows, of)
     plain = corrected(belief.prior, belief.posterior, pulls)
     np.testing.assert_allclose(ours.posterior.mean, plain.posterior.mean, atol=1e-12)
 
@@ -332,12 +333,12 @@ def test_a_constant_at_its_bound_stays_where_the_data_are() -> None:
     windows, _ = cut([recorded(system, 301, [0.7, 0.0], drift)], system, window=0.8)
     belief = fit_windows(system, windows, key=jax.random.key(0))
     of = np.zeros(len(windows), int)
-    pulls = intervals.pulls_of_windows(belief, windows, of)
+    pulls = pulls_of_windows(belief, windows, of)
     naive = corrected(belief.prior, belief.posterior, pulls)
-    ours = intervals.corrected_windows(belief, windows, of)
+    ours = corrected_windows(belief, windows, of)
     with jax.enable_x64(True):
         best, bad, good = (
-            intervals.cost_of_windows(belief, windows, found.posterior.mean)
+            cost_of_windows(belief, windows, found.posterior.mean)
             for found in (belief, naive, ours)
         )
     assert bad - best > 50.0 * naive.inflation
@@ -351,7 +352,7 @@ def test_pulls_are_those_of_the_dense_marginal(
 ) -> None:
     """The start states integrated out: rows of covariance ``I + J_e J_e^T``."""
     windows, belief = fitted
-    pulls = intervals.pulls_of_windows(belief, windows, np.zeros(len(windows), int))
+    pulls = pulls_of_windows(belief, windows, np.zeros(len(windows), int))
     found = linearise(belief, windows, belief.posterior.mean)
     J = np.asarray(found.jacobian)[:, :, 0] / float(belief.noise[0])
     r = np.asarray(found.residual)[..., 0] / float(belief.noise[0])

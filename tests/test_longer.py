@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from linear_system import linear
-from sim2gp.diagnose.intervals import Corrected, corrected_windows
+from sim2gp.diagnose.discrepancy import corrected_windows
+from sim2gp.diagnose.intervals import Corrected
 from sim2gp.diagnose.residuals import misfit_of_windows
 from sim2gp.experiments.longer import TIMES, Longer, advice, lengthened
 from sim2gp.experiments.prediction import cut_logs

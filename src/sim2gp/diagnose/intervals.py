@@ -32,43 +32,43 @@ which is the posterior itself if G = F and the prior where F = 0; it is never na
 than the first and never wider than the second. All in square roots. (The sandwich:
 Huber 1967, White 1982; F G^-1 F: Godambe 1960; in a posterior: Ribatet, Cooley and
 Davison 2012, arXiv 0911.5357; (I - P)^-1/2: Bell and McCaffrey 2002.)
+
+A bias that is the same in all windows does not show in their scatter. So some entries
+of ``z`` may be magnitudes ``x`` of effects that the simulator may lack, and which are
+nothing to all who use it: a discrepancy (Kennedy and O'Hagan 2001) of physical shape.
+Their sd is ``tau`` times that of the library, one ``tau`` for all, which is zero with
+probability `NOTHING` and each of `SHARES` alike with the rest. In the data's form above
+each ``tau`` has a Gaussian posterior and an evidence,
+
+    log p(tau) = 1/2 |Q_1^T d|^2 - log |T|,    [F_c^1/2 D; I] = Q T,  D = diag(1, tau),
+
+and what is told of the constants is their mixture's mean and covariance: what the data
+leave open of the effects widens the intervals, what they say of them moves the centre.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from sim2gp.diagnose.misfit import must_be_finite
+from sim2gp.diagnose.pulls import Pulls
 from sim2gp.diagnose.words import digits
 from sim2gp.gaussian import Gaussian
 from sim2gp.least_squares import RANK_TOLERANCE
-from sim2gp.models.windows import Windows, WindowsBelief, linearise
 from sim2gp.types import in_float64
 
 #: Below so many degrees of freedom nothing is said about the windows' scatter.
 FEWEST = 4.0
 #: Of Bartlett's weights: ``1.5 W / b`` degrees of freedom (Priestley 1981).
 BARTLETT = 1.5
-TRUSTED = 1.0  # nats that a centre may cost beyond what the linear misfit says
-HALVINGS = 6
+#: Probability that the simulator lacks nothing, before the data; sd of the effects that
+#: it may lack otherwise, in those of the library.
+NOTHING, SHARES = 0.5, tuple(2.0**-k for k in range(6))
 LIKE_WHITE = 1.3  # times as wide: small samples alone make so much of white noise
-
-
-@dataclass(frozen=True)
-class Pulls:
-    """What each window says of ``z`` alone, whitened by prior and noise.
-
-    ``factors`` are square roots of ``F_w``, ``scores`` the gradients ``u_w`` of the
-    cost at the MAP, ``group`` numbers the recordings: windows of one follow each other.
-    """
-
-    factors: Float[np.ndarray, "W k p"]
-    scores: Float[np.ndarray, "W p"]
-    group: Int[np.ndarray, " W"]
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,8 @@ class Corrected:
     """The corrected posterior, or the plain one where windows are too few to tell.
 
     ``inflation`` is ``kappa^2``, the samples that count as one; ``lag`` the ``b``
-    successive windows taken together; ``freedom`` the degrees of freedom ``nu``.
+    successive windows taken together; ``freedom`` the degrees of freedom ``nu``;
+    ``missing`` the probability that the simulator lacks something, of ``effects``.
     """
 
     posterior: Gaussian
@@ -84,114 +85,36 @@ class Corrected:
     lag: int
     freedom: float
     enough: bool
+    missing: float = 0.0
+    effects: tuple[str, ...] = ()
 
 
 @in_float64
-def pulls_of_windows(
-    belief: WindowsBelief, cut: Windows, group: Int[np.ndarray, " W"]
-) -> Pulls:
-    """Of a fit and its windows, start states eliminated; ``group`` numbers their logs.
-
-    Raises `NotFinite` E203.
-    """
-    return _pulls(_rows(belief, cut, belief.posterior.mean), cut, group)
-
-
-@in_float64
-def cost_of_windows(belief: WindowsBelief, cut: Windows, tt: Array) -> float:
-    """Half the windows' squared misfit at ``tt``, each from the start that suits it.
-
-    Starts follow by one Gauss-Newton step from where the fit has put them. Infinite
-    where the simulation is not finite.
-    """
-    return _cost(_rows(belief, cut, tt), cut)
-
-
-def _pulls(
-    rows: Float[np.ndarray, "W k npr"], cut: Windows, group: Int[np.ndarray, " W"]
-) -> Pulls:
-    must_be_finite("derivatives or residuals", rows, "the intervals")
-    n = cut.start.shape[1]
-    R = np.asarray(np.linalg.qr(rows, mode="r"))[:, n:, n:]
-    scores = np.einsum("wkp,wk->wp", R[..., :-1], R[..., -1])
-    return Pulls(R[..., :-1], scores, np.asarray(group))
-
-
-def _cost(rows: Float[np.ndarray, "W k npr"], cut: Windows) -> float:
-    if not np.isfinite(rows).all():
-        return math.inf
-    n = cut.start.shape[1]
-    both = np.concatenate([rows[..., :n], rows[..., -1:]], axis=-1)
-    R = np.asarray(np.linalg.qr(both, mode="r"))
-    return 0.5 * float(np.sum(R[:, n:, n] ** 2))
-
-
-def _rows(
-    belief: WindowsBelief, cut: Windows, tt: Array
-) -> Float[np.ndarray, "W k npr"]:
-    """Of each window ``[J_e J_z r]``, whitened, the start's prior in its last rows."""
-    p, n = belief.prior.mean.size, cut.start.shape[1]
-    found = linearise(belief, cut, tt)
-    weight = np.sqrt(np.asarray(belief.weights))[:, None, None]
-    scale = weight / np.asarray(belief.noise)
-    r, J = np.asarray(found.residual) * scale, np.asarray(found.jacobian)
-    J = J * scale[..., None]
-    sd = np.asarray(cut.start_sd)
-    away = np.asarray(belief.starts) - np.asarray(cut.start)
-    e = np.divide(away, sd, out=np.zeros_like(away), where=sd > 0.0)
-    rows = np.concatenate([J[..., p:], J[..., :p], r[..., None]], axis=-1)
-    own = np.zeros((len(e), n, n + p + 1))
-    own[..., :n], own[..., -1] = np.eye(n), e
-    return np.concatenate([rows.reshape(len(e), -1, n + p + 1), own], axis=1)
-
-
-@in_float64
-def corrected_windows(
-    belief: WindowsBelief, cut: Windows, group: Int[np.ndarray, " W"]
+def corrected(
+    prior: Gaussian,
+    plain: Gaussian,
+    pulls: Pulls,
+    effects: Bool[np.ndarray, " p"] | None = None,
 ) -> Corrected:
-    """The corrected posterior of a fit, its centre checked with the simulator itself.
+    """The posterior as wide as the windows' pulls scatter, about the data's centre.
 
-    Near a bound the machine is not linear in ``z``, and a centre far from the MAP is
-    one that no data suggest. Halfway back, and again, until the misfit there grows by
-    no more than the linear one says, to `TRUSTED` nats of data that count as often as
-    they should.
-    """
-    rows = _rows(belief, cut, belief.posterior.mean)
-    pulls = _pulls(rows, cut, group)
-    found = corrected(belief.prior, belief.posterior, pulls)
-    start = np.asarray(belief.posterior.mean)
-    step = np.asarray(found.posterior.mean) - start
-    if not found.enough or not np.any(step):
-        return found
-    dz = np.linalg.solve(np.asarray(belief.prior.scale), step)
-    score = pulls.scores.sum(axis=0)
-    F = np.einsum("wkp,wkq->pq", pulls.factors, pulls.factors)
-    before = _cost(rows, cut)
-    for share in 0.5 ** np.arange(HALVINGS):
-        there = cost_of_windows(belief, cut, jnp.asarray(start + share * step))
-        told = share * dz @ (score + 0.5 * share * F @ dz)
-        if there - before - told <= TRUSTED * max(found.inflation, 1.0):
-            break
-    else:
-        share = 0.0
-    centre = Gaussian(jnp.asarray(start + share * step), found.posterior.scale)
-    return replace(found, posterior=centre)
-
-
-@in_float64
-def corrected(prior: Gaussian, plain: Gaussian, pulls: Pulls) -> Corrected:
-    """The posterior as wide as the windows' pulls scatter; ``plain`` has the MAP.
-
-    Raises `NotFinite` E203 for a pull that is not a number.
+    ``plain`` has the point where the pulls were linearised, and is what is told of too
+    few windows; ``effects`` marks what the simulator may lack, believed with the
+    library's own sd. Raises `NotFinite` E203 for a pull that is not a number.
     """
     for what in (pulls.factors, pulls.scores):
         must_be_finite("pulls of windows", what, "the intervals")
-    p = len(np.asarray(prior.mean))
+    L0, mu0 = np.asarray(prior.scale), np.asarray(prior.mean)
+    z, p = np.linalg.solve(L0, np.asarray(plain.mean) - mu0), len(mu0)
     A = np.concatenate(list(pulls.factors))
+    R = np.asarray(np.linalg.qr(np.concatenate([A, np.eye(p)]), mode="r"))
+    # From here to the MAP of what is linear: nothing where this is the MAP.
+    down = np.linalg.solve(R.T, z + pulls.scores.sum(axis=0))
+    pulls = pulls.at(-np.linalg.solve(R, down))
+    z = z - np.linalg.solve(R, down)
     _, s, Vt = np.linalg.svd(A, full_matrices=False)
     seen = ~(s <= RANK_TOLERANCE * s.max(initial=0.0))
     s, Vt = s[seen], Vt[seen]
-    R = np.asarray(np.linalg.qr(np.concatenate([A, np.eye(p)]), mode="r"))
     v, P = _whitened(pulls, R)
     onto = (Vt @ R.T) / s[:, None]  # from v to the coordinates in which F = I
     W = _effective(P)
@@ -202,40 +125,94 @@ def corrected(prior: Gaussian, plain: Gaussian, pulls: Pulls) -> Corrected:
     root, kappa2 = _shrunk(_scatter(v, P, pulls.group, b) @ onto.T, nu)
     _, size, U = np.linalg.svd(root, full_matrices=False)
     spread = np.maximum(size, 1.0) * math.sqrt(nu / (nu - 2.0))
-    L0, mu0 = np.asarray(prior.scale), np.asarray(prior.mean)
-    z = np.linalg.solve(L0, np.asarray(plain.mean) - mu0)
     # F z_data = (F + I) z at the MAP, where the scores add up to -z.
     data = s * (Vt @ z) - (Vt @ pulls.scores.sum(axis=0)) / s
     weight = U / spread[:, None]
-    rows = np.concatenate([weight @ (s[:, None] * Vt), np.eye(p)])
-    Q, T = np.linalg.qr(rows)
-    centre = np.linalg.solve(T, Q[: len(s)].T @ (weight @ data))
-    scale = np.linalg.solve(T.T, L0.T).T
-    found = Gaussian(jnp.asarray(mu0 + L0 @ centre), jnp.asarray(scale))
-    return Corrected(found, kappa2, b, nu, True)
+    free = np.zeros(p, bool) if effects is None else np.asarray(effects)
+    centre, scale, missing = _averaged(weight @ (s[:, None] * Vt), weight @ data, free)
+    found = Gaussian(jnp.asarray(mu0 + L0 @ centre), jnp.asarray(L0 @ scale))
+    return Corrected(found, kappa2, b, nu, True, missing)
+
+
+def _averaged(
+    root: Float[np.ndarray, "q p"],
+    data: Float[np.ndarray, " q"],
+    effects: Bool[np.ndarray, " p"],
+) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p p"], float]:
+    """Mean and scale of ``z`` given ``|root z - data|^2 / 2``, and P(something).
+
+    Prior N(0, 1), of the effects N(0, tau^2).
+    """
+    p, q = len(effects), len(data)
+    shares = (0.0, *SHARES) if effects.any() else (0.0,)
+    logs, means, scales = [], [], []
+    for share in shares:
+        D = np.where(effects, share, 1.0)
+        Q, T = np.linalg.qr(np.concatenate([root * D, np.eye(p)]))
+        onto = Q[:q].T @ data
+        means.append(D * np.linalg.solve(T, onto))
+        scales.append(np.linalg.solve(T.T, np.diag(D)).T)
+        log_det = float(np.sum(np.log(np.abs(np.diag(T)))))
+        logs.append(0.5 * float(onto @ onto) - log_det)
+    if len(shares) == 1:
+        return means[0], scales[0], 0.0
+    prior = [NOTHING, *([(1.0 - NOTHING) / len(SHARES)] * len(SHARES))]
+    weights = np.asarray(prior) * np.exp(np.asarray(logs) - max(logs))
+    weights = weights / weights.sum()
+    mean = weights @ np.asarray(means)
+    rows = [
+        math.sqrt(w) * np.concatenate([C.T, [m - mean]])
+        for w, m, C in zip(weights, means, scales, strict=True)
+    ]
+    scale = np.asarray(np.linalg.qr(np.concatenate(rows), mode="r")).T
+    return mean, scale, 1.0 - float(weights[0])
 
 
 def words(found: Corrected, widened: Sequence[float], windows: int) -> str:
-    """Which intervals are told and why, in a sentence or two."""
+    """Which intervals are told and why, in some sentences."""
     if not found.enough:
         return (
             f"Intervals count every sample as new: {windows} windows are too few to "
             "tell whether errors are coloured, and of a real machine they are."
         )
-    scatter = digits(math.sqrt(found.inflation), 2)
-    if max(widened, default=1.0) < LIKE_WHITE:
+    scatter, most = math.sqrt(found.inflation), max(widened, default=1.0)
+    lacks = found.missing > NOTHING
+    if most < LIKE_WHITE and not lacks:
         return (
-            f"The errors of {windows} windows pull the constants {scatter} times as "
-            "far as white noise would: intervals are those of independent samples, "
-            f"times {digits(max(widened, default=1.0), 3)} at most."
+            f"The errors of {windows} windows pull the constants {digits(scatter, 2)} "
+            "times as far as white noise would: intervals are those of independent "
+            f"samples, times {digits(most, 3)} at most. {_allowed(found)}"
         )
-    few, most = (digits(x, 2) for x in (min(widened), max(widened)))
-    times = few if few == most else f"{few} to {most}"
+    ends = [digits(x, 2) for x in (min(widened), most)]
+    times = ends[0] if ends[0] == ends[1] else " to ".join(ends)
+    text = f"Intervals are {times} times as wide as if every sample were new"
+    if not lacks or scatter > LIKE_WHITE:
+        text += (
+            f": the errors of {windows} windows are coloured and pull the constants "
+            f"{digits(scatter, 2)} times as far as white noise would"
+        )
+    return f"{text}. {_allowed(found)}"
+
+
+def _allowed(found: Corrected) -> str:
+    """Whether physics that is missing is in the intervals."""
+    if not found.effects:
+        return (
+            "This covers errors that come and go, not physics that the model lacks "
+            "(sim2gp explain)."
+        )
+    percent = f"{100.0 * found.missing:.0f} %"
+    if found.missing > NOTHING:
+        return (
+            f"The model lacks physics, to {percent}: intervals allow for "
+            f"{len(found.effects)} effects of its library (friction, springs, drag and "
+            "the like), and constants lie where they would with them. sim2gp explain "
+            "tries the effects one by one."
+        )
     return (
-        f"Intervals are {times} times as wide as if every sample were new: the errors "
-        f"of {windows} windows are coloured and pull the constants {scatter} times as "
-        "far as white noise would. This covers errors that come and go, not physics "
-        "that the model lacks (sim2gp explain)."
+        f"That the model lacks one of {len(found.effects)} effects of its library is "
+        f"improbable ({percent}) and allowed for; of other physics intervals know "
+        "nothing."
     )
 
 

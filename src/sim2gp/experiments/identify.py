@@ -16,8 +16,9 @@ import numpy as np
 
 from sim2gp import diagnose
 from sim2gp.diagnose import intervals
+from sim2gp.diagnose.discrepancy import compile_corrected, corrected_windows
 from sim2gp.diagnose.importance import check_windows
-from sim2gp.diagnose.intervals import Corrected, corrected_windows
+from sim2gp.diagnose.intervals import Corrected
 from sim2gp.diagnose.nuts import sample_windows, sampler
 from sim2gp.diagnose.residuals import misfit_of_windows
 from sim2gp.experiments.configurations import told
@@ -44,7 +45,6 @@ from sim2gp.models.grid import CURVE, Grid, evaluation_windows
 from sim2gp.models.windows import (
     Windows,
     WindowsBelief,
-    compile_linearise,
     fit_windows,
     information_at,
 )
@@ -83,7 +83,7 @@ def run(
         key, robust = jax.random.key(seed), project.spec.likelihood.robust
         grid = evaluation_windows(logs, project.system, longest=CURVE[-1])
         compile_forecast(project.system, grid)
-        compile_linearise(project.system, windows)
+        compile_corrected(project.system, windows)
         fitted = belief = fit_windows(project.system, windows, key=key, robust=robust)
         task.advance("posterior")
         band, picture = _own_forecasts(belief, grid, logs)
@@ -261,6 +261,8 @@ def _about(
         "pulls_times_white": math.sqrt(honest.inflation) if honest.enough else None,
         "windows_at_once": honest.lag,
         "freedom": honest.freedom,
+        "missing": honest.missing if honest.effects else None,
+        "allowed_for": list(honest.effects),
     }
 
 

@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sim2gp.diagnose.intervals import Corrected, corrected_windows
+from sim2gp.diagnose.discrepancy import corrected_windows
+from sim2gp.diagnose.intervals import Corrected
 from sim2gp.diagnose.residuals import misfit_of_windows
 from sim2gp.diagnose.words import digits
 from sim2gp.errors import DeadParameters, InputError, NotConverged, NotFinite

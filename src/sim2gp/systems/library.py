@@ -8,7 +8,7 @@ position and speed, a dead zone by the input's range.
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from sim2gp.errors import InputError
@@ -131,21 +131,43 @@ def library(system: AbstractSystem, *, windows: bool = False) -> tuple[Candidate
     Over ``windows`` a lag is left to its equivalent, a delay. Raises `InputError` E145
     for a machine that no effects are registered for.
     """
-    bare: Any = system
-    while isinstance(bare, Actuated | Perturbed | Configured):
-        bare = bare.system
-    if isinstance(bare, Furuta):
-        found = _furuta()
-    elif isinstance(bare, CartPole):
-        found = _cartpole()
-    elif isinstance(bare, TwoLink | UniformRodArm):
-        found = _arm(bare)
-    else:
+    bare = _bare(system)
+    found = _physics(bare)
+    if found is None:
         known = "Furuta, CartPole, TwoLink, UniformRodArm"
         got = type(bare).__name__
         raise InputError("E145", "no library of effects", got=got, expected=known)
     for channel in bare.actions:
         found += _inputs(channel.name, channel.high, lag=not windows)
+    return _new(found, system)
+
+
+def smooth_effects(system: AbstractSystem) -> tuple[AbstractEffect, ...]:
+    """What a machine may lack and whose slope at nothing says what it does.
+
+    Each with its prior sd; none for a machine without a library.
+    """
+    found = _new(_physics(_bare(system)) or (), system)
+    effects = [candidate.effect for candidate in found if candidate.smooth]
+    return tuple(e for e in effects if isinstance(e, AbstractEffect))
+
+
+def _bare(system: Any) -> Any:
+    while isinstance(system, Actuated | Perturbed | Configured):
+        system = system.system
+    return system
+
+
+def _physics(bare: Any) -> list[Candidate] | None:
+    if isinstance(bare, Furuta):
+        return _furuta()
+    if isinstance(bare, CartPole):
+        return _cartpole()
+    return _arm(bare) if isinstance(bare, TwoLink | UniformRodArm) else None
+
+
+def _new(found: Sequence[Candidate], system: AbstractSystem) -> tuple[Candidate, ...]:
+    """Those that the table does not have already."""
     table = system.parameters
     there = {*table.names, *(name for name, value in table.fixed if value != 0.0)}
     there |= {e.name for e in _held(system)}
