@@ -9,9 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sim2gp.experiments.explain_study import Cogging
 from sim2gp.logs import Log
 from sim2gp.systems import Perturbed, UniformRodArm
-from sim2gp.systems.effects import Coulomb
+from sim2gp.systems.effects import AbstractEffect, Coulomb
 
 PERIOD, SECONDS = 0.01, 10.0
 SUBSTEPS = 10  # of RK4 in a period: dry friction is stiff
@@ -19,6 +20,7 @@ NOISE = 2e-3  # rad, of both encoders, whatever its colour
 TORQUE = np.array([0.25, 0.10])  # N m, root mean square
 FREQUENCIES = np.arange(0.2, 2.2, 0.2)  # Hz
 LENGTHS, WIDTH = (0.5, 0.4), 0.05
+TURNS = 6.0  # of cogging, in one of the joint
 NAMES = ("m1", "b1", "m2", "b2")
 
 
@@ -28,6 +30,8 @@ class Condition(NamedTuple):
     title: str
     rho: float = 0.0  # of first-order autoregressive noise, from sample to sample
     friction: float = 0.0  # N m of dry friction in both joints
+    width: float = WIDTH  # rad/s, of its tanh; the library's effect has that of WIDTH
+    cogging: float = 0.0  # N m in both joints: no library has it
 
 
 CONDITIONS = {
@@ -36,6 +40,10 @@ CONDITIONS = {
     "ar95": Condition("AR(1) noise, .95", rho=0.95),
     "friction5": Condition("dry friction, 5 mN m", friction=0.005),
     "friction20": Condition("dry friction, 20 mN m", friction=0.02),
+    "sharp20": Condition(
+        "dry friction, 20 mN m, five times as sharp", friction=0.02, width=WIDTH / 5.0
+    ),
+    "cogging10": Condition("cogging, 10 mN m", cogging=0.01),
 }
 
 
@@ -77,7 +85,7 @@ def recordings(condition: Condition, sets: int, chunk: int) -> Recordings:
     turns = 2.0 * np.pi * np.multiply.outer(FREQUENCIES, time)
     torque = np.sin(turns[:, :, None, None] + phase[:, None]).sum(axis=0)
     torque *= TORQUE / np.sqrt(np.mean(torque**2, axis=0))
-    states = flown(values, torque, condition.friction)
+    states = flown(values, torque, condition)
     white = rng.standard_normal((len(time), sets, 2))
     noise = coloured(white, condition.rho)
     return Recordings(truth, torque, states[..., :2] + NOISE * noise)
@@ -91,40 +99,48 @@ def coloured(white: np.ndarray, rho: float) -> np.ndarray:
     return out
 
 
-def flown(values: np.ndarray, torque: np.ndarray, friction: float) -> np.ndarray:
+def flown(values: np.ndarray, torque: np.ndarray, condition: Condition) -> np.ndarray:
     """States (T, S, 4) from rest under held torques, by RK4."""
     x, h, out = np.zeros((len(values), 4)), PERIOD / SUBSTEPS, []
     for u in torque:
         out.append(x)
         for _ in range(SUBSTEPS):
-            k1 = _rate(values, friction, x, u)
-            k2 = _rate(values, friction, x + 0.5 * h * k1, u)
-            k3 = _rate(values, friction, x + 0.5 * h * k2, u)
-            k4 = _rate(values, friction, x + h * k3, u)
+            k1 = _rate(values, condition, x, u)
+            k2 = _rate(values, condition, x + 0.5 * h * k1, u)
+            k3 = _rate(values, condition, x + 0.5 * h * k2, u)
+            k4 = _rate(values, condition, x + h * k3, u)
             x = x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
     return np.stack(out)
 
 
 def _rate(
-    values: np.ndarray, friction: float, x: np.ndarray, u: np.ndarray
+    values: np.ndarray, condition: Condition, x: np.ndarray, u: np.ndarray
 ) -> np.ndarray:
     (m1, b1, m2, b2), (l1, l2) = values.T, LENGTHS
-    _, q2, v1, v2 = x.T
+    q1, q2, v1, v2 = x.T
     c, s = 0.5 * m2 * l1 * l2 * np.cos(q2), 0.5 * m2 * l1 * l2 * np.sin(q2)
     M22 = m2 * l2**2 / 3.0
     M12 = M22 + c
     M11 = m1 * l1**2 / 3.0 + m2 * l1**2 + M22 + 2.0 * c
     f1 = u[:, 0] - b1 * v1 + s * (2.0 * v1 * v2 + v2**2)
     f2 = u[:, 1] - b2 * v2 - s * v1**2
-    f1 = f1 - friction * np.tanh(v1 / WIDTH)
-    f2 = f2 - friction * np.tanh(v2 / WIDTH)
+    f1 = f1 - condition.friction * np.tanh(v1 / condition.width)
+    f2 = f2 - condition.friction * np.tanh(v2 / condition.width)
+    f1 = f1 - condition.cogging * np.sin(TURNS * q1)
+    f2 = f2 - condition.cogging * np.sin(TURNS * q2)
     det = M11 * M22 - M12**2
     return np.stack(
         [v1, v2, (M22 * f1 - M12 * f2) / det, (M11 * f2 - M12 * f1) / det]
     ).T
 
 
-def with_friction() -> Perturbed:
-    """The simulator of an oracle who knows that there is dry friction, not how much."""
-    effects = Coulomb("q1", 0.05), Coulomb("q2", 0.05)
+def with_what_is_missing(condition: Condition) -> Perturbed:
+    """The simulator of an oracle who knows what is missing, not how much of it."""
+    joints = "q1", "q2"
+    effects: list[AbstractEffect] = [
+        Cogging(q, 0.05, TURNS)
+        if condition.cogging
+        else Coulomb(q, 0.05, condition.width)
+        for q in joints
+    ]
     return Perturbed(UniformRodArm(), effects, free=True)

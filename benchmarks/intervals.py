@@ -1,4 +1,4 @@
-"""Do 95 % intervals hold? Coverage under coloured noise and under missing friction.
+"""Do 95 % intervals hold? Coverage under coloured noise and under missing physics.
 
     python benchmarks/intervals.py [--sets N] [--workers N] [--also NAME...] [--out DIR]
 
@@ -31,7 +31,7 @@ from interval_arms import (
     NOISE,
     Recordings,
     recordings,
-    with_friction,
+    with_what_is_missing,
 )
 from interval_sysid import intervals
 from scipy.stats import beta, norm
@@ -117,8 +117,8 @@ def work(job: Job) -> dict[str, Any]:
             "mixture": candidates.mixture(x),
             "five_parts": candidates.five_parts(x),
         }
-        if condition.friction:
-            knows = with_friction()
+        if condition.friction or condition.cogging:
+            knows = with_what_is_missing(condition)
             again, _ = cut([data.log(s)], knows, window=WINDOW)
             best = fit_windows(knows, again, key=key).posterior
             each["oracle"] = tuple(
@@ -252,9 +252,10 @@ def lines(summary: dict[str, Any]) -> list[str]:
 
 
 def _goal(condition: str, mine: dict[str, Any]) -> str:
-    """Masses only where friction is missing: a damping must make up for it."""
+    """Masses only where physics is missing: a damping must make up for friction."""
     low, high = ASKED.get(condition, ASKED_ELSE)
-    asked = [c for c in NAMES if c[0] == "m" or not condition.startswith("friction")]
+    lacking = CONDITIONS[condition].friction or CONDITIONS[condition].cogging
+    asked = [c for c in NAMES if c[0] == "m" or not lacking]
     inside = all(low <= mine[c]["coverage"] <= high for c in asked)
     worst = max(mine[c]["score"] for c in asked)
     return (

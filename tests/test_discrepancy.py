@@ -16,6 +16,7 @@ from sim2gp.diagnose import intervals
 from sim2gp.diagnose.discrepancy import _with, corrected_windows
 from sim2gp.diagnose.intervals import NOTHING, SHARES, Corrected, corrected
 from sim2gp.diagnose.pulls import Pulls
+from sim2gp.experiments.told_intervals import lacking_table, told_intervals
 from sim2gp.gaussian import Gaussian
 from sim2gp.models.cutting import cut
 from sim2gp.models.windows import Windows, WindowsBelief, fit_windows
@@ -178,6 +179,15 @@ def test_friction_that_the_simulator_lacks_is_in_the_intervals(
     assert not any("back_emf" in name for name in found.effects)  # a damping, again
     assert found.posterior.scale.shape == (4, 4)
     assert away(truth, found.posterior).max() < 2.0
+    about = told_intervals(belief.system, found, {}, len(windows))
+    for q in "q1", "q2":
+        friction = about["allowed_for"][f"{q}.coulomb"]
+        assert abs(friction["mean"] - 0.02) < 3.0 * friction["sd"]
+        assert friction["unit"] == "N m"
+    assert about["missing"] == found.missing
+    (table,) = lacking_table(about)
+    assert [row[0] for row in table["rows"][:1]] in (["q1.coulomb"], ["q2.coulomb"])
+    assert len(table["rows"]) == len(found.effects)
     # Where a fit without effects stands is of no account.
     with jax.enable_x64(True):
         at = belief.posterior.mean + jnp.asarray([0.2, -0.3, 0.2, 0.5])
@@ -194,6 +204,9 @@ def test_a_sound_simulator_is_believed(arms: ModuleType) -> None:
     found = corrected_windows(belief, windows, one)
     alone = corrected_windows(belief, windows, one, ())
     assert found.missing < 0.3
+    assert lacking_table(told_intervals(belief.system, found, {}, 50)) == []
+    assert told_intervals(belief.system, alone, {}, 50)["missing"] is None
+    assert told_intervals(belief.system, alone, {}, 50)["allowed_for"] == {}
     assert np.max(Plain(found.posterior).sd / Plain(alone.posterior).sd) < 1.3
     assert away(truth, found.posterior).max() < 3.0
 

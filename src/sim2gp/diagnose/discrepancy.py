@@ -78,11 +78,17 @@ def corrected_windows(
         if len(order) == p or np.max(moved) <= SETTLED:
             break
         pulls = pulls_of_rows(rows, cut, group)
-    own_part = Gaussian(found.posterior.mean[:p], found.posterior.scale[:p])
-    scale = own_part.scale if len(order) == p else own_part.triangular()
-    names = np.asarray(whole.system.parameters.names)[order[p:]]
-    centre = Gaussian(jnp.asarray(at[own]), scale)
-    return replace(found, posterior=centre, effects=tuple(names.tolist()))
+    both = Gaussian(jnp.asarray(at[order]), found.posterior.scale)
+    if len(order) == p:
+        return replace(found, posterior=both)
+    mine = Gaussian(both.mean[:p], both.scale[:p]).triangular()
+    names = whole.system.parameters.names
+    return replace(
+        found,
+        posterior=Gaussian(both.mean[:p], mine),
+        effects=tuple(names[j] for j in order[p:]),
+        lacking=Gaussian(both.mean[p:], both.scale[p:]),
+    )
 
 
 def _with(

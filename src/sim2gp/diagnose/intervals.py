@@ -77,7 +77,8 @@ class Corrected:
 
     ``inflation`` is ``kappa^2``, the samples that count as one; ``lag`` the ``b``
     successive windows taken together; ``freedom`` the degrees of freedom ``nu``;
-    ``missing`` the probability that the simulator lacks something, of ``effects``.
+    ``missing`` the probability that the simulator lacks something, ``lacking`` the
+    magnitudes of those of its ``effects``.
     """
 
     posterior: Gaussian
@@ -87,6 +88,7 @@ class Corrected:
     enough: bool
     missing: float = 0.0
     effects: tuple[str, ...] = ()
+    lacking: Gaussian | None = None
 
 
 @in_float64
@@ -183,7 +185,7 @@ def words(found: Corrected, widened: Sequence[float], windows: int) -> str:
             "times as far as white noise would: intervals are those of independent "
             f"samples, times {digits(most, 3)} at most. {_allowed(found)}"
         )
-    ends = [digits(x, 2) for x in (min(widened), most)]
+    ends = [digits(x, 2) for x in (min(widened, default=1.0), most)]
     times = ends[0] if ends[0] == ends[1] else " to ".join(ends)
     text = f"Intervals are {times} times as wide as if every sample were new"
     if not lacks or scatter > LIKE_WHITE:

@@ -4,7 +4,6 @@ The run keeps what a later command needs to predict with it: the project file, t
 posterior over virtual values, and what the band of its forecasts is made of.
 """
 
-import math
 import os
 import time
 from collections.abc import Sequence
@@ -15,7 +14,6 @@ import jax
 import numpy as np
 
 from sim2gp import diagnose
-from sim2gp.diagnose import intervals
 from sim2gp.diagnose.discrepancy import compile_corrected, corrected_windows
 from sim2gp.diagnose.importance import check_windows
 from sim2gp.diagnose.intervals import Corrected
@@ -37,6 +35,7 @@ from sim2gp.experiments.prediction import (
     units,
 )
 from sim2gp.experiments.record import command, provenance
+from sim2gp.experiments.told_intervals import lacking_table, told_intervals
 from sim2gp.experiments.unseen import Unseen, unseen
 from sim2gp.gaussian import Gaussian
 from sim2gp.logs import Log
@@ -219,6 +218,9 @@ def _summarise(
     noise = dict(zip(names, np.asarray(belief.noise).tolist(), strict=True))
     rows = sum(len(log) for log in logs)
     actions = [channel.name for channel in system.actions]
+    about = told_intervals(system, honest, found["parameters"], len(windows))
+    listed = told(system.parameters, logs, found["parameters"])
+    listed["tables"] = [*lacking_table(about), *listed.get("tables", ())]
     return {
         "command": "identify",
         "title": f"{project.name}: what {_count(logs)}",
@@ -226,7 +228,7 @@ def _summarise(
         "seed": seed,
         "converged": True,
         "noise": noise,
-        "intervals": _about(honest, found["parameters"], len(windows)),
+        "intervals": about,
         "misfit": {
             **misfit_of_windows(belief, windows).as_dict(),
             "noise": _noise_words(names, noise, windows, units(system)),
@@ -245,24 +247,8 @@ def _summarise(
         "warnings": [str(note) for log in logs for note in log.notes],
         "trace_note": "Forecasts of half a second from causal starts, of the logs that "
         "were fitted; they know the recorded inputs and nothing else of the future.",
-        **told(system.parameters, logs, found["parameters"]),
+        **listed,
         **found,
-    }
-
-
-def _about(
-    honest: Corrected, parameters: dict[str, dict[str, Any]], windows: int
-) -> dict[str, Any]:
-    """Which intervals the parameters have, and what they rest on."""
-    widened = [entry["widened"] or 1.0 for entry in parameters.values()]
-    return {
-        "which": "corrected" if honest.enough else "plain",
-        "text": intervals.words(honest, widened, windows),
-        "pulls_times_white": math.sqrt(honest.inflation) if honest.enough else None,
-        "windows_at_once": honest.lag,
-        "freedom": honest.freedom,
-        "missing": honest.missing if honest.effects else None,
-        "allowed_for": list(honest.effects),
     }
 
 
