@@ -212,9 +212,9 @@ def _allowed(found: Corrected) -> str:
             "tries the effects one by one."
         )
     return (
-        f"That the model lacks one of {len(found.effects)} effects of its library is "
-        f"improbable ({percent}) and allowed for; of other physics intervals know "
-        "nothing."
+        f"That the model lacks some of {len(found.effects)} effects of its library has "
+        f"a probability of {percent} and is allowed for; of other physics intervals "
+        "know nothing."
     )
 
 

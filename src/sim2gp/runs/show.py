@@ -14,6 +14,7 @@ LONGEST = 12  # numbers of a list that are still printed
 _HIDDEN = (
     *("warnings", "versions", "animation", "figure1", "units", "tables", "command"),
     *("configurations", "candidates", "misfit_as_it_is", "diff"),
+    "intervals.allowed_for",
 )
 _HIDDEN_COLUMNS = {
     "parameters": ("meaning", "note", "partners", "low", "high"),
@@ -57,7 +58,7 @@ def print_summary(summary: Mapping[str, Any], title: str) -> None:
 
 def _singles(summary: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
     for key, value in summary.items():
-        if prefix == "" and key in _HIDDEN:
+        if prefix + key in _HIDDEN:
             continue
         if _is_short(value):
             yield prefix + key, _text(value)
@@ -69,7 +70,7 @@ def _groups(
     summary: Mapping[str, Any], prefix: str = ""
 ) -> Iterator[tuple[str, dict[str, Mapping[str, Any]]]]:
     for key, value in summary.items():
-        if prefix == "" and key in _HIDDEN:
+        if prefix + key in _HIDDEN:
             continue
         if isinstance(value, Mapping) and _is_group(value):
             yield prefix + key, dict(value)
