@@ -242,7 +242,7 @@ def test_the_words_say_whether_physics_is_missing() -> None:
     text = intervals.words(found, [1.0, 4.0], 40)
     assert text.startswith("Intervals are 1 to 4 times as wide as if every sample were")
     assert "coloured" not in text
-    assert "The model lacks physics, to 97 %: intervals allow for 2 effects" in text
+    assert "lacks physics with a probability of 97 %: intervals allow for 2" in text
     assert "sim2gp explain" in text
     sound = Corrected(posterior, 9.0, 1, 30.0, True, 0.04, ("q1.coulomb",))
     text = intervals.words(sound, [3.0], 40)

@@ -4,7 +4,8 @@ Every effect of the machine's library that is no constant in disguise becomes on
 unknown beside the machine's own, at nothing where the fit stands. The windows are
 linearised there, `sim2gp.diagnose.intervals` says where all of them lie, and they are
 linearised there again, until the centre stays: physics that is missing may have taken
-the fit far from it.
+the fit far from it. The noise stays the fit's, which has the misfit in it: that makes
+intervals rather too wide than too narrow.
 """
 
 from collections.abc import Sequence

@@ -205,11 +205,12 @@ def _allowed(found: Corrected) -> str:
         )
     percent = f"{100.0 * found.missing:.0f} %"
     if found.missing > NOTHING:
+        sure = "more than 99 %" if found.missing >= 0.995 else percent
         return (
-            f"The model lacks physics, to {percent}: intervals allow for "
-            f"{len(found.effects)} effects of its library (friction, springs, drag and "
-            "the like), and constants lie where they would with them. sim2gp explain "
-            "tries the effects one by one."
+            f"The model lacks physics with a probability of {sure}: intervals allow "
+            f"for {len(found.effects)} effects of its library (friction, springs, drag "
+            "and the like), and constants lie where they would with them. sim2gp "
+            "explain tries the effects one by one."
         )
     return (
         f"That the model lacks some of {len(found.effects)} effects of its library has "
