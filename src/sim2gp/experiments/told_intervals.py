@@ -8,7 +8,7 @@ import numpy as np
 
 from sim2gp.diagnose import intervals
 from sim2gp.diagnose.intervals import NOTHING, Corrected
-from sim2gp.diagnose.words import digits, quantity
+from sim2gp.diagnose.words import digits
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.library import smooth_effects, with_effects
 from sim2gp.types import in_float64
@@ -63,7 +63,8 @@ def lacking_table(told: Mapping[str, Any]) -> list[dict[str, Any]]:
         [
             name,
             entry["meaning"],
-            f"{quantity(entry['mean'], entry['unit'])} +- {digits(entry['sd'], 2)}",
+            f"{digits(entry['mean'], 2)} +- {digits(entry['sd'], 2)}",
+            entry["unit"],
         ]
         for name, entry in found
     ]
@@ -75,7 +76,7 @@ def lacking_table(told: Mapping[str, Any]) -> list[dict[str, Any]]:
     return [
         {
             "title": "What the simulator may lack",
-            "columns": ["effect", "meaning", "size"],
+            "columns": ["effect", "meaning", "size", "unit"],
             "rows": rows,
             "note": note,
         }
