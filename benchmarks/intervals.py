@@ -37,7 +37,7 @@ from interval_sysid import intervals
 from scipy.stats import beta, norm
 
 from sim2gp.diagnose.discrepancy import corrected_windows
-from sim2gp.diagnose.intervals import Corrected
+from sim2gp.diagnose.intervals import NOTHING, Corrected
 from sim2gp.diagnose.pulls import pulls_of_windows
 from sim2gp.diagnose.residuals import misfit_of_windows
 from sim2gp.models.cutting import cut
@@ -173,7 +173,7 @@ def figures(joined: dict[str, list[Any]]) -> dict[str, Any]:
     than the short windows' intervals say, at 5 % for all constants together.
     """
     found = {name: np.asarray(v) for name, v in joined.items()}
-    missing = {"missing": float(np.mean(found.pop(MISSING) > 0.5))}
+    missing = {"missing": float(np.mean(found.pop(MISSING) > NOTHING))}
     speak = {w: found.pop(key) for w, key in SPEAK.items() if key in found}
     if "longer" not in found:
         return {"methods": table(found), **missing}

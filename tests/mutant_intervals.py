@@ -116,15 +116,15 @@ INTERVALS = (
     Mutant(
         "intervals: scores of another place than the MAP",
         SCATTER,
-        "pulls = pulls.at(-np.linalg.solve(R, down))",
-        "pulls = pulls.at(0.0 * down)",
+        "z, pulls = z + step, pulls.at(step)",
+        "z = z + step",
         (LACKS, "where_a_linear_machine"),
     ),
     Mutant(
         "discrepancy: constants in disguise are effects",
         LACKING,
-        "if left > DISGUISE * np.linalg.norm(A[:, j]):",
-        "if left >= 0.0:",
+        "if sine_to(A[:, own], A[:, j])[0] > DISGUISE]",
+        "if j >= 0]",
         (LACKS, "friction_that"),
     ),
     Mutant(

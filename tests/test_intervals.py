@@ -16,7 +16,7 @@ from sim2gp.diagnose import intervals
 from sim2gp.diagnose.discrepancy import corrected_windows
 from sim2gp.diagnose.importance import DRAWS, check_windows
 from sim2gp.diagnose.intervals import corrected
-from sim2gp.diagnose.pulls import Pulls, cost_of_windows, pulls_of_windows
+from sim2gp.diagnose.pulls import Pulls, cost_of_rows, pulls_of_windows, rows_of
 from sim2gp.errors import NotFinite
 from sim2gp.gaussian import Gaussian
 from sim2gp.logs import Log
@@ -291,6 +291,10 @@ def recorded(system: Machine, rows: int, rate: list[float], error: np.ndarray) -
         inputs={"a0": a[:, 0], "a1": a[:, 1]},
         mask={"x0": np.ones(rows, bool)},
     )
+
+
+def cost_of_windows(belief: WindowsBelief, windows: Windows, tt: jax.Array) -> float:
+    return cost_of_rows(rows_of(belief, windows, tt), windows)
 
 
 @pytest.fixture(scope="module")

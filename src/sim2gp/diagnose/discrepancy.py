@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 
 from sim2gp.diagnose.intervals import Corrected, corrected
 from sim2gp.diagnose.pulls import Pulls, cost_of_rows, pulls_of_rows, rows_of
+from sim2gp.diagnose.score import sine_to
 from sim2gp.gaussian import Gaussian
 from sim2gp.models.windows import Windows, WindowsBelief, compile_linearise
 from sim2gp.systems.base import AbstractSystem
@@ -42,7 +43,7 @@ def compile_corrected(system: AbstractSystem, cut: Windows) -> None:
     compile_linearise(system, cut)
     effects = smooth_effects(system)
     if effects:
-        compile_linearise(with_effects(system, list(effects)), cut)
+        compile_linearise(with_effects(system, effects), cut)
 
 
 @in_float64
@@ -98,7 +99,7 @@ def _with(
     """The belief of the machine with effects, all at nothing; its own constants."""
     if not effects:
         return belief, np.arange(belief.prior.mean.size)
-    system = with_effects(belief.system, list(effects))
+    system = with_effects(belief.system, effects)
     names, prior = system.parameters.names, system.parameters.prior()
     own = np.asarray([names.index(name) for name in belief.system.parameters.names])
     scale = prior.scale.at[np.ix_(own, own)].set(belief.prior.scale)
@@ -115,12 +116,8 @@ def _with(
 def _told_apart(pulls: Pulls, own: Int[np.ndarray, " p"]) -> Int[np.ndarray, " k"]:
     """The other columns that show, and that no constants of the machine mimic."""
     A = np.asarray(np.linalg.qr(np.concatenate(list(pulls.factors)), mode="r"))
-    kept = []
-    for j in np.setdiff1d(np.arange(A.shape[1]), own):
-        share, *_ = np.linalg.lstsq(A[:, own], A[:, j], rcond=1e-10)
-        left = np.linalg.norm(A[:, j] - A[:, own] @ share)
-        if left > DISGUISE * np.linalg.norm(A[:, j]):
-            kept.append(j)
+    others = np.setdiff1d(np.arange(A.shape[1]), own)
+    kept = [j for j in others if sine_to(A[:, own], A[:, j])[0] > DISGUISE]
     return np.asarray(kept, int)
 
 

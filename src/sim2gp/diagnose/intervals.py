@@ -112,8 +112,8 @@ def corrected(
     R = np.asarray(np.linalg.qr(np.concatenate([A, np.eye(p)]), mode="r"))
     # From here to the MAP of what is linear: nothing where this is the MAP.
     down = np.linalg.solve(R.T, z + pulls.scores.sum(axis=0))
-    pulls = pulls.at(-np.linalg.solve(R, down))
-    z = z - np.linalg.solve(R, down)
+    step = -np.linalg.solve(R, down)
+    z, pulls = z + step, pulls.at(step)
     _, s, Vt = np.linalg.svd(A, full_matrices=False)
     seen = ~(s <= RANK_TOLERANCE * s.max(initial=0.0))
     s, Vt = s[seen], Vt[seen]

@@ -54,16 +54,6 @@ def pulls_of_windows(
     return pulls_of_rows(rows_of(belief, cut, belief.posterior.mean), cut, group)
 
 
-@in_float64
-def cost_of_windows(belief: WindowsBelief, cut: Windows, tt: Array) -> float:
-    """Half the windows' squared misfit at ``tt``, each from the start that suits it.
-
-    Starts follow by one Gauss-Newton step from where the fit has put them. Infinite
-    where the simulation is not finite.
-    """
-    return cost_of_rows(rows_of(belief, cut, tt), cut)
-
-
 def pulls_of_rows(
     rows: Float[np.ndarray, "W k npr"], cut: Windows, group: Int[np.ndarray, " W"]
 ) -> Pulls:
@@ -76,7 +66,11 @@ def pulls_of_rows(
 
 
 def cost_of_rows(rows: Float[np.ndarray, "W k npr"], cut: Windows) -> float:
-    """`cost_of_windows` of rows `rows_of`."""
+    """Half the windows' squared misfit of rows `rows_of`, each from its best start.
+
+    Starts follow by one Gauss-Newton step from where the fit has put them. Infinite
+    where the simulation is not finite.
+    """
     if not np.isfinite(rows).all():
         return math.inf
     n = cut.start.shape[1]

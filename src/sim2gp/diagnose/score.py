@@ -186,15 +186,24 @@ def _alias(blocks: np.ndarray, bare: Fitted) -> tuple[float, list[int]]:
     """Sine between the last column and the others' span, and who lies closest."""
     noise, e = bare.noise, bare.nuisances
     R = np.asarray(eliminate(jnp.asarray(blocks), e, noise).data)[:, :-1]
-    column, others = R[:, -1], R[:, :-1]
+    left, share = sine_to(R[:, :-1], R[:, -1])
+    order = np.argsort(-np.abs(share))
+    return left, [int(j) for j in order[:3] if abs(share[j]) > SHARED]
+
+
+def sine_to(
+    others: Float[np.ndarray, "k p"], column: Float[np.ndarray, " k"]
+) -> tuple[float, Float[np.ndarray, " p"]]:
+    """Sine of a column's angle to the others' span, and their shares of it.
+
+    All at unit length; zeros for a column that is nothing.
+    """
     length = np.linalg.norm(column)
     if length == 0.0:
-        return 0.0, []
+        return 0.0, np.zeros(others.shape[1])
     size = np.maximum(np.linalg.norm(others, axis=0), 1e-300)
     share, *_ = np.linalg.lstsq(others / size, column / length, rcond=1e-10)
-    left = np.linalg.norm(column / length - others / size @ share)
-    order = np.argsort(-np.abs(share))
-    return float(left), [int(j) for j in order[:3] if abs(share[j]) > SHARED]
+    return float(np.linalg.norm(column / length - others / size @ share)), share
 
 
 def inflation_of(

@@ -37,7 +37,7 @@ def told_intervals(
 def _effects(system: AbstractSystem, honest: Corrected) -> dict[str, dict[str, Any]]:
     if honest.lacking is None:
         return {}
-    table = with_effects(system, list(smooth_effects(system))).parameters
+    table = with_effects(system, smooth_effects(system)).parameters
     mean, sd = (np.asarray(x) for x in (honest.lacking.mean, honest.lacking.sd()))
     return {
         name: {

@@ -113,7 +113,7 @@ class Candidate:
 
 
 def with_effects(
-    system: AbstractSystem, effects: list[AbstractEffect]
+    system: AbstractSystem, effects: Sequence[AbstractEffect]
 ) -> AbstractSystem:
     """The machine with free effects inside, whatever actuators stand before it."""
     if isinstance(system, Configured):
