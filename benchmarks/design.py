@@ -167,7 +167,8 @@ def random_input(
 
     @eqx.filter_jit
     def beyond(U: Any) -> Any:
-        states = jax.vmap(lambda z: trajectory(experiment, z, U))(draws)
+        machines = jax.vmap(experiment.belief.at)(draws)
+        states = jax.vmap(lambda tt: trajectory(experiment, tt, U))(machines)
         return jnp.mean(jax.vmap(lambda S: excess(limits, S) > 0.0)(states))
 
     best, most = None, 0.0
@@ -196,7 +197,8 @@ def truth(seed: int) -> Any:
 def recorded(seed: int, run: int, U: np.ndarray) -> tuple[Log, np.ndarray]:
     """The log of the commands on the seed's arm, and the states behind it."""
     experiment, _ = setting(len(U) * PERIOD)
-    states = np.asarray(_flown(experiment, truth(seed), jnp.asarray(U)))[:-1]
+    machine = experiment.belief.at(truth(seed))
+    states = np.asarray(trajectory_of(experiment, machine, jnp.asarray(U)))[:-1]
     rng = np.random.default_rng([seed, run])
     y = states[:, :2] + NOISE * rng.standard_normal((len(U), 2))
     log = Log(
@@ -225,16 +227,14 @@ def motion_error(belief: Gaussian, seed: int) -> float:
     the later seconds would hang on its last digits, whatever was learned.
     """
     experiment, limits = setting(HELD * PERIOD)
-    prior = experiment.belief
-    z = np.linalg.solve(np.asarray(prior.scale), np.asarray(belief.mean - prior.mean))
     signal = Multisine(PERIOD, HELD)
     U = signal.commands(0.06 * signal.random(jax.random.key(77), 2), limits)
-    states = np.asarray(_flown(experiment, truth(seed), U))
+    states = np.asarray(trajectory_of(experiment, experiment.belief.at(truth(seed)), U))
     second, _ = setting(AHEAD * PERIOD)
     errors = []
     for k in range(0, HELD, AHEAD):
         now = eqx.tree_at(lambda e: e.start, second, jnp.asarray(states[k]))
-        found = np.asarray(_flown(now, jnp.asarray(z), U[k : k + AHEAD]))
+        found = np.asarray(trajectory_of(now, belief.mean, U[k : k + AHEAD]))
         errors.append((found - states[k : k + AHEAD + 1])[1:, :2])
     return float(np.sqrt(np.mean(np.square(errors))))
 
@@ -272,12 +272,13 @@ def learned(seed: int, U: np.ndarray, recordings: int) -> dict[str, Any]:
     }
 
 
-_flown = eqx.filter_jit(trajectory)
+trajectory_of = eqx.filter_jit(trajectory)
 
 
 @eqx.filter_jit
 def _expected(experiment: Experiment, z: Any, U: Any) -> Any:
-    A = information(experiment, z, U, trajectory(experiment, z, U))
+    states = trajectory(experiment, experiment.belief.at(z), U)
+    A = information(experiment, z, U, states)
     return jnp.sqrt(jnp.sum(after(experiment.belief, A) ** 2, axis=1))
 
 

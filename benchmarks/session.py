@@ -37,7 +37,8 @@ from design import (
 
 from sim2gp.design import Everything, Free, Multisine, design
 from sim2gp.experiments.claims import of_median
-from sim2gp.experiments.design import Asked, expectation, verdict
+from sim2gp.experiments.design import expectation
+from sim2gp.experiments.design_verdict import Asked, verdict
 from sim2gp.gaussian import Gaussian
 from sim2gp.logs import Log
 from sim2gp.runs.cells import Cells

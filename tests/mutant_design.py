@@ -4,7 +4,7 @@ from mutant_list import Mutant
 
 EXPERIMENT, GOALS = "design/experiment.py", "design/goals.py"
 LIMITS, SIGNALS, SEARCH = "design/limits.py", "design/signals.py", "design/search.py"
-RUN = "experiments/design.py"
+RUN, VERDICT = "experiments/design.py", "experiments/design_verdict.py"
 TOLD = ("test_design.py", "tells_what_the_log")
 GOAL = ("test_design.py", "dense_covariances")
 KEPT = ("test_design.py", "exactly or followed")
@@ -139,17 +139,38 @@ DESIGN = (
     ),
     Mutant(
         "verdict: what cannot be narrowed is a reason to run",
-        RUN,
+        VERDICT,
         'expected[n]["of_before"] <= 1.0 - NARROWER]',
         'expected[n]["of_before"] <= 1.0]',
         ("test_design_run.py", None),
     ),
     Mutant(
         "verdict: what is known well enough is a reason to run",
-        RUN,
+        VERDICT,
         "if share[n] > asked.within",
         "if share[n] > 0.0",
         ("test_design_run.py", None),
+    ),
+    Mutant(
+        "verdict: the model's errors are not said",
+        VERDICT,
+        "if wide[n] > max(asked.within, share[n])",
+        "if wide[n] < 0.0",
+        ("test_design_run.py", "when_to_stop"),
+    ),
+    Mutant(
+        "search: limits hold for machines of the plain posterior",
+        SEARCH,
+        "jax.vmap(experiment.plausible.at)(draws)",
+        "jax.vmap(experiment.belief.at)(draws)",
+        ("test_design_search.py", "corrected_posterior"),
+    ),
+    Mutant(
+        "export: the plain posterior leaves without being asked for",
+        "experiments/export.py",
+        'if posterior == "corrected" else fit.plain',
+        'if posterior == "plain" else fit.plain',
+        ("test_project_model.py", "as_wide_as_its_report"),
     ),
     Mutant(
         "csv: rounded",

@@ -45,7 +45,7 @@ def test_it_tells_what_the_log_of_it_would(system) -> None:
     """Against `models.windows`, on the log that the experiment would leave."""
     e, U = experiment(system), commands()
     nowhere = jnp.zeros_like(e.belief.mean)
-    states = TRAJECTORY(e, nowhere, U)
+    states = TRAJECTORY(e, e.belief.at(nowhere), U)
     y = np.asarray(states)[:-1]
     log = Log(
         name="log",
@@ -82,9 +82,9 @@ def test_it_tells_what_the_log_of_it_would(system) -> None:
 def test_a_plan_moves_as_the_system_steps() -> None:
     """Period by period, but for the blur of the inputs' edges."""
     e, U = experiment(), commands()
-    states = np.asarray(TRAJECTORY(e, jnp.zeros_like(e.belief.mean), U))
+    states = np.asarray(TRAJECTORY(e, e.belief.mean, U))
     with jax.enable_x64(True):
-        params = e.record(jnp.zeros_like(e.belief.mean))
+        params = e.record(e.belief.mean)
         step = jax.jit(lambda s, a: e.system.step(params, s, a, PERIOD))
         s = np.asarray(e.start)
         for k, a in enumerate(np.asarray(U)):
@@ -129,16 +129,15 @@ def test_a_prediction_depends_on_what_moves_it() -> None:
     e, U = experiment(), commands(1)
     periods = 25
     rows = np.asarray(ROWS(e, U, periods))
-    states = np.asarray(TRAJECTORY(e, jnp.zeros(3), U))
+    states = np.asarray(TRAJECTORY(e, e.belief.mean, U))
     step, at = 1e-5, 3  # the fourth prediction
     ahead = []
     for sign in (1.0, -1.0):
         moved = eqx.tree_at(lambda x: x.start, e, jnp.asarray(states[at * periods]))
         tt = e.belief.mean.at[1].add(sign * step)
-        moved = eqx.tree_at(lambda x: x.belief.mean, moved, tt)
         future = U[at * periods :]
         moved = dataclasses.replace(moved, steps=len(future))
-        ahead.append(np.asarray(TRAJECTORY(moved, jnp.zeros(3), future))[periods])
+        ahead.append(np.asarray(TRAJECTORY(moved, tt, future))[periods])
     slope = (ahead[0] - ahead[1])[:2] / (2.0 * step) / np.asarray(e.noise)
     np.testing.assert_allclose(rows[2 * at : 2 * at + 2, 1], slope, rtol=1e-5)
 

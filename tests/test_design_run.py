@@ -11,7 +11,8 @@ import pytest
 from sim2gp.cli import main
 from sim2gp.design import Everything, Limits, Named, search
 from sim2gp.experiments import identify
-from sim2gp.experiments.design import Asked, foretold, goal_of, setting, verdict
+from sim2gp.experiments.design import goal_of, setting
+from sim2gp.experiments.design_verdict import Asked, foretold, verdict
 from sim2gp.project import load_project
 from sim2gp.runs import Progress, load_run
 from test_identify import folder, project_in
@@ -139,8 +140,9 @@ def test_a_run_that_is_none(tmp_path: Path, capsys) -> None:
     assert capsys.readouterr().err.startswith("E130")
 
 
-def entry(mean: float, sd: float, left: float) -> dict[str, float]:
-    return {"mean": mean, "sd": sd, "of_before": left}
+def entry(mean: float, sd: float, left: float, times: float = 1.0) -> dict[str, float]:
+    """Of a constant whose corrected sd is ``times`` the plain one."""
+    return {"mean": mean, "sd": sd, "of_before": left, "corrected_sd": times * sd}
 
 
 @pytest.mark.parametrize(
@@ -158,6 +160,19 @@ def entry(mean: float, sd: float, left: float) -> dict[str, float]:
             False,
             "next to nothing of I",
         ),
+        # What the model's errors add is no reason to run it, and is not hidden.
+        (
+            {"m": entry(2.0, 0.02, 0.5, 20.0)},
+            1.0,
+            False,
+            "the model's errors keep m at 20 %",
+        ),
+        (
+            {"m": entry(2.0, 0.2, 0.5, 3.0)},
+            3.0,
+            True,
+            "m, known within 30 %, should come from 10 to 5 %",
+        ),
     ],
 )
 def test_when_to_stop(expected, nats, worth, words) -> None:
@@ -167,15 +182,17 @@ def test_when_to_stop(expected, nats, worth, words) -> None:
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "worth", "words"),
+    ("before", "after", "times", "worth", "words"),
     [
-        (8.0, 2.0, True, "0.5 s ahead, known within 8 sd of the sensors' noise now"),
-        (0.9, 0.1, False, "known within 0.9 sd of the sensors' noise already"),
-        (8.0, 7.9, False, "nothing narrows what is predicted 0.5 s ahead"),
+        (8.0, 2.0, 1, True, "0.5 s ahead, known within 8 sd of the sensors' noise now"),
+        (8.0, 2.0, 3, True, "8 sd of the sensors' noise (24 with the model's errors)"),
+        (0.9, 0.1, 1, False, "known within 0.9 sd of the sensors' noise already"),
+        (8.0, 7.9, 1, False, "nothing narrows what is predicted 0.5 s ahead"),
     ],
 )
-def test_when_a_prediction_is_good_enough(before, after, worth, words) -> None:
+def test_when_a_prediction_is_good_enough(before, after, times, worth, words) -> None:
     asked = dataclasses.replace(ASKED, predict=0.5)
-    found, text = foretold(asked, before, after, 1.4)
+    ahead = {"before": before, "after": after, "corrected": times * before}
+    found, text = foretold(asked, ahead, 1.4)
     assert found is worth
     assert words in text

@@ -21,6 +21,7 @@ from sim2gp import design as d
 from sim2gp.design import search
 from sim2gp.design.limits import excess
 from sim2gp.errors import InputError
+from sim2gp.gaussian import Gaussian
 
 pytestmark = pytest.mark.usefixtures("float64")
 
@@ -35,7 +36,7 @@ def test_worth_has_a_gradient_in_the_commands() -> None:
 
     @jax.jit
     def worth(U):
-        states = d.trajectory(e, z, U)
+        states = d.trajectory(e, e.belief.at(z), U)
         return search._worth_at(e, d.Everything(), z, U, states)[0]
 
     U = commands(2).at[: STEPS // 2].set(0.0)
@@ -127,7 +128,7 @@ def test_a_designed_experiment_beats_random_ones(found) -> None:
     @jax.jit
     def random(c):
         U = signal.commands(0.05 * c, box)
-        states = d.trajectory(e, nowhere, U)
+        states = d.trajectory(e, e.belief.mean, U)
         scale = d.after(e.belief, d.information(e, nowhere, U, states))
         return d.Everything().nats(e.belief.scale, scale), excess(box, states)
 
@@ -137,7 +138,7 @@ def test_a_designed_experiment_beats_random_ones(found) -> None:
     assert best.nats > max(nats) + 0.3
     # The scale that is told is that of its own commands.
     U = jnp.asarray(best.commands)
-    states = eqx.filter_jit(d.trajectory)(e, nowhere, U)
+    states = eqx.filter_jit(d.trajectory)(e, e.belief.mean, U)
     A = np.asarray(eqx.filter_jit(d.information)(e, nowhere, U, states))
     np.testing.assert_allclose(best.states, states, atol=1e-9)
     np.testing.assert_allclose(best.scale, d.after(e.belief, jnp.asarray(A)), rtol=1e-9)
@@ -174,3 +175,24 @@ def test_no_commands_keep_limits_that_nothing_can(found) -> None:
             patch.setattr(search, name, value)
         with pytest.raises(InputError, match="E150 no commands keep the limits"):
             d.design(e, d.Everything(), box, signal, key=jax.random.key(0))
+
+
+def test_limits_hold_for_the_corrected_posterior_and_nats_are_of_the_plain() -> None:
+    """Machines, their extent and the middle against single simulations."""
+    e, goal = experiment(), d.Everything()
+    shifted = Gaussian(e.belief.mean + 0.3, 3.0 * e.belief.scale[:, ::-1])
+    wide = dataclasses.replace(e, corrected=shifted)
+    box, U = limits(e.system), commands()
+    draws = jax.random.normal(jax.random.key(2), (5, 3))
+    states, beyond = search._checked(wide, box, U, draws)
+    one = eqx.filter_jit(d.trajectory)
+    for z, S, far in zip(draws, states, beyond, strict=True):
+        tt = shifted.mean + shifted.scale @ z
+        alone = one(e, tt, U)
+        np.testing.assert_allclose(S, alone, rtol=1e-6, atol=1e-8)
+        assert float(far) == pytest.approx(float(excess(box, alone)), rel=1e-6)
+    told, scale, middle = search._worth(wide, goal, draws, U)
+    expected = search._worth(e, goal, draws, U)
+    assert float(told) == pytest.approx(float(expected[0]), rel=1e-12)
+    np.testing.assert_allclose(scale, expected[1], rtol=1e-12)
+    np.testing.assert_allclose(middle, one(e, shifted.mean, U), rtol=1e-6, atol=1e-8)

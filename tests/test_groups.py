@@ -9,7 +9,14 @@ import pytest
 
 from sim2gp.configurations import Configuration
 from sim2gp.errors import InputError
-from sim2gp.experiments import apply, design, evaluate, explain, identify
+from sim2gp.experiments import (
+    apply,
+    design,
+    design_verdict,
+    evaluate,
+    explain,
+    identify,
+)
 from sim2gp.experiments.configurations import told
 from sim2gp.experiments.identified import restored
 from sim2gp.logs import Log
@@ -262,10 +269,10 @@ def test_held_out_logs_are_of_one_configuration(
 def test_an_experiment_is_for_the_machine_as_it_stands(run: Path) -> None:
     def setting(name: str | None) -> Any:
         nothing: dict[str, Any] = {}
-        asked = design.Asked(
+        asked = design_verdict.Asked(
             1.0, "free", (), None, 2.0, nothing, nothing, nothing, None, 1, name
         )
-        return design.setting(run, asked)[1]
+        return design.setting(restored(run), asked)[1]
 
     x = load_run(run).arrays
     bare, loaded = setting("bare"), setting("loaded")

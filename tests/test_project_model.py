@@ -4,15 +4,19 @@ import json
 import sys
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from sim2gp.cli import main
 from sim2gp.errors import InputError
 from sim2gp.experiments import apply
+from sim2gp.experiments.design import setting
+from sim2gp.experiments.design_verdict import Asked
 from sim2gp.experiments.identified import restored
 from sim2gp.project import load_project
-from sim2gp.runs import load_run
+from sim2gp.runs import load_run, new_run
 from sim2gp.systems.mjcf_load import compiled_all
 
 mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is not installed")
@@ -251,6 +255,67 @@ def test_its_constants_go_into_the_file(identified: Path, capsys) -> None:
         assert f"+{new}\n" in summary["diff"]
     assert main(["apply", run, "--out", str(out)]) == 2
     assert "E132 file exists" in capsys.readouterr().err
+
+
+def test_what_leaves_a_run_is_as_wide_as_its_report(
+    identified: Path, tmp_path: Path, capsys
+) -> None:
+    """Draws, files and `apply`: the corrected posterior, or the plain one by its name.
+
+    Of a run whose corrected posterior is far from the plain one, by copying it so.
+    """
+    stored, run = load_run(identified), identified.parent / "wide"
+    table = restored(identified).project.system.parameters
+    x = dict(stored.arrays)
+    rng = np.random.default_rng(0)
+    x["intervals/scale"] = (
+        20.0
+        * x["belief/scale"]
+        @ np.linalg.qr(rng.normal(size=x["belief/scale"].shape)).Q
+    )
+    x["intervals/mean"] = x["belief/mean"] + 0.05
+    with jax.enable_x64(True):
+        x["intervals/theta"] = np.asarray(
+            table.constrain(jnp.asarray(x["intervals/mean"]))
+        )
+    with new_run(run, "identify") as writer:
+        writer.write_arrays("arrays.npz", x)
+        writer.write_summary(stored.summary)
+        writer.write_text("project.toml", (identified / "project.toml").read_text())
+
+    fit, eps = restored(run), []
+    for prefix, known in (("intervals", fit.posterior), ("belief", fit.plain)):
+        np.testing.assert_array_equal(known.mean, x[f"{prefix}/mean"])
+        np.testing.assert_array_equal(known.scale, x[f"{prefix}/scale"])
+        which = {"intervals": "corrected", "belief": "plain"}[prefix]
+        asked = [] if which == "corrected" else ["--posterior", "plain"]
+        out = tmp_path / which
+        words = ["export", str(run), "--out", str(out), "--draws", "6", "--json"]
+        assert main([*words, *asked, "--quiet"]) == 0
+        about = json.loads(capsys.readouterr().out)["model"]
+        assert about["posterior"] == which
+        rows = load_run(out).arrays
+        draws = np.stack([rows[f"draws/{name}"] for name in table.names], axis=1)
+        with jax.enable_x64(True):
+            tt = np.asarray(jax.vmap(table.unconstrain)(jnp.asarray(draws)))
+        eps.append(np.linalg.solve(x[f"{prefix}/scale"], (tt - x[f"{prefix}/mean"]).T))
+        assert (out / "variant_005.xml").exists()
+
+        assert main(["apply", str(run), "--json", "--quiet", *asked]) == 0
+        applied = json.loads(capsys.readouterr().out)
+        assert applied["posterior"] == which
+        theta = dict(zip(table.names, x[f"{prefix}/theta"], strict=True))
+        for name, entry in applied["constants"].items():
+            if name in theta:
+                assert entry["is"] == pytest.approx(theta[name], rel=1e-9)
+
+    # Of one seed they are the same standard normal numbers, each in its own posterior.
+    np.testing.assert_allclose(eps[0], eps[1], atol=1e-6)
+    assert 0.5 < eps[0].std() < 1.6
+    question = Asked(1.0, "free", (), None, 2.0, {}, {}, {}, None)
+    _, experiment, _ = setting(fit, question)
+    np.testing.assert_array_equal(experiment.belief.scale, x["belief/scale"])
+    np.testing.assert_array_equal(experiment.plausible.mean, x["intervals/mean"])
 
 
 def test_a_file_that_was_changed_in_place_is_no_longer_the_one_fitted(

@@ -26,10 +26,13 @@ class Gaussian(eqx.Module):
     mean: Float[Array, " n"]
     scale: Float[Array, "n k"]
 
+    def at(self, eps: Float[Array, " k"]) -> Float[Array, " n"]:
+        """The point at standard normal coordinates ``eps``."""
+        return self.mean + self.scale @ eps
+
     def sample(self, key: Key) -> Float[Array, " n"]:
         """One draw."""
-        eps = jax.random.normal(key, (self.scale.shape[1],), self.scale.dtype)
-        return self.mean + self.scale @ eps
+        return self.at(jax.random.normal(key, (self.scale.shape[1],), self.scale.dtype))
 
     def push(self, A: Float[Array, "d n"], b: Float[Array, " d"]) -> "Gaussian":
         """The distribution of ``A x + b``."""

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from sim2gp.cli.arguments import numbers, pairs, usage_error
-from sim2gp.cli.options import Chosen, Common, Reads, Writes
+from sim2gp.cli.options import Chosen, Common, Reads, Wide, Writes
 from sim2gp.runs import Progress, load_run
 from sim2gp.runs.store import check_absent, check_target
 from sim2gp.runs.workers import cores
@@ -235,7 +235,8 @@ class Design(Writes, Chosen):
             source = import_module("sim2gp.project").load_project(source)
         else:
             load_run(source)  # a folder that is no run fails early
-        asked = import_module("sim2gp.experiments.design").Asked(
+            source = _experiment("identified", "restored")(source)
+        asked = import_module("sim2gp.experiments.design_verdict").Asked(
             seconds=self.seconds,
             kind=self.kind,
             about=self.about,
@@ -254,7 +255,7 @@ class Design(Writes, Chosen):
 
 
 @dataclass(kw_only=True)
-class Apply(Chosen):
+class Apply(Wide):
     """Write identified constants into the MuJoCo model's own file; shows the diff."""
 
     path: Annotated[Positional[Path], arg(metavar="RUN")]
@@ -273,6 +274,33 @@ class Apply(Chosen):
             model=self.model,
             in_place=self.in_place,
             configuration=self.configuration,
+            posterior=self.posterior,
+            progress=progress,
+        )
+
+
+@dataclass(kw_only=True)
+class Export(Writes, Wide):
+    """Draws of an identified machine for domain randomisation: arrays, MJCF files."""
+
+    path: Annotated[Positional[Path], arg(metavar="RUN")]
+    """The folder of identify."""
+    draws: int = 100
+    """Machines to draw."""
+    seed: int = 0
+    """Draws them."""
+
+    def run(self, progress: Progress) -> dict[str, Any]:
+        out = _out(self.out, f"export-{self.path.name}")
+        load_run(self.path)  # a folder that is no run fails before the work
+        fit = _experiment("identified", "restored")(self.path)
+        return _experiment("export")(
+            fit,
+            draws=self.draws,
+            out=out,
+            seed=self.seed,
+            configuration=self.configuration,
+            posterior=self.posterior,
             progress=progress,
         )
 
@@ -356,6 +384,7 @@ COMMANDS: dict[str, type[Common]] = {
     "compare": Compare,
     "design": Design,
     "apply": Apply,
+    "export": Export,
     "report": Report,
     "selftest": Selftest,
     "reproduce": Reproduce,

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import arg
 
@@ -33,6 +33,14 @@ class Chosen(Common):
 
     configuration: Annotated[str | None, arg(metavar="NAME")] = None
     """Which one, where groups of logs are of several."""
+
+
+@dataclass(kw_only=True)
+class Wide(Chosen):
+    """The option of a command that hands an identified machine on."""
+
+    posterior: Literal["corrected", "plain"] = "corrected"
+    """The report's intervals, or Laplace's, which counts the model as right."""
 
 
 @dataclass(kw_only=True)

@@ -30,7 +30,9 @@ Commands = Float[Array, "T m"]
 class Experiment(eqx.Module):
     """Everything about an experiment but its commands.
 
-    belief: over virtual parameters, before it.
+    belief: over virtual parameters, before it; information is counted from it.
+    corrected: the same as wide as the model's errors make it, or None: the limits of
+        the states must hold for machines that are drawn from it.
     noise: sd of each measured output; ``outputs`` are their indices among the states.
     start: the state that the machine is in when it begins.
     start_sd: how uncertain the start of every window is, before its samples.
@@ -48,24 +50,29 @@ class Experiment(eqx.Module):
     steps: int = eqx.field(static=True)
     window: int = eqx.field(static=True)
     substep: float = eqx.field(static=True, default=WINDOW_SUBSTEP)
+    corrected: Gaussian | None = None
 
     @property
     def substeps(self) -> int:
         """Of the integration, in a period."""
         return max(1, math.ceil(self.period / self.substep - TOLERANCE))
 
-    def record(self, z: Float[Array, " p"]) -> Any:
-        """Constants, at so many sd of the belief."""
-        tt = self.belief.mean + self.belief.scale @ z
+    @property
+    def plausible(self) -> Gaussian:
+        """What the machine may be, with the errors of the model allowed for."""
+        return self.belief if self.corrected is None else self.corrected
+
+    def record(self, tt: Float[Array, " p"]) -> Any:
+        """Constants, at virtual values."""
         return self.system.record(self.system.parameters.values(tt))
 
 
 def trajectory(
-    experiment: Experiment, z: Float[Array, " p"], U: Commands
+    experiment: Experiment, tt: Float[Array, " p"], U: Commands
 ) -> Float[Array, "times n"]:
-    """States at the beginning and after each period, for one machine of the belief."""
+    """States at the beginning and after each period, for one machine."""
     whole = _piece(experiment, U, 0, experiment.steps)
-    params = experiment.record(z)
+    params = experiment.record(tt)
     states = simulate(experiment.system, params, whole, experiment.start)
     return states[:: experiment.substeps]
 
@@ -78,11 +85,11 @@ def information(
 ) -> Float[Array, "rows p"]:
     """Rows that square to the Fisher information about the belief's ``z``.
 
-    At one machine, whose `trajectory` is ``states``. In units of the belief:
+    At one machine of the belief, whose `trajectory` is ``states``. In its units:
     ``I + A^T A`` is the precision after the experiment. Starts are eliminated window by
     window, by orthogonal projection.
     """
-    p, n = z.size, states.shape[1]
+    p, n, belief = z.size, states.shape[1], experiment.belief
     count = experiment.window
     first = jnp.arange(0, experiment.steps - count + 2, count)
     outputs = np.asarray(experiment.outputs)
@@ -91,7 +98,7 @@ def information(
         window, x0 = _piece(experiment, U, i, count - 1), states[i]
 
         def seen(x: Array) -> Array:
-            params = experiment.record(z + x[n:])
+            params = experiment.record(belief.at(z + x[n:]))
             start = x0 + experiment.start_sd * x[:n]
             found = simulate(experiment.system, params, window, start)
             rows = found[:: experiment.substeps, outputs] / experiment.noise[None]
@@ -127,7 +134,7 @@ def sensitivity_at(
     prediction, in noise sd.
     """
     system, tt = experiment.system, experiment.belief.mean
-    states = trajectory(experiment, jnp.zeros_like(tt), U)
+    states = trajectory(experiment, tt, U)
     first = jnp.arange(0, experiment.steps - periods + 1, periods)
     outputs = np.asarray(experiment.outputs)
 
@@ -135,8 +142,7 @@ def sensitivity_at(
         window = _piece(experiment, U, i, periods)
 
         def ahead(tt: Array) -> Array:
-            params = system.record(system.parameters.values(tt))
-            found = simulate(system, params, window, states[i])
+            found = simulate(system, experiment.record(tt), window, states[i])
             return found[-1, outputs] / experiment.noise
 
         return value_and_jacobian(ahead, tt)[1]

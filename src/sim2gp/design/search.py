@@ -56,7 +56,8 @@ class Designed(eqx.Module):
 
     nats: of the goal, on average over draws.
     scale: square root of the expected covariance at the belief's mean.
-    states: at the belief's mean; ``low`` and ``high`` are the draws' 5 % and 95 %.
+    states: at the mean of what is plausible; ``low`` and ``high`` are the 5 % and 95 %
+        of its draws.
     violations: the share of checked draws that leave the limits.
     """
 
@@ -272,9 +273,11 @@ def _climb(
     """Steps of Adam on the worth at one draw after the other, less what guards pay."""
     beyond = _beyond_of(experiment, _narrowed(limits))
 
+    near = jax.vmap(experiment.plausible.at)(guards)
+
     def loss(C: Float[Array, "k m"], z: Float[Array, " p"]) -> Array:
-        U = signal.commands(C, limits)
-        states = _states(experiment, U, jnp.concatenate([z[None], guards]))
+        U, own = signal.commands(C, limits), experiment.belief.at(z)
+        states = _states(experiment, U, jnp.concatenate([own[None], near]))
         worth, _ = _worth_at(experiment, goal, z, U, states[0])
         return cost * beyond(states[1:]) - worth
 
@@ -321,19 +324,20 @@ def _worth_at(
 def _worth(
     experiment: Experiment, goal: AbstractGoal, draws: Array, U: Array
 ) -> tuple[Array, Array, Array]:
-    """The mean over draws; scale and states at the first of them."""
+    """The mean over draws, the scale at the first, and the plausible mean's states."""
 
-    def one(z: Array) -> tuple[Array, Array, Array]:
-        states = trajectory(experiment, z, U)
-        return *_worth_at(experiment, goal, z, U, states), states
+    def one(z: Array) -> tuple[Array, Array]:
+        states = trajectory(experiment, experiment.belief.at(z), U)
+        return _worth_at(experiment, goal, z, U, states)
 
-    nats, scales, states = jax.lax.map(one, draws)
-    return jnp.mean(nats), scales[0], states[0]
+    nats, scales = jax.lax.map(one, draws)
+    middle = trajectory(experiment, experiment.plausible.mean, U)
+    return jnp.mean(nats), scales[0], middle
 
 
-def _states(experiment: Experiment, U: Array, draws: Array) -> Array:
-    """Of every drawn machine."""
-    return jax.vmap(lambda z: trajectory(experiment, z, U))(draws)
+def _states(experiment: Experiment, U: Array, machines: Array) -> Array:
+    """Of every machine, at its virtual values."""
+    return jax.vmap(lambda tt: trajectory(experiment, tt, U))(machines)
 
 
 _sensitivity = eqx.filter_jit(sensitivity_at)
@@ -343,7 +347,7 @@ _sensitivity = eqx.filter_jit(sensitivity_at)
 def _checked(
     experiment: Experiment, limits: Limits, U: Array, draws: Array
 ) -> tuple[Array, Array]:
-    """Of every drawn machine, and how far it leaves the limits; infinite when lost."""
-    states = _states(experiment, U, draws)
+    """Of plausible machines, and how far each leaves the limits; infinite when lost."""
+    states = _states(experiment, U, jax.vmap(experiment.plausible.at)(draws))
     beyond = jax.vmap(lambda S: excess(limits, S))(states)
     return states, jnp.where(jnp.isfinite(beyond), beyond, jnp.inf)

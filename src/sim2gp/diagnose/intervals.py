@@ -69,6 +69,7 @@ BARTLETT = 1.5
 #: it may lack otherwise, in those of the library.
 NOTHING, SHARES = 0.5, tuple(2.0**-k for k in range(6))
 LIKE_WHITE = 1.3  # times as wide: small samples alone make so much of white noise
+MUCH = 3.0  # times as wide: a summary says why, wherever it names the interval
 
 
 @dataclass(frozen=True)
@@ -185,15 +186,50 @@ def words(found: Corrected, widened: Sequence[float], windows: int) -> str:
             "times as far as white noise would: intervals are those of independent "
             f"samples, times {digits(most, 3)} at most. {_allowed(found)}"
         )
-    ends = [digits(x, 2) for x in (min(widened, default=1.0), most)]
-    times = ends[0] if ends[0] == ends[1] else " to ".join(ends)
-    text = f"Intervals are {times} times as wide as if every sample were new"
+    text = f"Intervals are {_times(widened)} times as wide as if every sample were new"
     if not lacks or scatter > LIKE_WHITE:
-        text += (
-            f": the errors of {windows} windows are coloured and pull the constants "
-            f"{digits(scatter, 2)} times as far as white noise would"
-        )
+        text += f": {_coloured(found, windows)}"
     return f"{text}. {_allowed(found)}"
+
+
+def why(found: Corrected, widened: Sequence[float], windows: int) -> str | None:
+    """In one sentence, where corrected and plain sd differ by more than `MUCH`.
+
+    The reasons are those that the correction has: samples that repeat each other, and
+    physics that is missing. None of them is a sum of the others.
+    """
+    if not found.enough or max(widened, default=1.0) <= MUCH:
+        return None
+    reasons = []
+    if math.sqrt(found.inflation) > LIKE_WHITE:
+        reasons.append(_coloured(found, windows))
+    if found.missing > NOTHING:
+        reasons.append(
+            f"the simulator is missing physics with a probability of {_sure(found)}, "
+            f"which the parameters make up for"
+        )
+    reason = ", and ".join(reasons) or "windows are few"
+    return (
+        f"The corrected intervals are {_times(widened)} times as wide as the plain "
+        f"ones: {reason}."
+    )
+
+
+def _times(widened: Sequence[float]) -> str:
+    ends = [digits(f(widened, default=1.0), 2) for f in (min, max)]
+    return ends[0] if ends[0] == ends[1] else " to ".join(ends)
+
+
+def _coloured(found: Corrected, windows: int) -> str:
+    return (
+        f"the errors of {windows} windows are coloured and pull the constants "
+        f"{digits(math.sqrt(found.inflation), 2)} times as far as white noise would"
+    )
+
+
+def _sure(found: Corrected) -> str:
+    percent = f"{100.0 * found.missing:.0f} %"
+    return "more than 99 %" if found.missing >= 0.995 else percent
 
 
 def _allowed(found: Corrected) -> str:
@@ -203,19 +239,17 @@ def _allowed(found: Corrected) -> str:
             "This covers errors that come and go, not physics that the model lacks "
             "(sim2gp explain)."
         )
-    percent = f"{100.0 * found.missing:.0f} %"
     if found.missing > NOTHING:
-        sure = "more than 99 %" if found.missing >= 0.995 else percent
         return (
-            f"The model lacks physics with a probability of {sure}: intervals allow "
-            f"for {len(found.effects)} effects of its library (friction, springs, drag "
-            "and the like), and constants lie where they would with them. sim2gp "
+            f"The model lacks physics with a probability of {_sure(found)}: intervals "
+            f"allow for {len(found.effects)} effects of its library (friction, "
+            "springs, drag and the like), and constants lie where they would with them. sim2gp "
             "explain tries the effects one by one."
         )
     return (
         f"That the model lacks some of {len(found.effects)} effects of its library has "
-        f"a probability of {percent} and is allowed for; of other physics intervals "
-        "know nothing."
+        f"a probability of {_sure(found)} and is allowed for; of other physics "
+        "intervals know nothing."
     )
 
 

@@ -1,7 +1,9 @@
 """Apply: what a run identified, written back into the model's own file.
 
 The file's text is edited where it says what was learned, and nowhere else; the edited
-text is compiled and compared before anything is kept. Values are the posterior's modes.
+text is compiled and compared before anything is kept. Values are the modes of the
+corrected posterior, the centres of the report's intervals, or where it is asked those
+of the plain one.
 """
 
 import difflib
@@ -10,7 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from sim2gp.errors import InputError
-from sim2gp.experiments.identified import PROJECT, project_of
+from sim2gp.experiments.identified import (
+    Width,
+    check_identified,
+    modes,
+    project_of,
+    used,
+)
 from sim2gp.project import Project
 from sim2gp.project.project import is_model
 from sim2gp.project.replace import replace_file
@@ -34,11 +42,13 @@ def run(
     in_place: bool,
     progress: Progress,
     configuration: str | None = None,
+    posterior: Width = "corrected",
 ) -> dict[str, Any]:
     """Write the constants of a run into ``out``, or the source ``in_place``, or show.
 
     ``model`` is another copy of the file than the one that was fitted; the machine is
-    that of one ``configuration``, where it has several (E152). Raises `InputError` E130
+    that of one ``configuration``, where it has several (E152). ``posterior`` says whose
+    modes are written. Raises `InputError` E130
     for a run without a model's constants, E132 where ``out`` exists, E170 where the
     file cannot say them: then nothing is written.
     """
@@ -51,7 +61,7 @@ def run(
     project = _project(run, stored, model)
     system = bare(project.system)
     assert isinstance(system, MuJoCo)
-    values, apart = _values(stored, project, system, configuration)
+    values, apart = _values(stored, project, system, configuration, posterior)
     progress.say(f"editing {system.source}")
     file = system.file()
     edited = file.edited(system.by_path(values))
@@ -62,6 +72,7 @@ def run(
         "command": "apply",
         "title": f"{run.name}: its constants in {file.source.name}",
         "model": str(file.source),
+        **used(stored.summary, posterior),
         "written": written,
         "constants": _table(file, edited),
         "not_written": apart | edited.unsaid,
@@ -71,15 +82,7 @@ def run(
 
 def _project(run: Path, stored: Run, model: Path | None) -> Project:
     """The run's project with the model's file where it stands now."""
-    if "belief/theta" not in stored.arrays or not (run / PROJECT).exists():
-        raise InputError(
-            "E130",
-            "no constants to apply",
-            where=str(run),
-            got=str(stored.summary.get("command", "a run without constants")),
-            expected="the folder of sim2gp identify",
-            fix="run sim2gp identify (again, if an older version made the run)",
-        )
+    check_identified(run, stored)
     project = project_of(run, stored, model)
     if not is_model(project.spec.system):
         raise InputError(
@@ -94,12 +97,17 @@ def _project(run: Path, stored: Run, model: Path | None) -> Project:
 
 
 def _values(
-    stored: Run, project: Project, system: MuJoCo, configuration: str | None
+    stored: Run,
+    project: Project,
+    system: MuJoCo,
+    configuration: str | None,
+    posterior: Width,
 ) -> tuple[dict[str, float], dict[str, str]]:
     """The model's constants by name, and why the run's other ones are none."""
-    table, places = own_table(project.system.parameters, configuration)
-    modes = stored.arrays["belief/theta"][list(places)]
-    found = dict(zip(table.names, modes.tolist(), strict=True))
+    joint = project.system.parameters
+    table, places = own_table(joint, configuration)
+    own = modes(stored, joint, posterior)[list(places)]
+    found = dict(zip(table.names, own.tolist(), strict=True))
     values = dict(table.fixed) | found
     for name in values:
         if "/" in name and name not in system.names:

@@ -2,13 +2,13 @@
 
 From a finished identification, or from a project file alone, before any log exists. The
 commands keep their limits exactly; the states keep theirs for nearly all machines that
-the belief still allows.
+are plausible: after an identification, for those of its corrected posterior.
+Information is counted from the plain one, because data do not reduce a model's errors.
 """
 
 import io
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,9 +31,9 @@ from sim2gp.design import (
     prediction_rows,
 )
 from sim2gp.diagnose.table import physical_moments
-from sim2gp.diagnose.words import digits, listed
 from sim2gp.errors import InputError
-from sim2gp.experiments.identified import restored
+from sim2gp.experiments.design_verdict import Asked, expected_table, foretold, verdict
+from sim2gp.experiments.identified import Identified, used
 from sim2gp.experiments.prediction import units
 from sim2gp.experiments.record import command, provenance
 from sim2gp.models.features import Encoding
@@ -50,47 +50,15 @@ FILE = "trajectory.csv"
 PERIOD = 0.01  # s, of commands and samples, where no log says otherwise
 WINDOW = 0.2  # s, where the likelihood has windows of one step
 LOOSE = 1.0  # rad, m, rad/s or m/s: the sd of a window's start where none is stated
-NARROWER = 0.05  # an experiment must narrow what is asked by this share
-
-
-@dataclass(frozen=True)
-class Asked:
-    """What is asked of an experiment: the options of the command."""
-
-    seconds: float
-    kind: str
-    about: tuple[str, ...]
-    predict: float | None
-    within: float
-    limits: Mapping[str, tuple[float, float]]
-    rates: Mapping[str, float]
-    start: Mapping[str, float]
-    period: float | None
-    starts: int = 1
-    configuration: str | None = None
-
-    def words(self) -> str:
-        """As they were typed."""
-        parts = [f"--seconds {self.seconds:g}", f"--kind {self.kind}"]
-        parts += [f"--about {' '.join(self.about)}"] if self.about else []
-        parts += [f"--predict {self.predict:g}"] if self.predict else []
-        parts += [f"--within {self.within:g}"]
-        boxes = [f"{n}={low:g}:{high:g}" for n, (low, high) in self.limits.items()]
-        for option, pairs in (
-            ("--limit", boxes),
-            ("--rate", [f"{n}={x:g}" for n, x in self.rates.items()]),
-            ("--start", [f"{n}={x:g}" for n, x in self.start.items()]),
-        ):
-            parts += [f"{option} {' '.join(pairs)}"] if pairs else []
-        parts += [f"--period {self.period:g}"] if self.period else []
-        parts += [f"--starts {self.starts}"]
-        if self.configuration:
-            parts += [f"--configuration {self.configuration}"]
-        return " ".join(parts)
 
 
 def run(
-    source: Project | Path, asked: Asked, *, out: Path, seed: int, progress: Progress
+    source: Project | Identified,
+    asked: Asked,
+    *,
+    out: Path,
+    seed: int,
+    progress: Progress,
 ) -> dict[str, Any]:
     """Choose the commands and write them; returns the summary.
 
@@ -117,9 +85,11 @@ def run(
         task.advance("limits and goal")
         found = design(experiment, goal, limits, signal, key=key, starts=asked.starts)
         task.advance(f"{found.nats:.1f} nats")
-        place = source.path if isinstance(source, Project) else source
+        place = source.path if isinstance(source, Project) else source.run
         summary = _summarise(place, asked, experiment, goal, found, seed)
         summary["warnings"] = notes
+        if isinstance(source, Identified):
+            summary |= widths(source)
         line = command("sim2gp", "design", place, *asked.words().split())
         line += " " + command("--seed", seed, "--out", out)
         summary |= provenance(line, started)
@@ -136,20 +106,21 @@ def run(
 
 @in_float64
 def setting(
-    source: Project | Path, asked: Asked
+    source: Project | Identified, asked: Asked
 ) -> tuple[Project, Experiment, list[str]]:
     """The machine and what is believed of it; what the user should know of both."""
     notes: list[str] = []
+    corrected = None
     if isinstance(source, Project):
-        project, system = source, source.system
-        belief, names = informed_prior(system.parameters), _measured(project)
+        project, joint = source, source.system
+        belief, names = informed_prior(joint.parameters), _measured(project)
         noise, period = _stated_noise(project, names), PERIOD
         notes.append("no log was used: what is believed is the project's priors")
     else:
-        found = restored(source)
-        project, system, belief = found.project, found.project.system, found.posterior
-        names, noise, period = found.outputs, found.noise, found.period
-    system, belief = alone(system, belief, asked.configuration)
+        project, joint, belief = source.project, source.project.system, source.plain
+        names, noise, period = source.outputs, source.noise, source.period
+        _, corrected = alone(joint, source.posterior, asked.configuration)
+    system, belief = alone(joint, belief, asked.configuration)
     states = [channel.name for channel in system.physical_states]
     period = asked.period or period
     steps = round(asked.seconds / period)
@@ -176,8 +147,17 @@ def setting(
         period,
         steps,
         min(window, steps),
+        corrected=corrected,
     )
     return project, experiment, notes
+
+
+def widths(fit: Identified) -> dict[str, Any]:
+    """Which of an identification's two posteriors was used for what."""
+    return used(fit.summary, "corrected") | {
+        "posterior": "Limits of the states and the expected motion are those of the "
+        "corrected posterior, information and expected sd those of the plain one"
+    }
 
 
 def signal_of(kind: str, experiment: Experiment) -> AbstractSignal:
@@ -228,10 +208,15 @@ def _start(given: Mapping[str, float], system: AbstractSystem) -> Any:
 
 @in_float64
 def expectation(experiment: Experiment, found: Designed) -> dict[str, dict[str, Any]]:
-    """Of each constant: unit, mean and sd now, sd expected after, and their ratio."""
+    """Of each constant: unit, mean and sd now, sd expected after, and their ratio.
+
+    All plain but ``corrected_sd``, today's with the model's errors allowed for.
+    """
     table, belief = experiment.system.parameters, experiment.belief
     mean = np.asarray(belief.mean)
     before = physical_moments(table, mean, np.asarray(belief.sd()))
+    wide = experiment.plausible
+    wider = physical_moments(table, np.asarray(wide.mean), np.asarray(wide.sd()))
     sd = np.sqrt(np.sum(found.scale**2, axis=1))
     after = physical_moments(table, mean, sd)
     return {
@@ -239,6 +224,7 @@ def expectation(experiment: Experiment, found: Designed) -> dict[str, dict[str, 
             "unit": p.unit,
             "mean": float(before["mean"][j]),
             "sd": float(before["sd"][j]),
+            "corrected_sd": float(wider["sd"][j]),
             "expected_sd": float(after["sd"][j]),
             "of_before": float(after["sd"][j] / before["sd"][j]),
         }
@@ -264,8 +250,9 @@ def _summarise(
         ahead = {
             "before": float(goal.deviation(before)),
             "after": float(goal.deviation(after)),
+            "corrected": float(goal.deviation(experiment.plausible.scale)),
         }
-        worth, reason = foretold(asked, ahead["before"], ahead["after"], found.nats)
+        worth, reason = foretold(asked, ahead, found.nats)
     return {
         "command": "design",
         "title": f"{place.stem}: the next experiment",
@@ -281,78 +268,7 @@ def _summarise(
         "violations": found.violations,
         "draws_checked": found.checked,
         "units": units(experiment.system),
-        "tables": [_table(expected)],
-    }
-
-
-def verdict(
-    asked: Asked, expected: Mapping[str, Mapping[str, Any]], nats: float
-) -> tuple[bool, str]:
-    """Whether it is worth the robot's time, and why.
-
-    What such an experiment cannot narrow is no reason to run it.
-    """
-    names = asked.about or tuple(expected)
-    told = [n for n in names if expected[n]["of_before"] <= 1.0 - NARROWER]
-    if not told:
-        return False, (
-            "Not worth running: within these limits nothing narrows "
-            f"{listed(names)} by more than {100.0 * NARROWER:.0f} %."
-        )
-    share = {n: 100.0 * expected[n]["sd"] / abs(expected[n]["mean"]) for n in told}
-    poor = [n for n in told if share[n] > asked.within]
-    untold = [n for n in names if n not in told]
-    rest = f" It tells next to nothing of {listed(untold)}." if untold else ""
-    if not poor:
-        return False, (
-            f"Not worth running: {listed(told)} known within {asked.within:g} % "
-            f"already.{rest}"
-        )
-    worst = max(poor, key=lambda n: share[n])
-    after = share[worst] * expected[worst]["of_before"]
-    text = f"Worth running: {nats:.1f} nats. {worst}, known within"
-    text += f" {digits(share[worst], 2)} % now, should be within {digits(after, 2)} %"
-    return True, f"{text} after.{rest}"
-
-
-def foretold(
-    asked: Asked, before: float, after: float, nats: float
-) -> tuple[bool, str]:
-    """The same of a prediction, its sd in those of the sensors' noise.
-
-    Nobody can see that it is better than the sensors.
-    """
-    what = f"what is predicted {asked.predict:g} s ahead"
-    now = f"{digits(before, 2)} sd of the sensors' noise"
-    if before <= 1.0:
-        return False, f"Not worth running: {what} is known within {now} already."
-    if after > (1.0 - NARROWER) * before:
-        return False, (
-            f"Not worth running: within these limits nothing narrows {what} by more "
-            f"than {100.0 * NARROWER:.0f} %; it is known within {now}."
-        )
-    return True, (
-        f"Worth running: {nats:.1f} nats; {what}, known within {now} now, should be "
-        f"within {digits(after, 2)} after."
-    )
-
-
-def _table(expected: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    rows = [
-        [
-            name,
-            f"{e['mean']:.4g} {e['unit']}",
-            f"{e['sd']:.2g}",
-            f"{e['expected_sd']:.2g}",
-            f"{digits(100.0 * e['of_before'], 2)} %",
-        ]
-        for name, e in expected.items()
-    ]
-    return {
-        "title": "What the experiment should tell",
-        "columns": ["constant", "believed", "sd now", "sd after", "left"],
-        "rows": rows,
-        "note": "Expected where the machine is as believed and its noise independent.",
+        "tables": [expected_table(expected)],
     }
 
 

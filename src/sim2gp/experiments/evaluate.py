@@ -65,7 +65,7 @@ def run(
     with new_run(out, "evaluate") as writer, progress.task("evaluate", 2) as task:
         rows, longest = rows_for(horizon), max(horizon, CURVE[-1])
         grid = windows_for(tested, found, longest, horizon)
-        result = predicted(system, fit.posterior, grid, horizon)
+        result = predicted(system, fit.plain, grid, horizon)
         train = _training(fit)
         linear = None
         if train is not None:
@@ -83,7 +83,7 @@ def run(
         if train is None:
             notes.append("the training logs were not found: no regression beside")
         about, moves = film(
-            system, fit.posterior, picture, grid, tested,
+            system, fit.plain, picture, grid, tested,
             "Forecasts over what was recorded",
         )  # fmt: skip
         if about:

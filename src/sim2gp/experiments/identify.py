@@ -185,6 +185,7 @@ def _stored(
         "belief/noise": np.asarray(belief.noise),
         "belief/weights": np.asarray(belief.weights),
         "intervals/mean": np.asarray(honest.mean),
+        "intervals/theta": np.asarray(physical(table, honest.mean)),
         "intervals/scale": np.asarray(honest.scale),
         "band/start_sd": band.start_sd,
         "band/input_sd": band.input_sd,

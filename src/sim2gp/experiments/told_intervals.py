@@ -26,6 +26,7 @@ def told_intervals(
     return {
         "which": "corrected" if honest.enough else "plain",
         "text": intervals.words(honest, widened, windows),
+        "why": intervals.why(honest, widened, windows),
         "pulls_times_white": math.sqrt(honest.inflation) if honest.enough else None,
         "windows_at_once": honest.lag,
         "freedom": honest.freedom,

@@ -35,11 +35,13 @@ def experiment(summary: Summary, arrays: Arrays) -> Raw:
     share = summary.get("violations")
     checked = summary.get("draws_checked")
     kept = (
-        f"{100.0 * float(share):.1f} % of {checked} machines drawn from the belief "
-        "leave a limit of position or velocity; the commands keep theirs exactly."
+        f"{100.0 * float(share):.1f} % of {checked} machines drawn from what is "
+        "believed leave a limit of position or velocity; the commands keep theirs "
+        "exactly."
         if isinstance(share, float)
         else ""
     )
+    kept += _said(summary)
     return section(
         "experiment",
         "The experiment",
@@ -53,6 +55,12 @@ def experiment(summary: Summary, arrays: Arrays) -> Raw:
             "soft",
         ),
     )
+
+
+def _said(summary: Summary) -> str:
+    """Which of two posteriors was used where, and why they differ."""
+    which, why = summary.get("posterior"), summary.get("why")
+    return f" {which}. {why or ''}" if isinstance(which, str) else ""
 
 
 def _names(arrays: Arrays, prefix: str) -> list[str]:

@@ -3,6 +3,7 @@
 Both are run directories: written at once or not at all, checked when they are read.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim2gp.errors import InputError
+from sim2gp.gaussian import Gaussian
 from sim2gp.models import AbstractBelief
 from sim2gp.planning import Policy
 from sim2gp.robot.policy import FORMAT
@@ -85,7 +87,26 @@ def export_model(
             expected="the posterior of a simulator's constants",
             fix="export the simulator's own belief",
         )
-    rows, central = _constants(belief, system, draws, key)
+    code = _compiled(belief, system) if compiled else None
+    about = {"dt": dt, "posterior": "belief"}
+    write_model(known, out, system, draws=draws, key=key, about=about, code=code)
+
+
+def write_model(
+    posterior: Gaussian,
+    out: Path | str,
+    system: AbstractSystem,
+    *,
+    draws: int,
+    key: Key,
+    about: Mapping[str, Any],
+    code: bytes | None = None,
+) -> dict[str, Any]:
+    """Write constants and ``draws`` of a Gaussian over virtual values; the summary.
+
+    ``about`` says what it is a posterior of. Files as `export_model` has them.
+    """
+    rows, central = _constants(posterior, system, draws, key)
     table = system.parameters
     units = dict(zip(table.names, table.units, strict=True))
     constants = {
@@ -96,29 +117,30 @@ def export_model(
         }
         for name in central
     }
-    about = {
+    model = {
         "system": type(system).__name__,
-        "dt": dt,
+        **about,
         "draws": draws,
         "constants": constants,
         **_channels(system),
     }
-    code = _compiled(belief, system) if compiled else None
+    summary = {"title": "A learned simulator", "model": model}
     with new_run(out, "export model") as writer:
         named = {f"draws/{name}": value for name, value in rows.items()}
         writer.write_arrays("arrays.npz", named)
         _write_variants(writer, system, rows)
         if code is not None:
             writer.write_bytes("step.jax", code)
-        writer.write_summary({"title": "A learned simulator", "model": about})
+        writer.write_summary(summary)
+    return summary
 
 
 @in_float64
 def _constants(
-    belief: Any, system: AbstractSystem, draws: int, key: Key
+    posterior: Gaussian, system: AbstractSystem, draws: int, key: Key
 ) -> tuple[dict[str, np.ndarray], dict[str, float]]:
     """Draws of every constant by name, and the one at the posterior's mean."""
-    table, posterior = system.parameters, belief.posterior
+    table = system.parameters
     tt = jax.vmap(posterior.sample)(jax.random.split(key, draws))
     rows = jax.vmap(table.values)(tt)
     central = table.values(posterior.mean)

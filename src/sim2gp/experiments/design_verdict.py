@@ -1,0 +1,140 @@
+"""What is asked of an experiment, and whether it is worth the robot's time."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from sim2gp.diagnose.words import digits, listed
+
+NARROWER = 0.05  # an experiment must narrow what is asked by this share
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What is asked of an experiment: the options of the command."""
+
+    seconds: float
+    kind: str
+    about: tuple[str, ...]
+    predict: float | None
+    within: float
+    limits: Mapping[str, tuple[float, float]]
+    rates: Mapping[str, float]
+    start: Mapping[str, float]
+    period: float | None
+    starts: int = 1
+    configuration: str | None = None
+
+    def words(self) -> str:
+        """As they were typed."""
+        parts = [f"--seconds {self.seconds:g}", f"--kind {self.kind}"]
+        parts += [f"--about {' '.join(self.about)}"] if self.about else []
+        parts += [f"--predict {self.predict:g}"] if self.predict else []
+        parts += [f"--within {self.within:g}"]
+        boxes = [f"{n}={low:g}:{high:g}" for n, (low, high) in self.limits.items()]
+        for option, pairs in (
+            ("--limit", boxes),
+            ("--rate", [f"{n}={x:g}" for n, x in self.rates.items()]),
+            ("--start", [f"{n}={x:g}" for n, x in self.start.items()]),
+        ):
+            parts += [f"{option} {' '.join(pairs)}"] if pairs else []
+        parts += [f"--period {self.period:g}"] if self.period else []
+        parts += [f"--starts {self.starts}"]
+        if self.configuration:
+            parts += [f"--configuration {self.configuration}"]
+        return " ".join(parts)
+
+
+def verdict(
+    asked: Asked, expected: Mapping[str, Mapping[str, Any]], nats: float
+) -> tuple[bool, str]:
+    """Whether it is worth the robot's time, and why.
+
+    What such an experiment cannot narrow is no reason to run it, and that is so of
+    what the model's errors add to the plain sd. But what is said to be known is the
+    corrected sd.
+    """
+    names = asked.about or tuple(expected)
+    told = [n for n in names if expected[n]["of_before"] <= 1.0 - NARROWER]
+    if not told:
+        return False, (
+            "Not worth running: within these limits nothing narrows "
+            f"{listed(names)} by more than {100.0 * NARROWER:.0f} %."
+        )
+    share, wide = (
+        {n: 100.0 * expected[n][sd] / abs(expected[n]["mean"]) for n in told}
+        for sd in ("sd", "corrected_sd")
+    )
+    poor = [n for n in told if share[n] > asked.within]
+    untold = [n for n in names if n not in told]
+    rest = f" It tells next to nothing of {listed(untold)}." if untold else ""
+    wider = [n for n in told if wide[n] > max(asked.within, share[n])]
+    if not poor and wider:
+        worst = max(wider, key=lambda n: wide[n])
+        return False, (
+            f"Not worth running: more data would narrow {listed(told)} within "
+            f"{asked.within:g} %, but the model's errors keep {worst} at "
+            f"{digits(wide[worst], 2)} %, and data do not reduce these.{rest}"
+        )
+    if not poor:
+        return False, (
+            f"Not worth running: {listed(told)} known within {asked.within:g} % "
+            f"already.{rest}"
+        )
+    worst = max(poor, key=lambda n: share[n])
+    now, after = (
+        digits(share[worst] * x, 2) for x in (1, expected[worst]["of_before"])
+    )
+    text = f"Worth running: {nats:.1f} nats. {worst}, known within"
+    if wide[worst] > share[worst]:
+        text += (
+            f" {digits(wide[worst], 2)} %, should come from {now} to {after} % but for "
+            "the model's errors"
+        )
+        return True, f"{text}.{rest}"
+    return True, f"{text} {now} % now, should be within {after} % after.{rest}"
+
+
+def foretold(asked: Asked, ahead: Mapping[str, float], nats: float) -> tuple[bool, str]:
+    """The same of a prediction, its sd in those of the sensors' noise.
+
+    Nobody can see that it is better than the sensors.
+    """
+    before, after, wide = (ahead[k] for k in ("before", "after", "corrected"))
+    what = f"what is predicted {asked.predict:g} s ahead"
+    now = f"{digits(before, 2)} sd of the sensors' noise"
+    if wide > before:
+        now += f" ({digits(wide, 2)} with the model's errors)"
+    if before <= 1.0:
+        return False, f"Not worth running: {what} is known within {now} already."
+    if after > (1.0 - NARROWER) * before:
+        return False, (
+            f"Not worth running: within these limits nothing narrows {what} by more "
+            f"than {100.0 * NARROWER:.0f} %; it is known within {now}."
+        )
+    return True, (
+        f"Worth running: {nats:.1f} nats; {what}, known within {now} now, should be "
+        f"within {digits(after, 2)} after."
+    )
+
+
+def expected_table(expected: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    rows = [
+        [
+            name,
+            f"{e['mean']:.4g} {e['unit']}",
+            f"{e['corrected_sd']:.2g}",
+            f"{e['sd']:.2g}",
+            f"{e['expected_sd']:.2g}",
+            f"{digits(100.0 * e['of_before'], 2)} %",
+        ]
+        for name, e in expected.items()
+    ]
+    return {
+        "title": "What the experiment should tell",
+        "columns": ["constant", "MAP", "corrected sd", "sd now", "sd after", "left"],
+        "rows": rows,
+        "note": "The corrected sd has the model's errors in it, and the limits of the "
+        "states hold for machines as different as that. The others are plain: expected "
+        "where the machine is as believed and its noise independent.",
+    }
