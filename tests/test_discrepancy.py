@@ -250,3 +250,22 @@ def test_the_words_say_whether_physics_is_missing() -> None:
     assert "a probability of 4 % and is allowed for" in text
     none = Corrected(posterior, 9.0, 1, 30.0, True)
     assert "not physics that the model lacks" in intervals.words(none, [3.0], 40)
+
+
+def test_a_wide_interval_says_why_in_one_sentence() -> None:
+    """Where the two sd differ by more than a factor of 3, and only there."""
+    flat = Gaussian(jnp.zeros(1), jnp.ones((1, 1)))
+    coloured = Corrected(flat, 81.0, 1, 40.0, True)
+    assert intervals.why(coloured, [0.9, 3.0], 340) is None
+    assert intervals.why(Corrected(flat, 81.0, 1, 2.0, False), [9.0], 3) is None
+    text = intervals.why(coloured, [12.0, 41.0], 340)
+    assert text is not None
+    assert "12 to 41 times" in text
+    assert "9 times as far" in text
+    assert "physics" not in text
+    missing = Corrected(flat, 1.0, 1, 40.0, True, 0.93, ("spring",), flat)
+    text = intervals.why(missing, [1.0, 5.0], 340)
+    assert text is not None
+    assert "93 %" in text
+    assert "white noise" not in text
+    assert text.count(". ") == 0

@@ -243,8 +243,8 @@ def _allowed(found: Corrected) -> str:
         return (
             f"The model lacks physics with a probability of {_sure(found)}: intervals "
             f"allow for {len(found.effects)} effects of its library (friction, "
-            "springs, drag and the like), and constants lie where they would with them. sim2gp "
-            "explain tries the effects one by one."
+            "springs, drag and the like), and constants lie where they would with "
+            "them. sim2gp explain tries the effects one by one."
         )
     return (
         f"That the model lacks some of {len(found.effects)} effects of its library has "
