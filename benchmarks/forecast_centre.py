@@ -15,7 +15,7 @@ import numpy as np
 
 from sim2gp.diagnose.discrepancy import corrected_windows
 from sim2gp.experiments.prediction import channels, cut_logs, predicted, recordings
-from sim2gp.models.grid import evaluation_windows, steps_of
+from sim2gp.models.grid import CURVE, evaluation_windows, steps_of
 from sim2gp.models.windows import fit_windows
 from sim2gp.project import load_project
 from sim2gp.types import in_float64
@@ -37,7 +37,7 @@ def compare(path: Path) -> list[str]:
     robust = project.spec.likelihood.robust
     belief = fit_windows(system, windows, key=jax.random.key(0), robust=robust)
     wide = corrected_windows(belief.informed(), windows, of).posterior
-    grid = evaluation_windows(others, system, longest=HORIZONS[-1])
+    grid = evaluation_windows(others, system, longest=CURVE[-1])
     lines = []
     for name, posterior in (("MAP", belief.posterior), ("corrected mean", wide)):
         found = predicted(system, posterior, grid, HORIZONS[0])
