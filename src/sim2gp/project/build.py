@@ -13,16 +13,19 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from sim2gp.configurations import AT
 from sim2gp.errors import InputError, nearest
 from sim2gp.parameters import Parameter, Parameters, unknown_parameter
+from sim2gp.project import slips
 from sim2gp.project.priors import located, prior
 from sim2gp.project.schema import (
     EFFECT_OPTIONS,
     ActuatorSpec,
+    ColumnSpec,
     EffectSpec,
     LogSpec,
-    PriorSpec,
+    ParameterSpec,
     ProjectSpec,
 )
 from sim2gp.project.source import Source
+from sim2gp.project.validate import words
 from sim2gp.systems import (
     AbstractMechanism,
     AbstractSystem,
@@ -96,25 +99,28 @@ def _options(
         where = source.where("options", name)
         if name not in known:
             raise unknown("option", name, known, where)
-        adapter = TypeAdapter(hints[name], config=ConfigDict(strict=True))
-        value = tuple(value) if isinstance(value, list) else value
+        strict = ConfigDict(strict=True, allow_inf_nan=False)
+        adapter = TypeAdapter(hints[name], config=strict)
+        given = tuple(value) if isinstance(value, list) else value
         try:
-            out[name] = adapter.validate_python(value)
+            out[name] = adapter.validate_python(given)
         except ValidationError as error:
+            expected = words({**error.errors()[0]})
+            fix = slips.of_value(("options", name), value, expected)
             raise InputError(
                 "E160",
                 "wrong value",
                 where=where,
                 got=repr(value)[:40],
-                expected=str(error.errors()[0]["msg"]).lower(),
-                fix="correct the value",
+                expected=expected,
+                fix=fix or "correct the value",
             ) from error
     return out
 
 
 def _table(
     table: Parameters,
-    specs: Mapping[str, PriorSpec | float],
+    specs: Mapping[str, ParameterSpec | float],
     source: Source,
     path: tuple[str, ...],
 ) -> Parameters:
@@ -123,7 +129,7 @@ def _table(
     changes = {}
     for name, stated in specs.items():
         where = source.where(*path, name)
-        if isinstance(stated, PriorSpec) and stated.tie:
+        if isinstance(stated, ParameterSpec) and stated.tie:
             raise unknown("option", "tie", (), where)
         if name in table.names:
             base = table[name]
@@ -132,7 +138,7 @@ def _table(
         else:
             known = [*table.names, *fixed]
             raise located(unknown_parameter(name, known), where)
-        changes[name] = prior(stated, base, where)
+        changes[name] = prior(stated, base, where, fixed.get(name))
     return table.replace(**changes)
 
 
@@ -145,35 +151,94 @@ def _perturbed(
     assert isinstance(system, AbstractMechanism)  # as every class of `SYSTEMS` is
     added: list[AbstractEffect] = []
     stated: dict[str, Parameter | float] = {}
+    possible = _possible(system)
     for where, kinds in specs.items():
         for what, said in kinds.items():
             line = source.where("effects", where, what)
-            if what not in EFFECTS:
-                raise unknown("effect", what, EFFECTS, line)
+            if what not in possible.get(where, ()):
+                raise _impossible(what, where, possible, line)
             effect = _effect(what, where, said, line)
-            try:
-                base = effect.parameter(system)
-            except InputError as error:
-                raise located(error, line) from error
             added.append(effect)
-            stated[effect.name] = prior(said, base, line)
+            base = effect.parameter(system)
+            stated[effect.name] = prior(said, base, line, own=0.0)
     table = Perturbed(system, added).parameters.replace(**stated)
     return Perturbed(system, added, table)
+
+
+def _possible(system: AbstractMechanism) -> dict[str, list[str]]:
+    """The effects that a machine can have, by joint and input."""
+    found: dict[str, list[str]] = {}
+    for channel in (*system.states[:2], *system.actions):
+        for what, kind in EFFECTS.items():
+            try:
+                kind(where=channel.name, magnitude=1.0).unit(system)
+            except InputError:
+                continue
+            found.setdefault(channel.name, []).append(what)
+    return found
+
+
+def _impossible(
+    what: str, where: str, possible: Mapping[str, list[str]], line: str
+) -> InputError:
+    """An effect that this machine, or this channel, cannot have (E103, E145, E160)."""
+    homes = [channel for channel, kinds in possible.items() if what in kinds]
+    if where in EFFECTS:  # [effects.coulomb] and below it the keys of a prior
+        fix = f"write [effects.CHANNEL.{where}]"
+        return InputError(
+            "E103",
+            "unknown channel",
+            where=line,
+            got=where,
+            expected="one of " + ", ".join(possible),
+            fix=fix,
+        )
+    if what not in EFFECTS:
+        return unknown("effect", what, possible.get(where, EFFECTS), line)
+    if homes and where not in possible:
+        close = nearest(where, homes) or homes[0]
+        return InputError(
+            "E103",
+            "unknown channel",
+            where=line,
+            got=where,
+            expected="one of " + ", ".join(homes),
+            fix=f"did you mean {close}",
+        )
+    known = possible.get(where) or sorted(
+        {k for kinds in possible.values() for k in kinds}
+    )
+    return InputError(
+        "E145",
+        f"no {what} on this machine" if not homes else f"no {what} on {where}",
+        where=line,
+        got=f"{where}.{what}",
+        expected="one of " + ", ".join(known),
+        fix=f"write [effects.{homes[0]}.{what}]" if homes else "use one of these",
+    )
 
 
 def _effect(
     what: str, where: str, said: EffectSpec | float, line: str
 ) -> AbstractEffect:
     """The effect of a name on a channel, with the options it has (E160)."""
+    known = [field.name for field in dataclasses.fields(EFFECTS[what])]
+    options = effect_options(what, said, known[2:], line)
+    made: AbstractEffect = EFFECTS[what](where=where, magnitude=1.0, **options)
+    return made
+
+
+def effect_options(
+    what: str, said: EffectSpec | float, known: Collection[str], line: str
+) -> dict[str, float]:
+    """What an effect has beside its magnitude, each one that it knows (E160)."""
     stated = () if isinstance(said, float) else EFFECT_OPTIONS
     given = {name: getattr(said, name) for name in stated}
     options = {name: value for name, value in given.items() if value is not None}
-    known = [f.name for f in dataclasses.fields(EFFECTS[what])]
     for name in options:
         if name not in known:
-            raise unknown(f"option of {what}", name, known[2:], line)
-    made: AbstractEffect = EFFECTS[what](where=where, magnitude=1.0, **options)
-    return made
+            raise unknown(f"option of {what}", name, known, line)
+    return options
 
 
 def actuated(
@@ -191,7 +256,8 @@ def actuated(
             said = getattr(spec, part)
             where = source.where("actuators", name, part)
             base = actuator_prior(channels[name], part)
-            chosen = base if said == "free" else prior(said, base, where)
+            own = None if part == "delay" else ActuatorSpec.model_fields[part].default
+            chosen = base if said == "free" else prior(said, base, where, own)
             _check_delay(part, chosen, where)
             stated[f"{name}.{part}"] = chosen
     return Actuated(system, stated)
@@ -213,13 +279,14 @@ def _check_delay(part: str, stated: Parameter | float, where: str) -> None:
 def unknown(kind: str, name: str, known: Collection[str], where: str) -> InputError:
     """E160 with the name that was probably meant."""
     close = nearest(name, known)
+    fix = f"did you mean {close}" if close else slips.elsewhere(name)
     return InputError(
         "E160",
         f"unknown {kind}",
         where=where,
         got=name,
         expected="one of " + ", ".join(known) if known else f"no {kind}",
-        fix=f"did you mean {close}" if close else "use a known name",
+        fix=fix or ("use a known name" if known else "remove it"),
     )
 
 
@@ -233,6 +300,9 @@ def check_names(spec: ProjectSpec, source: Source, system: AbstractSystem) -> No
             where = source.where("logs", i, "columns", name)
             if name not in (*states, *inputs):
                 raise unknown("channel", name, [*states, *inputs], where)
+            if isinstance(value, ColumnSpec) and value.saturation is not None:
+                low, high = value.saturation
+                _check_pair(f"saturation of {name}", low, high, where)
             if isinstance(value, float) and name not in inputs:
                 raise InputError(
                     "E160",
@@ -259,16 +329,31 @@ def check_names(spec: ProjectSpec, source: Source, system: AbstractSystem) -> No
     for name in spec.rates:
         if name not in inputs:
             raise unknown("input", name, inputs, source.where("rates", name))
-    for section, key, named in (
-        ("likelihood", "start_sd", spec.likelihood.start_sd),
-        ("likelihood", "noise_floor", spec.likelihood.noise_floor),
-        ("task", "target", spec.task.target),
-        ("task", "weights", spec.task.weights),
+    _check_likelihood(spec, source, states)
+
+
+def _check_likelihood(spec: ProjectSpec, source: Source, states: list[str]) -> None:
+    """What the file says of windows, of states, and of noise is what is fitted."""
+    stated = spec.likelihood
+    if stated.window == 0.0 and "start" in stated.model_fields_set:
+        raise InputError(
+            "E160",
+            "start of windows of one step",
+            where=source.where("likelihood", "start"),
+            got=f'window = 0, start = "{stated.start}"',
+            expected="no start: a step begins at its first row",
+            fix="remove start, or set window to some tenths of a second",
+        )
+    named = {name for group in spec.logs for name in group.columns}
+    measured = [name for name in states if name in named] or states
+    for key, given, kind, known in (
+        ("start_sd", stated.start_sd, "state", states),
+        ("noise_floor", stated.noise_floor, "measured state", measured),
     ):
-        for name in named if isinstance(named, dict) else ():
-            if name not in (*states, *inputs):
-                where = source.where(section, key, name)
-                raise unknown("channel", name, [*states, *inputs], where)
+        for name in given if isinstance(given, dict) else ():
+            if name not in known:
+                where = source.where("likelihood", key, name)
+                raise unknown(kind, name, known, where)
 
 
 def _check_complete(
@@ -293,6 +378,15 @@ def _check_complete(
 
 def _check_clock(group: LogSpec, source: Source, i: int) -> None:
     """Time comes from a column or a period; rows from a period or from stamps."""
+    if isinstance(group.time, ColumnSpec) and group.time.saturation is not None:
+        raise InputError(
+            "E160",
+            "saturation of a clock",
+            where=source.where("logs", i, "time", "saturation"),
+            got=f"saturation = {group.time.saturation}",
+            expected="column, unit, sign, scale, offset",
+            fix="remove it, or leave rows out by exclude",
+        )
     pairs: list[tuple[str, str, object, object]]
     pairs = [("time", "period", group.time, group.period)]
     if group.resample is not None:
