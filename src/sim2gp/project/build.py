@@ -3,59 +3,29 @@
 This half of the project loads the simulators; `sim2gp.project.schema` does not.
 """
 
-import dataclasses
 import inspect
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from typing import Any, get_type_hints
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from sim2gp.configurations import AT
-from sim2gp.errors import InputError, nearest
+from sim2gp.errors import InputError
 from sim2gp.parameters import Parameter, Parameters, unknown_parameter
 from sim2gp.project import slips
+from sim2gp.project.effects import perturbed
 from sim2gp.project.priors import located, prior
 from sim2gp.project.schema import (
-    EFFECT_OPTIONS,
     ActuatorSpec,
     ColumnSpec,
-    EffectSpec,
     LogSpec,
     ParameterSpec,
     ProjectSpec,
 )
 from sim2gp.project.source import Source
-from sim2gp.project.validate import words
-from sim2gp.systems import (
-    AbstractMechanism,
-    AbstractSystem,
-    Perturbed,
-    effects,
-    placement,
-)
+from sim2gp.project.validate import unknown, words
+from sim2gp.systems import AbstractSystem
 from sim2gp.systems.actuator import Actuated, actuator_prior
-from sim2gp.systems.effects import AbstractEffect
-
-#: Effects by the last part of their constant's name, ``<channel>.<effect>``.
-EFFECTS: dict[str, Any] = {
-    kind.what: kind
-    for kind in (
-        effects.BackEmf,
-        placement.BaseTilt,
-        placement.BaseTiltSide,
-        effects.Coulomb,
-        effects.DeadZone,
-        effects.Drag,
-        placement.EncoderOffset,
-        placement.Payload,
-        effects.PoleGeometry,
-        effects.RailFriction,
-        effects.RailTilt,
-        effects.RodInertia,
-        effects.Spring,
-        effects.Stribeck,
-    )
-}
 
 
 def build_system(
@@ -80,7 +50,7 @@ def build_system(
     table = _table(plain.parameters, shared, source, ("parameters",))
     system: AbstractSystem = kind(parameters=table, **options)
     if spec.effects:
-        system = _perturbed(system, spec.effects, source)
+        system = perturbed(system, spec.effects, source)
     return actuated(system, spec.actuators, source)
 
 
@@ -142,105 +112,6 @@ def _table(
     return table.replace(**changes)
 
 
-def _perturbed(
-    system: AbstractSystem,
-    specs: Mapping[str, Mapping[str, EffectSpec | float]],
-    source: Source,
-) -> AbstractSystem:
-    """The machine with the effects of the file; magnitudes are constants by name."""
-    assert isinstance(system, AbstractMechanism)  # as every class of `SYSTEMS` is
-    added: list[AbstractEffect] = []
-    stated: dict[str, Parameter | float] = {}
-    possible = _possible(system)
-    for where, kinds in specs.items():
-        for what, said in kinds.items():
-            line = source.where("effects", where, what)
-            if what not in possible.get(where, ()):
-                raise _impossible(what, where, possible, line)
-            effect = _effect(what, where, said, line)
-            added.append(effect)
-            base = effect.parameter(system)
-            stated[effect.name] = prior(said, base, line, own=0.0)
-    table = Perturbed(system, added).parameters.replace(**stated)
-    return Perturbed(system, added, table)
-
-
-def _possible(system: AbstractMechanism) -> dict[str, list[str]]:
-    """The effects that a machine can have, by joint and input."""
-    found: dict[str, list[str]] = {}
-    for channel in (*system.states[:2], *system.actions):
-        for what, kind in EFFECTS.items():
-            try:
-                kind(where=channel.name, magnitude=1.0).unit(system)
-            except InputError:
-                continue
-            found.setdefault(channel.name, []).append(what)
-    return found
-
-
-def _impossible(
-    what: str, where: str, possible: Mapping[str, list[str]], line: str
-) -> InputError:
-    """An effect that this machine, or this channel, cannot have (E103, E145, E160)."""
-    homes = [channel for channel, kinds in possible.items() if what in kinds]
-    if where in EFFECTS:  # [effects.coulomb] and below it the keys of a prior
-        fix = f"write [effects.CHANNEL.{where}]"
-        return InputError(
-            "E103",
-            "unknown channel",
-            where=line,
-            got=where,
-            expected="one of " + ", ".join(possible),
-            fix=fix,
-        )
-    if what not in EFFECTS:
-        return unknown("effect", what, possible.get(where, EFFECTS), line)
-    if homes and where not in possible:
-        close = nearest(where, homes) or homes[0]
-        return InputError(
-            "E103",
-            "unknown channel",
-            where=line,
-            got=where,
-            expected="one of " + ", ".join(homes),
-            fix=f"did you mean {close}",
-        )
-    known = possible.get(where) or sorted(
-        {k for kinds in possible.values() for k in kinds}
-    )
-    return InputError(
-        "E145",
-        f"no {what} on this machine" if not homes else f"no {what} on {where}",
-        where=line,
-        got=f"{where}.{what}",
-        expected="one of " + ", ".join(known),
-        fix=f"write [effects.{homes[0]}.{what}]" if homes else "use one of these",
-    )
-
-
-def _effect(
-    what: str, where: str, said: EffectSpec | float, line: str
-) -> AbstractEffect:
-    """The effect of a name on a channel, with the options it has (E160)."""
-    known = [field.name for field in dataclasses.fields(EFFECTS[what])]
-    options = effect_options(what, said, known[2:], line)
-    made: AbstractEffect = EFFECTS[what](where=where, magnitude=1.0, **options)
-    return made
-
-
-def effect_options(
-    what: str, said: EffectSpec | float, known: Collection[str], line: str
-) -> dict[str, float]:
-    """What an effect has beside its magnitude, each one that it knows (E160)."""
-    stated = () if isinstance(said, float) else EFFECT_OPTIONS
-    given = {name: getattr(said, name) for name in stated}
-    options = {name: value for name, value in given.items() if value is not None}
-    for name in options:
-        if name not in known:
-            raise unknown(f"option of {what}", name, known, line)
-    return options
-
-
 def actuated(
     system: AbstractSystem, specs: Mapping[str, ActuatorSpec], source: Source
 ) -> AbstractSystem:
@@ -274,20 +145,6 @@ def _check_delay(part: str, stated: Parameter | float, where: str) -> None:
             expected="a delay of at least 0 s",
             fix="state low and high, with low >= 0",
         )
-
-
-def unknown(kind: str, name: str, known: Collection[str], where: str) -> InputError:
-    """E160 with the name that was probably meant."""
-    close = nearest(name, known)
-    fix = f"did you mean {close}" if close else slips.elsewhere(name)
-    return InputError(
-        "E160",
-        f"unknown {kind}",
-        where=where,
-        got=name,
-        expected="one of " + ", ".join(known) if known else f"no {kind}",
-        fix=fix or ("use a known name" if known else "remove it"),
-    )
 
 
 def check_names(spec: ProjectSpec, source: Source, system: AbstractSystem) -> None:

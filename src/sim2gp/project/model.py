@@ -14,10 +14,12 @@ from pathlib import Path
 from sim2gp.configurations import AT
 from sim2gp.errors import InputError
 from sim2gp.parameters import Parameter
-from sim2gp.project.build import actuated, effect_options, unknown
+from sim2gp.project.build import actuated
+from sim2gp.project.effects import effect_options
 from sim2gp.project.priors import located, prior
 from sim2gp.project.schema import ParameterSpec, ProjectSpec
 from sim2gp.project.source import Source
+from sim2gp.project.validate import unknown
 from sim2gp.systems import AbstractSystem, MuJoCo
 from sim2gp.systems.base import AbstractPlant
 from sim2gp.systems.mjcf import SIGNED, Constant, constants_of, matching

@@ -4,12 +4,12 @@ An unknown key, a missing one and a value of the wrong kind each name the line, 
 was expected there, and what to write (`sim2gp.project.slips`).
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from pydantic import ValidationError
 
-from sim2gp.errors import InputError
+from sim2gp.errors import InputError, nearest
 from sim2gp.project import slips
 from sim2gp.project.schema import RESERVED, ProjectSpec, keys_at
 from sim2gp.project.source import Path_, Source
@@ -46,7 +46,7 @@ def validated(source: Source) -> ProjectSpec:
     if error["type"] == "missing":
         raise _missing(source, path, error)
     if error["type"] == "extra_forbidden":
-        raise _unknown(source, path, error["input"])
+        raise _unknown_key(source, path, error["input"])
     raise _wrong(source, path, error, [e for p, e in deep if p == path])
 
 
@@ -78,7 +78,7 @@ def _missing(source: Source, path: Path_, error: dict[str, Any]) -> InputError:
     )
 
 
-def _unknown(source: Source, path: Path_, value: Any) -> InputError:
+def _unknown_key(source: Source, path: Path_, value: Any) -> InputError:
     where, key = source.where(*path), str(path[-1])
     if len(path) == 1 and key in RESERVED:
         named = key == "model" and isinstance(value, str)
@@ -123,6 +123,20 @@ def _wrong(
         got=repr(value)[:40],
         expected=expected,
         fix=fix or (f"write {expected}" if plain else "correct the value"),
+    )
+
+
+def unknown(kind: str, name: str, known: Collection[str], where: str) -> InputError:
+    """E160 with the name that was probably meant."""
+    close = nearest(name, known)
+    fix = f"did you mean {close}" if close else slips.elsewhere(name)
+    return InputError(
+        "E160",
+        f"unknown {kind}",
+        where=where,
+        got=name,
+        expected="one of " + ", ".join(known) if known else f"no {kind}",
+        fix=fix or ("use a known name" if known else "remove it"),
     )
 
 
