@@ -23,7 +23,7 @@ from sim2gp.project.schema import (
     ProjectSpec,
 )
 from sim2gp.project.source import Source
-from sim2gp.project.validate import unknown, words
+from sim2gp.project.validate import unknown, words, wrong_value
 from sim2gp.systems import AbstractSystem
 from sim2gp.systems.actuator import Actuated, actuator_prior
 
@@ -77,14 +77,7 @@ def _options(
         except ValidationError as error:
             expected = words({**error.errors()[0]})
             fix = slips.of_value(("options", name), value, expected)
-            raise InputError(
-                "E160",
-                "wrong value",
-                where=where,
-                got=repr(value)[:40],
-                expected=expected,
-                fix=fix or "correct the value",
-            ) from error
+            raise wrong_value("E160", where, value, expected, fix) from error
     return out
 
 

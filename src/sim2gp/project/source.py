@@ -66,7 +66,10 @@ def read_source(path: Path) -> Source:
         values = tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
         raise _yaml(name, bare) or _syntax(name, text, str(error)) from error
-    source = Source(name, text, values, dict(_lines(text, bare)))
+    lines: dict[Path_, int] = {}
+    for key, line in _lines(text, bare):
+        lines.setdefault(key, line)  # of a table in pieces, the first
+    source = Source(name, text, values, lines)
     for key, value in _leaves(values, ()):
         if _is_hostile(key, value):
             raise InputError(
@@ -165,7 +168,8 @@ def _lines(text: str, bare: str) -> Iterator[tuple[Path_, int]]:
             if found:
                 parts = _parts(found.group(1))
                 table = _resolve(parts, counts, double)
-                yield table, number
+                for end in range(1, len(table) + 1):
+                    yield table[:end], number
             continue
         found = _DOTTED.match(line) if depth == 0 else None
         if found and line[found.end() :].startswith("="):

@@ -113,13 +113,21 @@ def _wrong(
     elif {"sd", "start_sd", "noise_floor"} & set(path):
         code = "E144" if kind in ("greater_than", "finite_number") else "E160"
     fix = slips.of_value(path, value, expected)
-    if not fix and kind == "literal_error":
-        fix = slips.of_choice(value, error["ctx"]["expected"])
+    choices = [e["ctx"]["expected"] for e in same if e["type"] == "literal_error"]
+    if choices and not fix:
+        fix = slips.of_choice(value, choices[0])
+    return wrong_value(code, source.where(*path), value, expected, fix)
+
+
+def wrong_value(
+    code: str, where: str, value: Any, expected: str, fix: str
+) -> InputError:
+    """A value of another kind or size, and what to write where no slip is known."""
     plain = expected.startswith(("a ", "one ", "text", "true", "two "))
     return InputError(
         code,
         "wrong value",
-        where=source.where(*path),
+        where=where,
         got=repr(value)[:40],
         expected=expected,
         fix=fix or (f"write {expected}" if plain else "correct the value"),
