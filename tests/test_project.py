@@ -44,10 +44,7 @@ delay = {low = 0.0, high = 0.02}
 [likelihood]
 window = 0.2
 
-[task]
 [limits]
-[model]
-[planner]
 """
 
 
@@ -150,11 +147,10 @@ SCHEMA_FAULTS: list[tuple[str, str, list[str]]] = [
     (BASE.replace("delay", "dealy"), "E160", ["line 22", "did you mean delay"]),
     (BASE.replace("high = 0.02", "hi = 1"), "E160", ["line 22", "did you mean high"]),
     (BASE.replace("time =", "tiem ="), "E160", ["line 12", "did you mean time"]),
-    (BASE + "elite = 3", "E160", ["line 31", "did you mean elites"]),
     (BASE.replace('"two_link"', '"twolink"'), "E160", ["line 1", "mean two_link"]),
     (BASE.replace("mean = 0.5", 'mean = "1e-3"'), "E160", ["line 7", "quotes"]),
     (BASE.replace("mean = 0.5", "mean = true"), "E160", ["line 7", "True"]),
-    (BASE.replace('["logs/*.csv"]', '"logs"'), "E160", ["line 11", "a list"]),
+    (BASE.replace('["logs/*.csv"]', '"logs"'), "E160", ["line 11", 'files = ["logs"]']),
     (BASE.replace("[[12.0, 13.5]]", "[[1.0]]"), "E160", ["line 13", "exclude"]),
     (BASE.replace("window = 0.2", "window = -1"), "E160", ["line 25", "or equal to 0"]),
     (BASE.replace("window = 0.2", "window = yes"), "E160", ["line 25", "TOML"]),
@@ -163,8 +159,6 @@ SCHEMA_FAULTS: list[tuple[str, str, list[str]]] = [
     (BASE.replace("9.81", '"9.81"'), "E160", ["line 4", "number"]),
     (with_lines("locked = [true]"), "E160", ["line 4", "locked"]),
     (BASE.replace("high = 0.02", "high = inf"), "E141", ["line 22", "finite"]),
-    (BASE + "samples = 0", "E148", ["line 31", "samples"]),
-    (BASE + "samples = 8\nelites = 9", "E148", ["line 32", "9 of 8"]),
     (
         BASE.replace("mean = 0.5", "mean = 0.5\nmean = 1"),
         "E145",
@@ -185,7 +179,7 @@ def test_faults_of_shape(case: int, tmp_path: Path) -> None:
 
 NAME_FAULTS: list[tuple[str, str, list[str]]] = [
     (BASE.replace("parameters.m2", "parameters.m22"), "E145", ["line 6", "mean m2"]),
-    (BASE + "[parameters]\nmm2 = 1.0", "E145", ["line 32", "m2"]),
+    (BASE + "[parameters]\nmm2 = 1.0", "E145", ["line 29", "m2"]),
     (BASE.replace("torque1]", "torqe1]"), "E160", ["line 21", "mean torque1"]),
     (BASE.replace("q1 =", "q_1 ="), "E160", ["line 16", "mean q1"]),
     (BASE.replace('torque2 = "tau_con2"', ""), "E160", ["line 15", "torque2"]),
@@ -201,9 +195,8 @@ NAME_FAULTS: list[tuple[str, str, list[str]]] = [
     (BASE.replace("mean = 0.5\nsd = 0.1", ""), "E160", ["line 6", "nothing stated"]),
     (BASE.replace("[[12.0, 13.5]]", "[[2.0, 1.0]]"), "E141", ["line 13", "[2, 1]"]),
     (with_lines("q1 = [1, -1]", after="[limits]"), "E141", ["limits of q1"]),
-    (with_lines("q7 = [-1, 1]", after="[limits]"), "E160", ["line 29", "q7"]),
+    (with_lines("q7 = [-1, 1]", after="[limits]"), "E160", ["line 28", "q7"]),
     (with_lines("start_sd.q9 = 1", after="[likelihood]"), "E160", ["line 25", "q9"]),
-    (with_lines("target.q9 = 1", after="[task]"), "E160", ["line 28", "q9"]),
     (
         BASE.replace("[actuators", "[logs.fixed]\nm3 = 1.0\n[actuators"),
         "E145",

@@ -3,7 +3,8 @@
     python docs/site/stage.py build/docs/pages
 
 The pages are plain Markdown that reads as it is; three things are said differently for
-the site. A fence ```` ```python nightly ```` loses what the tests say to themselves; a
+the site. A fence ```` ```python nightly ```` loses what the tests say to themselves (so
+does that of a part of a project file, which names the system that completes it); a
 link that leaves docs/ takes its target along, since a site is one folder; and what
 README calls the tree is the reference. That has a page for each package of sim2gp, and
 one for the modules beside them, so that a new module is in it without being entered.
@@ -24,7 +25,7 @@ TOP = {"CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
 CORE = "core"
 DEFINITIONS = (ast.ClassDef, ast.FunctionDef)
 
-FENCE = re.compile(r"^```python[^\n]*$", re.MULTILINE)
+FENCE = re.compile(r"^```(python|toml)[^\n]*$", re.MULTILINE)
 LINK = re.compile(r"(?<=\]\()([^)#\s]+)")
 CODE = re.compile(r"^```.*?^```\s*?$|`[^`\n]+`", re.MULTILINE | re.DOTALL)
 
@@ -46,7 +47,7 @@ def main(out: Path) -> None:
 
 def staged(page: Path, out: Path) -> str:
     """The text of a page of the repository as a page of the site."""
-    text = FENCE.sub("```python", page.read_text(encoding="utf-8"))
+    text = FENCE.sub(r"```\1", page.read_text(encoding="utf-8"))
     # Code keeps its brackets: a link is looked for between the pieces of code alone.
     pieces, end = [], 0
     for code in CODE.finditer(text):

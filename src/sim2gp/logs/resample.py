@@ -71,8 +71,18 @@ def joined(
     tracks: Sequence[Track], resample: Resample | None, source: str
 ) -> tuple[Track, list[Note]]:
     """One track of all, and what was done to get it (E103, E116)."""
-    if len(tracks) == 1 and resample is None:
-        return tracks[0], []
+    if len(tracks) == 1:
+        if resample is None:
+            return tracks[0], []
+        if resample.period is None and resample.stamps is None:
+            raise InputError(
+                "E160",
+                "nothing to resample",
+                where=source,
+                got="one stream, and neither period nor stamps",
+                expected="rows at a period, or several streams",
+                fix="remove resample, or add period to it",
+            )
     rule = resample or Resample()
     at, cuts, place = _clock(tracks, rule, source)
     channels: dict[str, Values] = {}

@@ -3,56 +3,29 @@
 This half of the project loads the simulators; `sim2gp.project.schema` does not.
 """
 
-import dataclasses
 import inspect
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from typing import Any, get_type_hints
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from sim2gp.configurations import AT
-from sim2gp.errors import InputError, nearest
+from sim2gp.errors import InputError
 from sim2gp.parameters import Parameter, Parameters, unknown_parameter
+from sim2gp.project import slips
+from sim2gp.project.effects import perturbed
 from sim2gp.project.priors import located, prior
 from sim2gp.project.schema import (
-    EFFECT_OPTIONS,
     ActuatorSpec,
-    EffectSpec,
+    ColumnSpec,
     LogSpec,
-    PriorSpec,
+    ParameterSpec,
     ProjectSpec,
 )
 from sim2gp.project.source import Source
-from sim2gp.systems import (
-    AbstractMechanism,
-    AbstractSystem,
-    Perturbed,
-    effects,
-    placement,
-)
+from sim2gp.project.validate import unknown, words, wrong_value
+from sim2gp.systems import AbstractSystem
 from sim2gp.systems.actuator import Actuated, actuator_prior
-from sim2gp.systems.effects import AbstractEffect
-
-#: Effects by the last part of their constant's name, ``<channel>.<effect>``.
-EFFECTS: dict[str, Any] = {
-    kind.what: kind
-    for kind in (
-        effects.BackEmf,
-        placement.BaseTilt,
-        placement.BaseTiltSide,
-        effects.Coulomb,
-        effects.DeadZone,
-        effects.Drag,
-        placement.EncoderOffset,
-        placement.Payload,
-        effects.PoleGeometry,
-        effects.RailFriction,
-        effects.RailTilt,
-        effects.RodInertia,
-        effects.Spring,
-        effects.Stribeck,
-    )
-}
 
 
 def build_system(
@@ -77,7 +50,7 @@ def build_system(
     table = _table(plain.parameters, shared, source, ("parameters",))
     system: AbstractSystem = kind(parameters=table, **options)
     if spec.effects:
-        system = _perturbed(system, spec.effects, source)
+        system = perturbed(system, spec.effects, source)
     return actuated(system, spec.actuators, source)
 
 
@@ -96,25 +69,21 @@ def _options(
         where = source.where("options", name)
         if name not in known:
             raise unknown("option", name, known, where)
-        adapter = TypeAdapter(hints[name], config=ConfigDict(strict=True))
-        value = tuple(value) if isinstance(value, list) else value
+        strict = ConfigDict(strict=True, allow_inf_nan=False)
+        adapter = TypeAdapter(hints[name], config=strict)
+        given = tuple(value) if isinstance(value, list) else value
         try:
-            out[name] = adapter.validate_python(value)
+            out[name] = adapter.validate_python(given)
         except ValidationError as error:
-            raise InputError(
-                "E160",
-                "wrong value",
-                where=where,
-                got=repr(value)[:40],
-                expected=str(error.errors()[0]["msg"]).lower(),
-                fix="correct the value",
-            ) from error
+            expected = words({**error.errors()[0]})
+            fix = slips.of_value(("options", name), value, expected)
+            raise wrong_value("E160", where, value, expected, fix) from error
     return out
 
 
 def _table(
     table: Parameters,
-    specs: Mapping[str, PriorSpec | float],
+    specs: Mapping[str, ParameterSpec | float],
     source: Source,
     path: tuple[str, ...],
 ) -> Parameters:
@@ -123,7 +92,7 @@ def _table(
     changes = {}
     for name, stated in specs.items():
         where = source.where(*path, name)
-        if isinstance(stated, PriorSpec) and stated.tie:
+        if isinstance(stated, ParameterSpec) and stated.tie:
             raise unknown("option", "tie", (), where)
         if name in table.names:
             base = table[name]
@@ -132,48 +101,8 @@ def _table(
         else:
             known = [*table.names, *fixed]
             raise located(unknown_parameter(name, known), where)
-        changes[name] = prior(stated, base, where)
+        changes[name] = prior(stated, base, where, fixed.get(name))
     return table.replace(**changes)
-
-
-def _perturbed(
-    system: AbstractSystem,
-    specs: Mapping[str, Mapping[str, EffectSpec | float]],
-    source: Source,
-) -> AbstractSystem:
-    """The machine with the effects of the file; magnitudes are constants by name."""
-    assert isinstance(system, AbstractMechanism)  # as every class of `SYSTEMS` is
-    added: list[AbstractEffect] = []
-    stated: dict[str, Parameter | float] = {}
-    for where, kinds in specs.items():
-        for what, said in kinds.items():
-            line = source.where("effects", where, what)
-            if what not in EFFECTS:
-                raise unknown("effect", what, EFFECTS, line)
-            effect = _effect(what, where, said, line)
-            try:
-                base = effect.parameter(system)
-            except InputError as error:
-                raise located(error, line) from error
-            added.append(effect)
-            stated[effect.name] = prior(said, base, line)
-    table = Perturbed(system, added).parameters.replace(**stated)
-    return Perturbed(system, added, table)
-
-
-def _effect(
-    what: str, where: str, said: EffectSpec | float, line: str
-) -> AbstractEffect:
-    """The effect of a name on a channel, with the options it has (E160)."""
-    stated = () if isinstance(said, float) else EFFECT_OPTIONS
-    given = {name: getattr(said, name) for name in stated}
-    options = {name: value for name, value in given.items() if value is not None}
-    known = [f.name for f in dataclasses.fields(EFFECTS[what])]
-    for name in options:
-        if name not in known:
-            raise unknown(f"option of {what}", name, known[2:], line)
-    made: AbstractEffect = EFFECTS[what](where=where, magnitude=1.0, **options)
-    return made
 
 
 def actuated(
@@ -191,7 +120,8 @@ def actuated(
             said = getattr(spec, part)
             where = source.where("actuators", name, part)
             base = actuator_prior(channels[name], part)
-            chosen = base if said == "free" else prior(said, base, where)
+            own = None if part == "delay" else ActuatorSpec.model_fields[part].default
+            chosen = base if said == "free" else prior(said, base, where, own)
             _check_delay(part, chosen, where)
             stated[f"{name}.{part}"] = chosen
     return Actuated(system, stated)
@@ -210,19 +140,6 @@ def _check_delay(part: str, stated: Parameter | float, where: str) -> None:
         )
 
 
-def unknown(kind: str, name: str, known: Collection[str], where: str) -> InputError:
-    """E160 with the name that was probably meant."""
-    close = nearest(name, known)
-    return InputError(
-        "E160",
-        f"unknown {kind}",
-        where=where,
-        got=name,
-        expected="one of " + ", ".join(known) if known else f"no {kind}",
-        fix=f"did you mean {close}" if close else "use a known name",
-    )
-
-
 def check_names(spec: ProjectSpec, source: Source, system: AbstractSystem) -> None:
     """Every channel and parameter that the file names is the machine's."""
     states = [channel.name for channel in system.physical_states]
@@ -233,6 +150,9 @@ def check_names(spec: ProjectSpec, source: Source, system: AbstractSystem) -> No
             where = source.where("logs", i, "columns", name)
             if name not in (*states, *inputs):
                 raise unknown("channel", name, [*states, *inputs], where)
+            if isinstance(value, ColumnSpec) and value.saturation is not None:
+                low, high = value.saturation
+                _check_pair(f"saturation of {name}", low, high, where)
             if isinstance(value, float) and name not in inputs:
                 raise InputError(
                     "E160",
@@ -259,16 +179,31 @@ def check_names(spec: ProjectSpec, source: Source, system: AbstractSystem) -> No
     for name in spec.rates:
         if name not in inputs:
             raise unknown("input", name, inputs, source.where("rates", name))
-    for section, key, named in (
-        ("likelihood", "start_sd", spec.likelihood.start_sd),
-        ("likelihood", "noise_floor", spec.likelihood.noise_floor),
-        ("task", "target", spec.task.target),
-        ("task", "weights", spec.task.weights),
+    _check_likelihood(spec, source, states)
+
+
+def _check_likelihood(spec: ProjectSpec, source: Source, states: list[str]) -> None:
+    """What the file says of windows, of states, and of noise is what is fitted."""
+    stated = spec.likelihood
+    if stated.window == 0.0 and "start" in stated.model_fields_set:
+        raise InputError(
+            "E160",
+            "start of windows of one step",
+            where=source.where("likelihood", "start"),
+            got=f'window = 0, start = "{stated.start}"',
+            expected="no start: a step begins at its first row",
+            fix="remove start, or set window to some tenths of a second",
+        )
+    named = {name for group in spec.logs for name in group.columns}
+    measured = [name for name in states if name in named] or states
+    for key, given, kind, known in (
+        ("start_sd", stated.start_sd, "state", states),
+        ("noise_floor", stated.noise_floor, "measured state", measured),
     ):
-        for name in named if isinstance(named, dict) else ():
-            if name not in (*states, *inputs):
-                where = source.where(section, key, name)
-                raise unknown("channel", name, [*states, *inputs], where)
+        for name in given if isinstance(given, dict) else ():
+            if name not in known:
+                where = source.where("likelihood", key, name)
+                raise unknown(kind, name, known, where)
 
 
 def _check_complete(
@@ -293,6 +228,15 @@ def _check_complete(
 
 def _check_clock(group: LogSpec, source: Source, i: int) -> None:
     """Time comes from a column or a period; rows from a period or from stamps."""
+    if isinstance(group.time, ColumnSpec) and group.time.saturation is not None:
+        raise InputError(
+            "E160",
+            "saturation of a clock",
+            where=source.where("logs", i, "time", "saturation"),
+            got=f"saturation = {group.time.saturation}",
+            expected="column, unit, sign, scale, offset",
+            fix="remove it, or leave rows out by exclude",
+        )
     pairs: list[tuple[str, str, object, object]]
     pairs = [("time", "period", group.time, group.period)]
     if group.resample is not None:

@@ -14,7 +14,7 @@ from sim2gp.configurations import AT, Configuration
 from sim2gp.errors import InputError
 from sim2gp.parameters import Parameter, unknown_parameter
 from sim2gp.project.priors import located, prior
-from sim2gp.project.schema import PriorSpec, ProjectSpec
+from sim2gp.project.schema import ParameterSpec, ProjectSpec
 from sim2gp.project.source import Source
 from sim2gp.systems import AbstractSystem, configured
 from sim2gp.systems.base import names_of
@@ -112,7 +112,7 @@ def _priors(
         stated = spec.parameters[column]
         base = table[columns[column]]
         found = prior(stated, base, where)
-        tied = isinstance(stated, PriorSpec) and stated.tie
+        tied = isinstance(stated, ParameterSpec) and stated.tie
         if tied or not isinstance(found, Parameter):
             raise InputError(
                 "E160",

@@ -13,12 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from sim2gp.errors import InputError, nearest
+from sim2gp.errors import InputError
 from sim2gp.logs import Column, read_log
 from sim2gp.logs.formats import recordings
 from sim2gp.logs.units import UNITS
 from sim2gp.project.columns import Match, match, time_column
-from sim2gp.project.project import SYSTEMS, is_model, system_class
+from sim2gp.project.project import (
+    SYSTEMS,
+    is_model,
+    system_class,
+    unknown_system,
+)
 from sim2gp.project.readings import SURE, Found, Reading, Version, find_readings
 from sim2gp.project.replace import key as toml_key
 from sim2gp.project.replace import quoted, replace_project
@@ -75,15 +80,7 @@ def _machine(model: str) -> AbstractSystem:
         from sim2gp.systems import MuJoCo
 
         return MuJoCo(Path(model))
-    close = nearest(model, SYSTEMS)
-    raise InputError(
-        "E160",
-        "unknown system",
-        where="the command line",
-        got=repr(model),
-        expected="one of " + ", ".join(SYSTEMS) + ", or a model's file (.xml, .urdf)",
-        fix=f"did you mean {close}" if close else "name one of these",
-    )
+    raise unknown_system(model, "the command line")
 
 
 def _columns(

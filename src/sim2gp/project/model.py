@@ -14,13 +14,15 @@ from pathlib import Path
 from sim2gp.configurations import AT
 from sim2gp.errors import InputError
 from sim2gp.parameters import Parameter
-from sim2gp.project.build import actuated, unknown
+from sim2gp.project.build import actuated
+from sim2gp.project.effects import effect_options
 from sim2gp.project.priors import located, prior
-from sim2gp.project.schema import PriorSpec, ProjectSpec
+from sim2gp.project.schema import ParameterSpec, ProjectSpec
 from sim2gp.project.source import Source
+from sim2gp.project.validate import unknown
 from sim2gp.systems import AbstractSystem, MuJoCo
 from sim2gp.systems.base import AbstractPlant
-from sim2gp.systems.mjcf import Constant, constants_of, matching
+from sim2gp.systems.mjcf import SIGNED, Constant, constants_of, matching
 from sim2gp.systems.mujoco import default_prior, loaded
 from sim2gp.systems.zeros import Zeroed, offset_prior
 
@@ -51,8 +53,17 @@ def build_model(
             raise located(error, where) from error
         # A path of its own is the exception to a pattern.
         found = [c for c in found if c.path == pattern or c.path not in spec.parameters]
-        tied = isinstance(stated, PriorSpec) and stated.tie
-        for group in [found] if tied and found else [[c] for c in found]:
+        if not found:
+            raise InputError(
+                "E145",
+                "pattern without constants of its own",
+                where=where,
+                got=pattern,
+                expected="a constant that no other table names",
+                fix="remove the pattern, or one of the other tables",
+            )
+        tied = isinstance(stated, ParameterSpec) and stated.tie
+        for group in [found] if tied else [[c] for c in found]:
             groups.append([c.path for c in group])
             priors[group[0].path] = _prior(stated, group[0], model, where)
     try:
@@ -74,7 +85,8 @@ def _zeroed(system: AbstractPlant, spec: ProjectSpec, source: Source) -> Abstrac
                 base = offset_prior(system, joint)
             except InputError as error:
                 raise located(error, line) from error
-            offsets[joint] = prior(said, base, line)
+            effect_options(what, said, (), line)
+            offsets[joint] = prior(said, base, line, own=0.0)
     return Zeroed(system, offsets) if offsets else system
 
 
@@ -90,12 +102,13 @@ def _root(spec: ProjectSpec, source: Source, folder: Path) -> Path | None:
 
 
 def _prior(
-    stated: PriorSpec | float, constant: Constant, model: object, where: str
+    stated: ParameterSpec | float, constant: Constant, model: object, where: str
 ) -> Parameter | float:
     """What the file says, about the model's own number."""
     base = default_prior(constant, model)
-    bare = PriorSpec(tie=True)
-    if base is not None and stated in (bare, PriorSpec()):
+    bare = ParameterSpec(tie=True)
+    if base is not None and stated in (bare, ParameterSpec()):
         return base
     empty = Parameter(constant.path, constant.unit, constant.meaning, "identity")
-    return prior(stated, base or empty, where)
+    own = constant.get(model) if constant.quantity in SIGNED else None
+    return prior(stated, base or empty, where, own)

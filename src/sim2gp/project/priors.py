@@ -1,8 +1,9 @@
 """What the file says of a constant, turned into a prior or a fixed value.
 
 ``value`` fixes; ``mean, sd`` are physical moments, inside ``low, high`` where these
-stand too; ``relative_sd`` is an sd as a share of the mean; ``low, high`` alone make a
-nearly uniform box (logarithmic where the system's own prior is).
+are given too; ``relative_sd`` is an sd as a share of the mean. An sd alone is about the
+machine's own number: the published one, the model file's, none for an effect. ``low,
+high`` alone make a nearly uniform box (logarithmic where the system's own prior is).
 """
 
 import math
@@ -14,6 +15,7 @@ from sim2gp.parameters import BOX_SD, Parameter, prior_from_moments
 from sim2gp.project.schema import PriorSpec
 
 _MATTER = {"kg": "mass", "kg m^2": "inertia"}
+_BOXED = "box or log_box with bounds"
 
 
 def located(error: InputError, where: str) -> InputError:
@@ -28,15 +30,20 @@ def located(error: InputError, where: str) -> InputError:
     )
 
 
-def prior(spec: PriorSpec | float, base: Parameter, where: str) -> Parameter | float:
-    """The prior, or the fixed value, that a table of the file states (E141 to E144)."""
+def prior(
+    spec: PriorSpec | float, base: Parameter, where: str, own: float | None = None
+) -> Parameter | float:
+    """The prior, or the fixed value, that a table of the file states (E141 to E144).
+
+    ``own`` is the machine's own number, where it is not the prior's nominal one.
+    """
+    own = base.nominal if own is None else own
     if not isinstance(spec, PriorSpec):
         _check_matter(float(spec), base, where)
         return float(spec)
     if spec.relative_sd is not None:
-        spec = _absolute(spec, spec.relative_sd, base, where)
-    fields = set(PriorSpec.model_fields) - {"tie"}
-    given = spec.model_dump(exclude_none=True, include=fields)
+        spec = _absolute(spec, spec.relative_sd, own, where)
+    given = spec.model_dump(exclude_none=True, include=set(PriorSpec.model_fields))
     if spec.value is not None:
         if len(given) > 1:
             raise _conflict(where, "value", given, "value alone, or a prior")
@@ -47,9 +54,12 @@ def prior(spec: PriorSpec | float, base: Parameter, where: str) -> Parameter | f
     try:
         if spec.mean is None and spec.sd is None:
             return _box(spec, base, where)
-        if spec.mean is None or spec.sd is None:
+        mean = own if spec.mean is None else spec.mean
+        if mean is None or spec.sd is None:
             raise _conflict(where, "mean and sd", given, "both of them")
-        return _moments(spec, spec.mean, spec.sd, base)
+        if spec.map in ("log", "identity") and {"low", "high"} & set(given):
+            raise _conflict(where, f"map = {spec.map}", given, _BOXED)
+        return _moments(spec, mean, spec.sd, base)
     except InputError as error:
         raise located(error, where) from error
 
@@ -68,9 +78,11 @@ def _check_matter(least: float | None, base: Parameter, where: str) -> None:
     )
 
 
-def _absolute(spec: PriorSpec, share: float, base: Parameter, where: str) -> PriorSpec:
+def _absolute(
+    spec: PriorSpec, share: float, own: float | None, where: str
+) -> PriorSpec:
     """``relative_sd`` as an sd, about the stated mean or the machine's own number."""
-    mean = base.nominal if spec.mean is None else spec.mean
+    mean = own if spec.mean is None else spec.mean
     if mean is None or mean == 0.0 or spec.sd is not None:
         given = spec.model_dump(exclude_none=True)
         raise _conflict(where, "relative_sd", given, "a mean that is not 0, and no sd")
@@ -111,6 +123,9 @@ def _box(spec: PriorSpec, base: Parameter, where: str) -> Parameter:
     if spec.low is None and spec.high is None:
         if spec.map is None:
             raise _conflict(where, "nothing stated", {}, "a prior or a value")
+        if spec.map != base.map and spec.map not in ("box", "log_box"):
+            expected = "mean and sd, whose logarithm or value is Gaussian"
+            raise _conflict(where, f"map = {spec.map}", {"map": spec.map}, expected)
         return replace(base, map=spec.map)
     low = base.low if spec.low is None else spec.low
     high = base.high if spec.high is None else spec.high
@@ -126,7 +141,7 @@ def _box(spec: PriorSpec, base: Parameter, where: str) -> Parameter:
     kind = spec.map or ("log_box" if logarithmic else "box")
     if kind not in ("box", "log_box"):
         given = {"low": low, "high": high, "map": kind}
-        raise _conflict(where, f"map = {kind}", given, "box or log_box with bounds")
+        raise _conflict(where, f"map = {kind}", given, _BOXED)
     return replace(base, map=kind, low=low, high=high, mean=0.0, sd=BOX_SD)
 
 

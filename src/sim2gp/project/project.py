@@ -6,7 +6,9 @@
 
 import glob
 import importlib
+import json
 import os
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,9 +22,9 @@ from sim2gp.project.schema import (
     LogSpec,
     ProjectSpec,
     ResampleSpec,
-    validated,
 )
 from sim2gp.project.source import Source, read_source
+from sim2gp.project.validate import validated
 
 if TYPE_CHECKING:
     from sim2gp.systems import AbstractSystem
@@ -35,6 +37,9 @@ SYSTEMS = {
     "two_link": ("two_link", "TwoLink"),
     "uniform_rod_arm": ("two_link", "UniformRodArm"),
 }
+MODEL_FILES = (".xml", ".mjcf", ".urdf")
+#: What other tools write before a model's file.
+_PREFIX = re.compile(r"(?i)^(mujoco|mjcf|mjx|urdf|xml)\s*:\s*")
 
 
 @dataclass(frozen=True)
@@ -214,23 +219,34 @@ def read_spec(path: Path | str) -> tuple[Source, ProjectSpec]:
     """The file's text and its validated values, without loading any simulator."""
     source = read_source(Path(path))
     spec = validated(source)
-    _check_planner(spec, source)
-    if spec.system not in SYSTEMS and not is_model(spec.system):
-        close = nearest(spec.system, SYSTEMS)
-        raise InputError(
-            "E160",
-            "unknown system",
-            where=source.where("system"),
-            got=repr(spec.system),
-            expected="one of " + ", ".join(SYSTEMS) + ", or a model's file (.xml)",
-            fix=f"did you mean {close}" if close else "name one of these",
-        )
+    if not (spec.system in SYSTEMS or is_model(spec.system)):
+        raise unknown_system(spec.system, source.where("system"))
     return source, spec
 
 
 def is_model(name: str) -> bool:
     """Whether a system is a file of MuJoCo's, MJCF or URDF."""
-    return name.lower().endswith((".xml", ".mjcf", ".urdf"))
+    return name.lower().endswith(MODEL_FILES) and _PREFIX.match(name) is None
+
+
+def unknown_system(name: str, where: str) -> InputError:
+    """E160 for a system that is neither a bundled machine nor a model's file."""
+    close = nearest(name, SYSTEMS)
+    file = _PREFIX.sub("", name)
+    if file.lower().endswith(MODEL_FILES):
+        fix = f"write the file's name, {json.dumps(file)}"
+    elif _PREFIX.match(f"{name}:"):
+        fix = 'write the file\'s name, as in "robot.xml"'
+    else:
+        fix = f"did you mean {close}" if close else "name one of these"
+    return InputError(
+        "E160",
+        "unknown system",
+        where=where,
+        got=repr(name),
+        expected="one of " + ", ".join(SYSTEMS) + ", or a model's file (.xml, .urdf)",
+        fix=fix,
+    )
 
 
 def system_class(name: str) -> "type[AbstractSystem]":
@@ -240,19 +256,6 @@ def system_class(name: str) -> "type[AbstractSystem]":
         importlib.import_module(f"sim2gp.systems.{module}"), kind
     )
     return found
-
-
-def _check_planner(spec: ProjectSpec, source: Source) -> None:
-    planner = spec.planner
-    if planner.elites and planner.samples and planner.elites > planner.samples:
-        raise InputError(
-            "E148",
-            "more elites than samples",
-            where=source.where("planner", "elites"),
-            got=f"{planner.elites} of {planner.samples}",
-            expected="elites <= samples",
-            fix="lower elites",
-        )
 
 
 def _column(value: str | float | ColumnSpec) -> Column | float:

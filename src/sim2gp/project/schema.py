@@ -1,22 +1,24 @@
-"""The shape of a project file, section by section, and its faults in one line each.
+"""The shape of a project file, section by section.
 
     system = "two_link"                           (or a model's file, "robot.xml")
     [options]  [parameters.NAME]  [effects.CHANNEL.EFFECT]  [[weighed]]  [[logs]]
-    [actuators.INPUT]  [likelihood]  [task]  [limits]  [rates]  [model]  [planner]
+    [actuators.INPUT]  [likelihood]  [limits]  [rates]
 
-Types are strict: a number in quotes is text. A fault names the line of its key.
+Types are strict: a number in quotes is text. Every key here is read by some command:
+one that nothing reads is an error (`sim2gp.project.validate`).
 """
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
-from sim2gp.errors import InputError, nearest
-from sim2gp.project.source import Path_, Source
+from sim2gp.project.source import Path_
 
 Pair = Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]
 Positive = Annotated[FiniteFloat, Field(gt=0)]
-Count = Annotated[int, Field(gt=0)]
+
+#: Sections that have a meaning once a command reads them; an error until then.
+RESERVED = ("task", "model", "planner")
 
 
 class Section(BaseModel):
@@ -28,18 +30,25 @@ class Section(BaseModel):
 class PriorSpec(Section):
     """What is believed of one constant: a value, moments, a box, or both of these.
 
-    ``relative_sd`` is a share of the mean, or of the machine's own number. ``tie``
-    makes all constants of a pattern one number (of a model's file alone).
+    ``sd`` or ``relative_sd`` (a share) alone are about the machine's own number.
     """
 
     value: FiniteFloat | None = None
     mean: FiniteFloat | None = None
     sd: FiniteFloat | None = None
     relative_sd: Positive | None = None
-    tie: bool = False
     low: FiniteFloat | None = None
     high: FiniteFloat | None = None
     map: Literal["box", "log_box", "log", "identity"] | None = None
+
+
+class ParameterSpec(PriorSpec):
+    """A prior of a constant of the machine, or of all that a pattern names.
+
+    ``tie`` makes all constants of a pattern one number (of a model's file alone).
+    """
+
+    tie: bool = False
 
 
 class EffectSpec(PriorSpec):
@@ -137,48 +146,19 @@ class LikelihoodSpec(Section):
     noise_floor: Positive | dict[str, Positive] | None = None
 
 
-class TaskSpec(Section):
-    """What to achieve: a preset, or a target and weights by channel."""
-
-    preset: str | None = None
-    target: dict[str, FiniteFloat] = {}
-    weights: dict[str, FiniteFloat] = {}
-    seconds: Positive = 5.0
-    period: Positive = 0.02
-
-
-class ModelSpec(Section):
-    """How data become a belief."""
-
-    kind: Literal["sim2gp", "point_estimate", "prior_mean"] = "sim2gp"
-
-
-class PlannerSpec(Section):
-    """How a draw becomes actions."""
-
-    kind: Literal["icem", "mppi"] = "icem"
-    samples: Count | None = None
-    horizon: Count | None = None
-    iterations: Count | None = None
-    elites: Count | None = None
-
-
 class ProjectSpec(Section):
     """The whole file."""
 
     system: str
     options: dict[str, Any] = {}
-    parameters: dict[str, FiniteFloat | PriorSpec] = {}
+    parameters: dict[str, FiniteFloat | ParameterSpec] = {}
     effects: dict[str, dict[str, FiniteFloat | EffectSpec]] = {}
     weighed: list[WeighedSpec] = []
     logs: list[LogSpec] = []
     actuators: dict[str, ActuatorSpec] = {}
     likelihood: LikelihoodSpec = LikelihoodSpec()
-    task: TaskSpec = TaskSpec()
     limits: dict[str, Pair] = {}
     rates: dict[str, Positive] = {}
-    model: ModelSpec = ModelSpec()
-    planner: PlannerSpec = PlannerSpec()
 
     def configuration(self, group: int) -> str:
         """Name of the configuration that a group of logs recorded."""
@@ -191,134 +171,28 @@ class ProjectSpec(Section):
         return tuple(dict.fromkeys(names))
 
 
-def validated(source: Source) -> ProjectSpec:
-    """The file's values as a `ProjectSpec`, or its first fault (E141, E148, E160)."""
-    try:
-        return ProjectSpec.model_validate(source.values)
-    except ValidationError as failure:
-        errors: list[dict[str, Any]] = [{**error} for error in failure.errors()]
-    faults = [(_present(error["loc"], source.values), error) for error in errors]
-    deep = [
-        (path, error)
-        for path, error in faults
-        if not any(len(p) > len(path) and p[: len(path)] == path for p, _ in faults)
-    ]
-    path, error = min(deep, key=lambda fault: _order(source, fault[0]))
-    raise _fault(source, path, error, [e for p, e in deep if p == path])
+#: The tables of a project file: header, path ("*" is a name of the user's), keys.
+TABLES: tuple[tuple[str, tuple[str, ...], type[Section]], ...] = (
+    ("the file", (), ProjectSpec),
+    ("[parameters.NAME]", ("parameters", "*"), ParameterSpec),
+    ("[effects.CHANNEL.NAME]", ("effects", "*", "*"), EffectSpec),
+    ("[[weighed]]", ("weighed",), WeighedSpec),
+    ("[[logs]]", ("logs",), LogSpec),
+    ("[logs.columns.CHANNEL]", ("logs", "columns", "*"), ColumnSpec),
+    ("[logs.time]", ("logs", "time"), ColumnSpec),
+    ("[logs.resample]", ("logs", "resample"), ResampleSpec),
+    ("[actuators.INPUT]", ("actuators", "*"), ActuatorSpec),
+    ("[actuators.INPUT.NAME]", ("actuators", "*", "*"), PriorSpec),
+    ("[likelihood]", ("likelihood",), LikelihoodSpec),
+)
 
 
-def _present(loc: Path_, values: Any) -> Path_:
-    """The part of pydantic's location that the file spells; the rest names types."""
-    path: Path_ = ()
-    for part in loc:
-        try:
-            values = values[part]
-        except (KeyError, IndexError, TypeError):
-            continue
-        path = (*path, part)
-    return path
-
-
-def _order(source: Source, path: Path_) -> int:
-    return int(source.where(*path).split(":line ")[1].split(",")[0])
-
-
-def _keys_at(path: Path_) -> list[str]:
-    """The keys that a table at this path may have."""
-    section = path[0] if path else ""
-    model: type[BaseModel] = ProjectSpec
-    if section == "effects":
-        model = EffectSpec
-    elif section in ("parameters", "actuators") and len(path) > 1:
-        last = section == "parameters" or len(path) > 2
-        model = PriorSpec if last else ActuatorSpec
-    elif section == "logs":
-        inner = ResampleSpec if "resample" in path else ColumnSpec
-        model = inner if len(path) > 2 else LogSpec
-    elif section == "weighed":
-        model = WeighedSpec
-    elif section:
-        model = type(ProjectSpec.model_fields[str(section)].default)
-    return list(model.model_fields)
-
-
-def _fault(
-    source: Source, path: Path_, error: dict[str, Any], same: list[dict[str, Any]]
-) -> InputError:
-    kind, value = error["type"], error["input"]
-    where, got = source.where(*path), repr(value)[:40]
-    if kind == "missing":
-        key = str(error["loc"][-1])
-        return InputError(
-            "E160",
-            f"missing key {key}",
-            where=where,
-            got=_listed(value) if isinstance(value, dict) else got,
-            expected=f"{key} = ...",
-            fix=f"add {key}",
-        )
-    if kind == "extra_forbidden":
-        known = _keys_at(path[:-1])
-        close = nearest(str(path[-1]), known)
-        return InputError(
-            "E160",
-            "unknown key",
-            where=where,
-            got=str(path[-1]),
-            expected="one of " + ", ".join(known),
-            fix=f"did you mean {close}" if close else "remove it",
-        )
-    expected = " or ".join(dict.fromkeys(_expected(e) for e in same))
-    code = "E160"
-    if kind == "finite_number" and path[-1] in ("low", "high"):
-        code = "E141"
-    elif {"sd", "start_sd", "noise_floor"} & set(path):
-        code = "E144" if kind in ("greater_than", "finite_number") else "E160"
-    elif path and path[0] == "planner" and kind == "greater_than":
-        code = "E148"
-    fix = "write the value without quotes" if _is_quoted(value, expected) else ""
-    if kind == "literal_error" and isinstance(value, str):
-        choices = error["ctx"]["expected"].replace("'", "").replace(" or ", ", ")
-        close = nearest(value, choices.split(", "))
-        fix = f"did you mean {close!r}" if close else ""
-    plain = expected.startswith(("a ", "one ", "text", "true"))
-    fix = fix or (f"write {expected}" if plain else "correct the value")
-    return InputError(
-        code, "wrong value", where=where, got=got, expected=expected, fix=fix
-    )
-
-
-def _listed(table: dict[str, Any]) -> str:
-    return ", ".join(table)[:60] or "an empty table"
-
-
-def _is_quoted(value: Any, expected: str) -> bool:
-    if not isinstance(value, str) or "number" not in expected:
-        return False
-    try:
-        float(value)
-    except ValueError:
-        return False
-    return True
-
-
-def _expected(error: dict[str, Any]) -> str:
-    """Pydantic's sentence in the words of a project file."""
-    kind = error["type"]
-    words = {
-        "float_type": "a number",
-        "finite_number": "a finite number",
-        "int_type": "a whole number",
-        "string_type": "text in quotes",
-        "string_pattern_mismatch": "a word without spaces and @",
-        "bool_type": "true or false",
-        "list_type": "a list in brackets",
-        "dict_type": "a table",
-        "model_type": "a table",
-    }
-    if kind in words:
-        return words[kind]
-    if kind == "literal_error":
-        return f"one of {error['ctx']['expected']}"
-    message = str(error["msg"])
-    return message.removeprefix("Input should be ").lower()
+def keys_at(path: Path_) -> list[str]:
+    """The keys that the table at a path may have; none where keys are names."""
+    names = [part for part in path if isinstance(part, str)]
+    for _, shape, model in TABLES:
+        if len(shape) == len(names) and all(
+            part in ("*", name) for part, name in zip(shape, names, strict=True)
+        ):
+            return list(model.model_fields)
+    return []

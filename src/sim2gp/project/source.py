@@ -15,6 +15,7 @@ from typing import Any
 from sim2gp.errors import InputError
 from sim2gp.logs.file import read_bytes, shown
 from sim2gp.logs.table import decode
+from sim2gp.project.syntax import of_repeated, of_syntax
 
 MAX_BYTES = 1_000_000
 MAX_DEPTH = 64
@@ -65,7 +66,10 @@ def read_source(path: Path) -> Source:
         values = tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
         raise _yaml(name, bare) or _syntax(name, text, str(error)) from error
-    source = Source(name, text, values, dict(_lines(text, bare)))
+    lines: dict[Path_, int] = {}
+    for key, line in _lines(text, bare):
+        lines.setdefault(key, line)  # of a table in pieces, the first
+    source = Source(name, text, values, lines)
     for key, value in _leaves(values, ()):
         if _is_hostile(key, value):
             raise InputError(
@@ -123,8 +127,9 @@ def _depth(bare: str) -> int:
 def _syntax(name: str, text: str, message: str) -> InputError:
     place = re.search(r"at line (\d+), column (\d+)", message)
     line = int(place.group(1)) if place else len(text.splitlines())
+    column = int(place.group(2)) if place else 1
     rows = text.splitlines()
-    shown_line = rows[line - 1].strip() if 0 < line <= len(rows) else ""
+    row = rows[line - 1] if 0 < line <= len(rows) else ""
     reason = re.sub(r"\s*\(at .*\)", "", message)
     twice = re.search(r"overwrite|twice|redefine|already", reason, re.IGNORECASE)
     what = "key stands twice" if twice else "not valid TOML"
@@ -135,9 +140,9 @@ def _syntax(name: str, text: str, message: str) -> InputError:
         code,
         what,
         where=f"{name}:line {line}",
-        got=repr(shown_line[:60]),
+        got=repr(row.strip()[:60]),
         expected="each key once" if twice else "TOML (" + reason[:80].lower() + ")",
-        fix="remove one of the two" if twice else "mend the line",
+        fix=of_repeated(row) if twice else of_syntax(reason, row, column),
     )
 
 
@@ -163,7 +168,8 @@ def _lines(text: str, bare: str) -> Iterator[tuple[Path_, int]]:
             if found:
                 parts = _parts(found.group(1))
                 table = _resolve(parts, counts, double)
-                yield table, number
+                for end in range(1, len(table) + 1):
+                    yield table[:end], number
             continue
         found = _DOTTED.match(line) if depth == 0 else None
         if found and line[found.end() :].startswith("="):

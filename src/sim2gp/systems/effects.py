@@ -10,6 +10,7 @@ system of a machine and its effects and holds their registered strengths.
 
 import abc
 import math
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -17,18 +18,21 @@ import jax.numpy as jnp
 from equinox import AbstractClassVar, AbstractVar
 from jaxtyping import Array, Float
 
+from sim2gp.errors import InputError
 from sim2gp.parameters import Parameter
 from sim2gp.systems.base import (
     AbstractMechanism,
     Inertia,
     index_of,
 )
+from sim2gp.systems.cartpole import CartPole
 from sim2gp.systems.friction import (
     COULOMB_SUBSTEP,
     coulomb,
     dead_zone,
     quadratic_drag,
 )
+from sim2gp.systems.furuta import Furuta
 from sim2gp.types import Action, Scalar
 
 _SUBSTEP = 0.005  # s; a true, perturbed machine is integrated twice as finely
@@ -51,7 +55,7 @@ class AbstractEffect(eqx.Module):
 
     @abc.abstractmethod
     def unit(self, system: AbstractMechanism) -> str:
-        """Unit of the magnitude on this machine."""
+        """Unit of the magnitude; E103 or E145 where the machine cannot have it."""
 
     @abc.abstractmethod
     def input(self, system: AbstractMechanism, x: Scalar, a: Action) -> Action:
@@ -158,6 +162,7 @@ class RailFriction(AbstractForce):
     max_substep: ClassVar[float] = COULOMB_SUBSTEP
 
     def unit(self, system: AbstractMechanism) -> str:
+        only_on(self, system, {CartPole: "x"})
         return "1"
 
     def force(
@@ -265,6 +270,7 @@ class RailTilt(AbstractForce):
     max_substep: ClassVar[float] = _SUBSTEP
 
     def unit(self, system: AbstractMechanism) -> str:
+        only_on(self, system, {CartPole: "x"})
         return "rad"
 
     def force(
@@ -295,6 +301,7 @@ class RodInertia(AbstractGeometry):
     max_substep: ClassVar[float] = _SUBSTEP
 
     def unit(self, system: AbstractMechanism) -> str:
+        only_on(self, system, {Furuta: "alpha"})
         return "1"
 
     def inertia(
@@ -329,6 +336,7 @@ class PoleGeometry(AbstractGeometry):
     max_substep: ClassVar[float] = _SUBSTEP
 
     def unit(self, system: AbstractMechanism) -> str:
+        only_on(self, system, {CartPole: "theta"})
         return "m"
 
     def inertia(
@@ -357,6 +365,21 @@ class DeadZone(AbstractInputEffect):
 
     def through(self, x: Scalar, u: Scalar) -> Scalar:
         return dead_zone(u, x, self.smoothing)
+
+
+def only_on(
+    effect: AbstractEffect, system: AbstractMechanism, homes: Mapping[type, str]
+) -> None:
+    """Refuse an effect on a machine or a channel that cannot have it (E145)."""
+    for kind, channel in homes.items():
+        if isinstance(system, kind) and effect.where == channel:
+            return
+    raise InputError(
+        "E145",
+        f"{effect.what} of this machine",
+        got=f"{effect.where} of {type(system).__name__}",
+        expected=" or ".join(f"{c} of {k.__name__}" for k, c in homes.items()),
+    )
 
 
 def _on_joint(i: int, f: Scalar) -> Pair:

@@ -11,7 +11,6 @@ import equinox as eqx
 import jax.numpy as jnp
 from equinox import AbstractClassVar
 
-from sim2gp.errors import InputError
 from sim2gp.systems.base import AbstractMechanism, Inertia
 from sim2gp.systems.cartpole import CartPole
 from sim2gp.systems.effects import (
@@ -19,6 +18,7 @@ from sim2gp.systems.effects import (
     AbstractGeometry,
     Pair,
     gravity_of,
+    only_on,
 )
 from sim2gp.systems.furuta import Furuta
 from sim2gp.types import Scalar
@@ -74,7 +74,8 @@ class AbstractBaseTilt(AbstractForce):
     max_substep: ClassVar[float] = _SUBSTEP
 
     def unit(self, system: AbstractMechanism) -> str:
-        return _only(system, (Furuta,), self.what, "rad")
+        only_on(self, system, {Furuta: "theta"})
+        return "rad"
 
     def force(
         self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
@@ -119,7 +120,8 @@ class Payload(AbstractGeometry):
     max_substep: ClassVar[float] = _SUBSTEP
 
     def unit(self, system: AbstractMechanism) -> str:
-        return _only(system, (Furuta, CartPole), self.what, "kg")
+        only_on(self, system, {Furuta: "alpha", CartPole: "theta"})
+        return "kg"
 
     def inertia(
         self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair
@@ -145,14 +147,3 @@ class Payload(AbstractGeometry):
             first, second = x * end * sin * v[1] ** 2, jnp.zeros_like(x)
         weight = x * end * gravity_of(system) * sin
         return jnp.stack([first, second - weight])
-
-
-def _only(
-    system: AbstractMechanism, kinds: tuple[type, ...], what: str, unit: str
-) -> str:
-    """The unit, on a machine that can have the effect (E145 for another)."""
-    if isinstance(system, kinds):
-        return unit
-    known = ", ".join(kind.__name__ for kind in kinds)
-    got = type(system).__name__
-    raise InputError("E145", f"{what} of this machine", got=got, expected=known)
