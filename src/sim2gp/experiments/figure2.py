@@ -34,6 +34,7 @@ from sim2gp.experiments.swingup import (
     study,
 )
 from sim2gp.runs import Progress, new_run
+from sim2gp.runs.cells import Old
 from sim2gp.tasks import MACHINES, SOLVED
 
 SEEDS, EPISODES = 5, 10
@@ -67,6 +68,7 @@ def run(
     quick: bool,
     workers: int,
     progress: Progress,
+    old: Old = "refuse",
 ) -> dict[str, Any]:
     """Fly the missing cells, check the claims, write the run; returns its summary.
 
@@ -87,7 +89,9 @@ def run(
     }
     numbers = range(seed, seed + seeds)
     with new_run(out, f"reproduce {figure}") as writer:
-        table, details = study(groups, numbers, out, workers=workers, progress=progress)
+        table, details = study(
+            groups, numbers, out, workers=workers, progress=progress, old=old
+        )
         words = f"sim2gp reproduce {figure} --seed {seed} --seeds {seeds} "
         check = claims if figure == "fig2" else off_policy_claims
         summary: dict[str, Any] = {
