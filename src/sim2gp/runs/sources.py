@@ -6,7 +6,6 @@ import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from sim2gp.runs.plain import to_json, version
 
@@ -40,12 +39,13 @@ def digest_of(text: str) -> str:
     return hashlib.sha256(text.encode("utf-8")).hexdigest()[:16]
 
 
+@functools.cache
 def source_of(file: str | Path) -> Source:
     """The source of a module's file, and of all that it imports of ours.
 
     Ours is sim2gp and, for a script, the files next to it. Imports are read from the
     syntax trees, also inside functions; nothing is imported. Comments, docstrings and
-    layout do not count.
+    layout do not count. Read once in a process: what it runs does not change.
     """
     start, names = Path(file).resolve(), {}
     pending = [_name(start)]
@@ -91,7 +91,10 @@ def _read(path: Path, name: str) -> tuple[str, tuple[str, ...]]:
     for node in ast.walk(tree):
         if isinstance(node, _DOCUMENTED) and ast.get_docstring(node, clean=False):
             del node.body[0]
-    return digest_of(repr(_said(tree))), imported
+        for field in node._fields:  # which of the empty ones there are, Python decides
+            if getattr(node, field, None) in (None, []):
+                node.__dict__.pop(field, None)
+    return digest_of(ast.dump(tree)), imported
 
 
 def _imported(tree: ast.AST, package: str) -> Iterator[str]:
@@ -116,13 +119,3 @@ def _of_package(name: str) -> Iterator[str]:
     parts = name.split(".")
     if parts[0] == PACKAGE.name and len(parts) == 2 and not _file(name, PACKAGE):
         yield from (_name(path) for path in PACKAGE.rglob("*.py"))
-
-
-def _said(node: Any) -> Any:
-    """A tree without what differs between versions of Python: fields that are empty."""
-    if isinstance(node, ast.AST):
-        fields = [
-            (k, _said(v)) for k, v in ast.iter_fields(node) if v not in (None, [])
-        ]
-        return type(node).__name__, fields
-    return [_said(each) for each in node] if isinstance(node, list) else repr(node)
