@@ -33,7 +33,9 @@ def cases(folder: Path) -> list[Case]:
     """Every case from the good policy in ``folder`` (two layers, an angle)."""
     run = load_run(folder)
     found = [
-        *_headers(run.summary, run.arrays),
+        *_headers(run.summary["policy"], archive(run.arrays)),
+        *_channels(run.summary["policy"], archive(run.arrays)),
+        *_summaries(archive(run.arrays)),
         *_arrays(run.summary, run.arrays),
         *_archives(run.summary, run.arrays),
         *_damage(folder),
@@ -56,23 +58,22 @@ def archive(arrays: Mapping[str, np.ndarray]) -> bytes:
     return buffer.getvalue()
 
 
-def _headers(summary: Summary, arrays: Arrays) -> Iterator[Case]:
-    """Fields that are missing, of another type or value, unknown, or there twice."""
-    content, about = archive(arrays), summary["policy"]
+def case(name: str, policy: Any, content: bytes, code: str = "E133") -> Case:
+    """With another header."""
+    text = json.dumps({"policy": policy})
+    return Case(name, code, lambda path: written(path, text, content))
 
-    def case(name: str, policy: Any, code: str = "E133") -> Case:
-        text = json.dumps({"policy": policy})
-        return Case(name, code, lambda path: written(path, text, content))
+
+def _headers(about: Summary, content: bytes) -> Iterator[Case]:
+    """Fields that are missing, of another type or value, unknown, or there twice."""
 
     def changed(field: str, value: Any, code: str = "E133") -> Case:
-        return case(
-            f"{field} = {str(value)[:99]!r} {type(value).__name__}",
-            about | {field: value},
-            code,
-        )
+        name = f"{field} = {value!r}"
+        return case(name, about | {field: value}, content, code)
 
     for field, good in about.items():
-        yield case(f"no {field}", {k: v for k, v in about.items() if k != field})
+        less = {k: v for k, v in about.items() if k != field}
+        yield case(f"no {field}", less, content)
         for value in VALUES:
             newer = field == "format" and type(value) is int and value > good
             if type(value) is not type(good) or value != good:
@@ -80,15 +81,19 @@ def _headers(summary: Summary, arrays: Arrays) -> Iterator[Case]:
         member = f'"{field}": {json.dumps(good)}'
         twice = json.dumps({"policy": about}).replace(member, f"{member}, {member}")
         assert twice.count(member) == 2
-        yield Case(
-            f"{field} twice",
-            "E183",
-            lambda path, text=twice: written(path, text, content),
-        )
+        yield whole(f"{field} twice", twice, content)
     yield changed("format", 2, "E185")
     yield changed("layers", 1)
     yield changed("layers", 3)
     yield changed("author", "somebody")
+
+
+def _channels(about: Summary, content: bytes) -> Iterator[Case]:
+    """Names and units that cannot be, or are not those of the arrays."""
+
+    def changed(field: str, value: Any) -> Case:
+        return case(f"{field}: {value!r}", about | {field: value}, content)
+
     for field in ("states", "actions"):
         names = about[field]
         for wrong in ("", " ", "a\nb", "\x00", "x" * 1000, 3, None, ["q"]):
@@ -100,27 +105,28 @@ def _headers(summary: Summary, arrays: Arrays) -> Iterator[Case]:
     yield changed("actions", about["states"][:1])
     units = about["units"]
     for channel in units:
-        yield case(
-            f"no unit of {channel}",
-            about | {"units": {k: v for k, v in units.items() if k != channel}},
-        )
+        yield changed("units", {k: v for k, v in units.items() if k != channel})
         for wrong in ("", None, 1.0, "\n", ["rad"]):
-            unit = about | {"units": units | {channel: wrong}}
-            yield case(f"{channel} in {wrong!r}", unit)
+            yield changed("units", units | {channel: wrong})
     yield changed("units", units | {"another": "m"})
     turning = about["states"][about["angle"]]
     for wrong in ("deg", "m", "rad/s"):
         yield changed("units", units | {turning: wrong})
+
+
+def _summaries(content: bytes) -> Iterator[Case]:
+    """Of something else than a policy, or no JSON."""
     for value in (None, [], "policy", {}):
-        yield case(f"policy = {value!r}", value)
+        yield case(f"policy = {value!r}", value, content)
     for text in ("{}", '{"model": {}}'):
-        yield Case(text, "E133", lambda path, text=text: written(path, text, content))
+        yield whole(text, text, content, "E133")
     for text in ("", "[]", "null", '{"policy": NaN}', "{" * 5, '{"a":' * 10**5):
-        yield Case(
-            f"summary {text[:8]}",
-            "E183",
-            lambda path, text=text: written(path, text, content),
-        )
+        yield whole(f"summary {text[:8]}", text, content)
+
+
+def whole(name: str, text: str, content: bytes, code: str = "E183") -> Case:
+    """With another summary."""
+    return Case(name, code, lambda path: written(path, text, content))
 
 
 def _arrays(summary: Summary, arrays: Arrays) -> Iterator[Case]:

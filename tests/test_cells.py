@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from sim2gp.cli import main
 from sim2gp.errors import InputError
 from sim2gp.experiments import swingup
 from sim2gp.experiments.swingup import Cell
@@ -120,6 +121,30 @@ def test_a_study_refuses_older_cells_until_the_user_decides(
     names.clear()
     assert draw(tmp_path / "a")["source"] == fresh["source"]
     assert names == []
+
+
+def test_the_command_line_asks_what_to_do_with_older_cells(
+    names: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def reproduce(*more: str) -> int:
+        words = "reproduce mismatch --quick --workers 1 --json --quiet --out".split()
+        return main([*words, str(tmp_path / "map"), *more])
+
+    assert reproduce() == 0
+    for name in names[:3]:
+        unmarked(tmp_path / "map.cells" / f"{name}.json")
+    before = capsys.readouterr().out
+    assert reproduce() == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.count("\n") == 1
+    assert "E186" in said.err
+    assert "--keep-old uses them" in said.err
+    for option, count in (("--keep-old", 3), ("--refresh", 0)):
+        assert reproduce(option) == 0
+        found = json.loads(capsys.readouterr().out)
+        assert found["cells_of_other_source"] == count
+        assert found["source"] == json.loads(before)["source"]
 
 
 Study = tuple[Path, Callable[..., Any]]

@@ -209,7 +209,7 @@ def test_sizes_are_checked_before_an_array_is_built(
         raise AssertionError("an array was built")
 
     monkeypatch.setattr(policy, "load_arrays", built)
-    words = ("declares too much", "in None", "no rows", "no states", "as <f8")
+    words = ("declares too much", "units: ", "no rows", "no states", "as <f8")
     found = [c for c in bad_policies.cases(small) if any(w in c.name for w in words)]
     assert len(found) > 20
     for i, case in enumerate(found):

@@ -24,7 +24,7 @@ from sim2gp.experiments.exploring import (
     explore_cell,
     reference,
 )
-from sim2gp.experiments.record import provenance
+from sim2gp.experiments.record import provenance, reproduce
 from sim2gp.experiments.stages import in_stages
 from sim2gp.experiments.swingup import CONDITIONS
 from sim2gp.runs import Progress, new_run
@@ -77,8 +77,6 @@ def run(
         of_key = {k: [flown[cell] for cell in row] for k, row in groups.items()}
         table = {key: _columns(values, episodes) for key, values in of_key.items()}
         early = {key: _beginnings(values) for key, values in of_key.items()}
-        words = f"sim2gp reproduce {figure} --seed {seed} --seeds {seeds} "
-        words += f"--episodes {episodes}{' --quick' * quick}"
         summary: dict[str, Any] = {
             "command": f"reproduce {figure}",
             "title": "Figures 3 and 5: exploring for information",
@@ -92,10 +90,9 @@ def run(
             "seed": seed,
             "seeds": seeds,
             "claims": claims(table, early, np.random.default_rng(seed)),
-            **_told(flown),
             **about,
             "tables": _tables(table, methods),
-            **provenance(words, started),
+            **provenance(reproduce(figure, seed, seeds, episodes, quick, old), started),
         }
         arrays = _arrays(table, early)
         from sim2gp.report import figure3, figure_bytes, write_report
@@ -141,7 +138,7 @@ def _flown(
     stored.check(named)
     work = partial(explore_cell, out=shared, old=old)
     flown = in_stages(stages, work, alike, workers=workers, progress=progress)
-    return flown, stored.summary(named)
+    return flown, _told(flown) | stored.summary(named)
 
 
 def _columns(

@@ -19,7 +19,7 @@ from sim2gp.experiments.claims import (
     claim,
     resampled,
 )
-from sim2gp.experiments.record import provenance
+from sim2gp.experiments.record import provenance, reproduce
 from sim2gp.experiments.swingup import (
     METHODS,
     WITH_TERM,
@@ -76,8 +76,7 @@ def run(
         table, details = study(
             groups, numbers, out, workers=workers, progress=progress, old=old
         )
-        words = f"sim2gp reproduce mismatch --seed {seed} --seeds {seeds} "
-        words += f"--episodes {episodes}{' --quick' if quick else ''}"
+        words = reproduce("mismatch", seed, seeds, episodes, quick, old)
         summary: dict[str, Any] = {
             "command": "reproduce mismatch",
             "title": "Mismatch map: every learner under what its simulator lacks",
