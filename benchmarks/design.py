@@ -1,7 +1,7 @@
 """Designed experiments beside what one would run otherwise, on arms with friction.
 
     python benchmarks/design.py [--truths N] [--recordings N] [--seconds S]
-        [--workers N] [--out DIR]
+        [--workers N] [--out DIR] [--refresh | --keep-old]
 
 Hidden two-link arms are drawn from CAD priors. Each is excited for S seconds within the
 same limits of torque, torque rate, position and velocity and with the same energy: by
@@ -43,6 +43,7 @@ from sim2gp.logs import Log
 from sim2gp.models.cutting import cut
 from sim2gp.models.windows import fit_windows
 from sim2gp.parameters import prior_from_moments
+from sim2gp.runs.cells import Cells, Old, add_options
 from sim2gp.runs.workers import cores, spread
 from sim2gp.systems import TwoLink
 from sim2gp.types import in_float64
@@ -79,6 +80,7 @@ class Job(NamedTuple):
     seconds: float
     recordings: int
     out: Path
+    old: Old
 
 
 def arm() -> TwoLink:
@@ -288,18 +290,23 @@ def work(job: Job) -> dict[str, Any]:
         U = commands(job.method, job.seed, job.seconds)
         return learned(job.seed, U, job.recordings)
     which = job.seed % DESIGNS
-    name = f"{job.method.replace(' ', '_')}_{job.seconds:g}_{which}.npy"
-    U = stored(job.out / name, lambda: commands(job.method, which, job.seconds))
+    cells, name = Cells(job.out, __file__, job.old), designed(job)
+    U = stored(cells, name, lambda: commands(job.method, which, job.seconds))
     return learned(job.seed, U, job.recordings)
 
 
-def stored(path: Path, make: Callable[[], np.ndarray]) -> np.ndarray:
-    """Commands from the disk, made where they are not there yet."""
-    if not path.exists():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        np.save(path, make())
-    found: np.ndarray = np.load(path)
-    return found
+def designed(job: Job) -> str:
+    """The cell of its commands, which several arms share."""
+    which = job.seed % DESIGNS
+    return f"{job.method.replace(' ', '_')}_{job.seconds:g}_{which}"
+
+
+def stored(cells: Cells, name: str, make: Callable[[], np.ndarray]) -> np.ndarray:
+    """Commands from the disk, computed where they are not there yet."""
+    found = cells.load(name, {})
+    if found is None:
+        found = cells.save(name, {}, {"commands": make()})
+    return np.asarray(found["commands"])
 
 
 def main() -> None:
@@ -309,10 +316,13 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--workers", type=int, default=cores())
     parser.add_argument("--out", type=Path, default=Path("results/design"))
+    add_options(parser)
     options = parser.parse_args()
     seeds = range(options.truths)
-    rest = options.seconds, options.recordings, options.out.with_suffix(".cells")
+    rest = options.seconds, options.recordings, options.out, options.old
     groups = [[Job(m, s, *rest) for s in seeds] for m in METHODS]
+    cells = Cells(options.out, __file__, options.old)
+    cells.check((designed(job), {}) for group in groups for job in group)
     found: dict[str, list[Any]] = {m: [None] * len(seeds) for m in METHODS}
     for job, result in spread(work, groups, options.workers):
         found[job.method][job.seed] = result

@@ -1,6 +1,7 @@
 """Does `sim2gp explain` find the missing physics that was planted?
 
     python benchmarks/explain.py [--truths N] [--strength X] [--seconds S] [--out DIR]
+        [--refresh | --keep-old]
 
 Two machines; on each, every effect of `sim2gp.experiments.explain_study` on N hidden
 machines, nothing on 2 N, and three effects that no library holds on N each. Prints what
@@ -17,7 +18,7 @@ from typing import Any
 
 from sim2gp.experiments import explain_study as study
 from sim2gp.runs import Progress
-from sim2gp.runs.cells import Cells
+from sim2gp.runs.cells import Cells, add_options
 from sim2gp.runs.plain import to_json
 from sim2gp.tasks import MACHINES
 
@@ -33,17 +34,21 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=float("inf"))
     parser.add_argument("--machines", nargs="+", default=list(MACHINES))
     parser.add_argument("--out", type=Path, default=ROOT / "runs" / "explain-study")
+    add_options(parser)
     options = parser.parse_args()
-    started, store = time.perf_counter(), Cells(options.out)
+    started = time.perf_counter()
+    store = Cells(options.out, study.__file__, options.old)
     found: list[dict[str, Any]] = []
     todo = [
         (machine, name, k)
         for machine in options.machines
         for name, k in study.cells(machine, options.truths)
     ]
+    about = {"seed": options.seed, "strength": options.strength}
+    named = [("-".join(map(str, job)), about) for job in todo]
+    store.check(named)
     with Progress().task("cells", len(todo)) as task:
         for machine, name, k in todo:
-            about = {"seed": options.seed, "strength": options.strength}
             label = f"{machine}-{name}-{k}"
             cell = store.load(label, about)
             if cell is None:
@@ -54,10 +59,12 @@ def main() -> None:
                 store.save(label, about, cell)
             found.append(cell)
             task.advance(f"{label}: {study.verdict(machine, cell)}")
-    report(found, options)
+    report(found, store.summary(named), options)
 
 
-def report(found: list[dict[str, Any]], options: argparse.Namespace) -> None:
+def report(
+    found: list[dict[str, Any]], source: dict[str, Any], options: argparse.Namespace
+) -> None:
     """Print the confusion table and the claims; write the summary."""
     confusion: dict[str, dict[str, int]] = {}
     for cell in found:
@@ -79,6 +86,7 @@ def report(found: list[dict[str, Any]], options: argparse.Namespace) -> None:
         f"--strength {options.strength:g} --seed {options.seed}",
         **about,
         "strength": options.strength,
+        **source,
         "claims": claims,
         "confusion": {row: dict(answers) for row, answers in confusion.items()},
         "cells": found,

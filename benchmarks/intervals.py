@@ -1,6 +1,7 @@
 """Do 95 % intervals hold? Coverage under coloured noise and under missing physics.
 
     python benchmarks/intervals.py [--sets N] [--workers N] [--also NAME...] [--out DIR]
+        [--refresh | --keep-old]
 
 Ten seconds of a hidden two-link arm (`interval_arms.py`) are fitted with the likelihood
 of `sim2gp identify`; masses and dampings are unknown. Beside the plain intervals
@@ -42,7 +43,7 @@ from sim2gp.diagnose.pulls import pulls_of_windows
 from sim2gp.diagnose.residuals import misfit_of_windows
 from sim2gp.models.cutting import cut
 from sim2gp.models.windows import WindowsBelief, fit_windows
-from sim2gp.runs.cells import Cells
+from sim2gp.runs.cells import Cells, add_options
 from sim2gp.runs.workers import cores, spread
 from sim2gp.systems import UniformRodArm
 from sim2gp.types import in_float64
@@ -272,9 +273,16 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=cores())
     parser.add_argument("--also", nargs="+", choices=FLOWN, default=[])
     parser.add_argument("--out", type=Path, default=Path("results/intervals"))
+    add_options(parser)
     options = parser.parse_args()
     chunks = -(-options.sets // CHUNK)
-    cells, groups, found = Cells(options.out), [], {}
+    cells, groups, found = Cells(options.out, __file__, options.old), [], {}
+    cells.check(
+        (job.name, job.arguments)
+        for name in CONDITIONS
+        for also in ("", *FLOWN)
+        for job in (Job(name, k, options.out, also) for k in range(chunks))
+    )
     for name in CONDITIONS:
         for also in ("", *FLOWN):
             jobs = [Job(name, k, options.out, also) for k in range(chunks)]
@@ -286,7 +294,8 @@ def main() -> None:
     for job, values in spread(work, groups, options.workers):
         found[job] = cells.save(job.name, job.arguments, values)
         print(f"{len(found)}", end="\r", file=sys.stderr)
-    summary: dict[str, Any] = {"sets": chunks * CHUNK, "conditions": {}}
+    about = cells.summary((job.name, job.arguments) for job in found)
+    summary: dict[str, Any] = {"sets": chunks * CHUNK, **about, "conditions": {}}
     for name, condition in CONDITIONS.items():
         joined: dict[str, list[Any]] = {}
         for job in sorted(found, key=lambda j: j.chunk):

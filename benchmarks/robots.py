@@ -1,6 +1,7 @@
 """Robots of others: are hidden constants of models from dm_control recovered?
 
     python benchmarks/robots.py [--models FOLDER] [--draws N] [--workers N] [--out DIR]
+        [--refresh | --keep-old]
 
 The cart-pole, acrobot and reacher (an arm) of the suite of dm_control; their files are
 looked for where dm_control is installed, or in FOLDER. For each draw their constants
@@ -30,7 +31,7 @@ from sim2gp.errors import InputError, NotConverged, NotFinite
 from sim2gp.experiments.prediction import cut_logs
 from sim2gp.models.windows import fit_windows
 from sim2gp.project import Project, load_project
-from sim2gp.runs.cells import Cells
+from sim2gp.runs.cells import Cells, add_options
 from sim2gp.runs.workers import cores, spread
 from sim2gp.systems.actuator import bare
 from sim2gp.types import in_float64
@@ -121,6 +122,16 @@ class Job(NamedTuple):
     draw: int
     models: Path
     out: Path
+
+    @property
+    def name(self) -> str:
+        """Of its cell."""
+        return f"{self.robot}_{self.draw}"
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """What its cell rests on."""
+        return ROBOTS[self.robot].arguments
 
 
 @in_float64
@@ -278,25 +289,27 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=40)
     parser.add_argument("--workers", type=int, default=cores())
     parser.add_argument("--out", type=Path, default=Path("results/robots"))
+    add_options(parser)
     options = parser.parse_args()
     models = (options.models or models_of_dm_control()).resolve()
-    cells, groups = Cells(options.out), []
+    draws = range(options.draws)
+    cells, groups = Cells(options.out, __file__, options.old), []
     found: dict[Job, dict[str, Any]] = {}
-    for name, robot in ROBOTS.items():
-        told = robot.arguments
-        jobs = [Job(name, d, models, options.out) for d in range(options.draws)]
-        done = {job: cells.load(f"{name}_{job.draw}", told) for job in jobs}
+    every = [Job(name, d, models, options.out) for name in ROBOTS for d in draws]
+    cells.check(named := [(job.name, job.arguments) for job in every])
+    for name in ROBOTS:
+        jobs = [job for job in every if job.robot == name]
+        done = {job: cells.load(job.name, job.arguments) for job in jobs}
         found |= {job: values for job, values in done.items() if values is not None}
         groups.append([job for job in jobs if done[job] is None])
     for job, values in spread(work, groups, options.workers):
-        robot = ROBOTS[job.robot]
-        told = robot.arguments
-        found[job] = cells.save(f"{job.robot}_{job.draw}", told, values)
-        print(f"{len(found)}/{len(ROBOTS) * options.draws}", end="\r", file=sys.stderr)
-    summary: dict[str, Any] = {"draws": options.draws, "robots": {}}
-    for name in ROBOTS:
-        jobs = [Job(name, d, models, options.out) for d in range(options.draws)]
-        summary["robots"][name] = table([found[job] for job in jobs])
+        found[job] = cells.save(job.name, job.arguments, values)
+        print(f"{len(found)}/{len(every)}", end="\r", file=sys.stderr)
+    summary: dict[str, Any] = {"draws": options.draws, **cells.summary(named)}
+    summary["robots"] = {
+        name: table([found[job] for job in every if job.robot == name])
+        for name in ROBOTS
+    }
     text = "\n".join(lines(summary))
     print(text)
     options.out.mkdir(parents=True, exist_ok=True)

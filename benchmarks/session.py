@@ -1,6 +1,7 @@
 """A session that designs its own experiments and stops, beside a tuned multisine.
 
     python benchmarks/session.py [--truths N] [--rounds N] [--workers N] [--out DIR]
+        [--refresh | --keep-old]
 
 Hidden two-link arms from CAD priors, as in `design.py`. The session designs ten
 seconds, runs them, fits all logs, and designs again, until `sim2gp design` says that
@@ -41,8 +42,7 @@ from sim2gp.experiments.design import expectation
 from sim2gp.experiments.design_verdict import Asked, verdict
 from sim2gp.gaussian import Gaussian
 from sim2gp.logs import Log
-from sim2gp.runs.cells import Cells
-from sim2gp.runs.plain import source
+from sim2gp.runs.cells import Cells, Old, add_options
 from sim2gp.runs.workers import cores, spread
 from sim2gp.types import in_float64
 
@@ -51,6 +51,7 @@ SECONDS = 10.0
 ASKED = Asked(SECONDS, "free", (), None, 2.0, {}, {}, {}, PERIOD)
 #: Of the same motions; the session itself learns from the first.
 RECORDINGS = 5
+MULTISINE = "multisine"  # the cell of its commands
 #: The project's goal: as good as the multisine in so many times the seconds.
 TIMES = 2
 
@@ -59,6 +60,22 @@ class Job(NamedTuple):
     seed: int
     rounds: int
     out: Path
+    old: Old
+
+    @property
+    def name(self) -> str:
+        """Of its cell."""
+        return f"arm{self.seed}"
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """What its cell rests on."""
+        told = {"rounds": self.rounds, "noise": NOISE, "limits": LIMITS, "rates": RATES}
+        return told | {"starts": STARTS, "recordings": RECORDINGS, "times": TIMES}
+
+    @property
+    def cells(self) -> Cells:
+        return Cells(self.out, __file__, self.old)
 
 
 @in_float64
@@ -109,21 +126,19 @@ def judged(seed: int, commands: list[np.ndarray], first: int) -> list[float]:
 
 def work(job: Job) -> dict[str, Any]:
     """Both on one arm; from the disk if they were flown."""
-    U = stored(job.out.with_suffix(".cells") / "multisine.npy", tuned)
-    cells, name = Cells(job.out), f"arm{job.seed}"
-    told = {"rounds": job.rounds, "noise": NOISE, "limits": LIMITS, "rates": RATES}
-    told |= {"starts": STARTS, "recordings": RECORDINGS, "times": TIMES}
-    found = cells.load(name, told)
+    cells = job.cells
+    U = stored(cells, MULTISINE, tuned)
+    found = cells.load(job.name, job.arguments)
     if found is None:
         said, flown = session(job.seed, job.rounds)
-        np.savez(job.out.with_suffix(".cells") / f"{name}.npz", *flown)
+        np.savez(cells.folder / f"{job.name}.npz", *flown)
         n = len(flown)
         values = {
             "session": judged(job.seed, flown, 0),
             "as_many": judged(job.seed, n * [U], 100),
             "more": judged(job.seed, TIMES * n * [U], 100),
         }
-        found = cells.save(name, told, said | values | {"source": source()})
+        found = cells.save(job.name, job.arguments, said | values)
     return found
 
 
@@ -138,9 +153,13 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=8)
     parser.add_argument("--workers", type=int, default=cores())
     parser.add_argument("--out", type=Path, default=Path("results/session"))
+    add_options(parser)
     options = parser.parse_args()
-    stored(options.out.with_suffix(".cells") / "multisine.npy", tuned)
-    jobs = [Job(seed, options.rounds, options.out) for seed in range(options.truths)]
+    seeds, rest = range(options.truths), (options.rounds, options.out, options.old)
+    jobs = [Job(seed, *rest) for seed in seeds]
+    cells = Cells(options.out, __file__, options.old)
+    cells.check([(MULTISINE, {}), *((job.name, job.arguments) for job in jobs)])
+    stored(cells, MULTISINE, tuned)
     groups = [jobs[i :: options.workers] for i in range(options.workers)]
     rows: list[Any] = [None] * len(jobs)
     for job, row in spread(work, groups, options.workers):

@@ -1,6 +1,7 @@
 """Learning within an episode beside learning between episodes, under mismatch.
 
     python benchmarks/within_episode.py [--seeds N] [--episodes N] [--every STEPS]
+        [--refresh | --keep-old]
 
 The Furuta with figure 2's cable spring. Each learner is flown as the paper has it (one
 world per episode) and with a belief that is conditioned, and drawn from again, every
@@ -23,6 +24,7 @@ from sim2gp.experiments.swingup import (
     study,
 )
 from sim2gp.runs import Progress
+from sim2gp.runs.cells import add_options
 from sim2gp.runs.workers import cores
 from sim2gp.tasks import SOLVED
 
@@ -37,6 +39,7 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=50)
     parser.add_argument("--workers", type=int, default=cores())
     parser.add_argument("--out", type=Path, default=Path("results/within_episode"))
+    add_options(parser)
     arguments = parser.parse_args()
     groups = {
         (condition, learner, every): Cell(
@@ -46,12 +49,13 @@ def main() -> None:
         for condition in CONDITIONS
         for every in (None, arguments.every)
     }
-    table, _ = study(
+    table, details = study(
         groups,
         range(arguments.seeds),
         arguments.out,
         workers=arguments.workers,
         progress=Progress(),
+        old=arguments.old,
     )
     text = "\n".join(_lines(table, arguments.every))
     print(text)
@@ -61,7 +65,8 @@ def main() -> None:
         f"{c}, {learner}, {every or 'episode'}": score.tolist()
         for (c, learner, every), score in table.items()
     }
-    told = {"command": " ".join(["python", *sys.argv]), "scores": plain}
+    about = {name: details[name] for name in ("source", "cells_of_other_source")}
+    told = {"command": " ".join(["python", *sys.argv]), **about, "scores": plain}
     (arguments.out / "scores.json").write_text(json.dumps(told, indent=1) + "\n")
 
 

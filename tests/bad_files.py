@@ -23,7 +23,8 @@ from bad_inputs import (
     stored,
 )
 from sim2gp.project import load_project
-from sim2gp.robot.policy import FORMAT, load_policy
+from sim2gp.robot.format import FORMAT
+from sim2gp.robot.policy import load_policy
 from sim2gp.runs import new_run
 
 # Models
@@ -82,11 +83,11 @@ def policy(changes: Mapping[str, Any], code: str, *said: str) -> Input:
     """What `export_policy` writes, of one layer, with some arrays changed."""
 
     def make(folder: Path, patch: Patch) -> None:
-        one = np.ones((1, 1), np.float32)
-        stored = {"weights/0": one, "biases/0": one[0], "scale": one[0]}
-        stored |= {"low": -one[0], "high": one[0]}
+        two, one = np.ones((1, 2), np.float32), np.ones(1, np.float32)
+        stored = {"weights/0": two, "biases/0": two[0], "scale": one}
+        stored |= {"low": -one, "high": one}
         about = {"format": FORMAT, "layers": 1, "angle": None}
-        about |= {"states": ["x"], "actions": ["u"]}
+        about |= {"states": ["x"], "actions": ["u"], "units": {"x": "m", "u": "V"}}
         with new_run(folder / "policy", "export policy") as writer:
             writer.write_arrays("arrays.npz", stored | dict(changes))
             writer.write_summary({"policy": about})
@@ -95,7 +96,7 @@ def policy(changes: Mapping[str, Any], code: str, *said: str) -> Input:
     return Input(code, said, make)
 
 
-NAN = np.full((1, 1), np.nan, np.float32)
+NAN = np.full((1, 2), np.nan, np.float32)
 
 
 def run(spoil: Callable[[Path], object], code: str, *said: str) -> Input:
@@ -224,8 +225,8 @@ THIRD: tuple[Case, ...] = (
         74,
         "tensors",
         stored("a.safetensors", raw(TENSORS), "E181", "numpy.savez"),
-        policy({"weights/0": NAN}, "E181", "weights/0", "1 of 1"),
-        policy({"weights/0": np.ones((1, 1))}, "E133", "float64"),
+        policy({"weights/0": NAN}, "E181", "weights/0", "2 of 2"),
+        policy({"weights/0": np.ones((1, 2))}, "E133", "float64"),
         stored(
             "a.npz",
             archive(("pos.npy", b"\x93NUMPY\x02\x00" + b"\xff" * 3 + b"\x7f")),
@@ -243,7 +244,7 @@ THIRD: tuple[Case, ...] = (
         76,
         "run that was changed",
         run(flipped, "E183", "arrays.npz", "another checksum"),
-        run(newer, "E185", "got 99", "at most 1"),
+        run(newer, "E185", "got 99", "at most 2"),
         run(fixed_since, "E184", "project.toml", "expected cart_mass"),
     ),
 )

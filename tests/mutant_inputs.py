@@ -99,7 +99,7 @@ INPUTS = (
     ),
     Mutant(
         "inputs: a policy may be NaN",
-        "robot/policy.py",
+        "robot/format.py",
         "        if bad:",
         "        if False:",
         (TESTS, "tensors"),

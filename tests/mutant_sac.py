@@ -148,9 +148,9 @@ OFF_POLICY = (
     ),
     Mutant(
         "policy: numbers of any width are run",
-        POLICY,
-        "if x.dtype != np.float32:",
-        "if x.dtype == np.float16:",
+        "robot/format.py",
+        "if found[name].dtype != np.float32:",
+        "if found[name].dtype == np.float16:",
         ("test_export.py", "refused"),
     ),
     Mutant(

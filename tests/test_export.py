@@ -1,7 +1,10 @@
 """What leaves the project: a policy that needs no JAX, constants for other trainers."""
 
+import json
+import os
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import equinox as eqx
@@ -10,18 +13,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import bad_policies
 from sim2gp.errors import InputError, NotFinite
 from sim2gp.flight import oracle_world
 from sim2gp.models import NLM, Sim2GP
 from sim2gp.planning import SAC, Observation, Policy
 from sim2gp.robot import NumpyPolicy, load_policy
 from sim2gp.robot.export import export_model, export_policy
-from sim2gp.runs import load_run, new_run
+from sim2gp.runs import load_run, new_run, store
 from sim2gp.systems import Actuated, CartPole, Furuta, MuJoCo
 from sim2gp.tasks import furuta_swingup
 
 KEY = jax.random.key(0)
 TASK, SYSTEM = furuta_swingup(), Furuta()
+GOLDEN = Path(__file__).parent / "golden"
 
 
 CART = """
@@ -124,10 +129,11 @@ def test_what_is_no_policy_is_refused(folder: Path, tmp_path: Path) -> None:
 
     arrays = found.arrays
     newer = written("newer", about | {"format": 2}, arrays)
+    with pytest.raises(InputError, match="E185"):
+        load_policy(newer)
     few = {k: v for k, v in arrays.items() if k != "biases/1"}
     wide = arrays | {"scale": arrays["scale"].astype(float)}
     for place, got in (
-        (newer, "another format"),
         (written("few", about, few), "biases/1"),
         (written("wide", about, wide), "float64"),
     ):
@@ -140,6 +146,93 @@ def test_what_is_no_policy_is_refused(folder: Path, tmp_path: Path) -> None:
             load_policy(folder)
     finally:
         (folder / "arrays.npz").write_bytes(content)
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A good policy of two layers: four states, of which one turns, one action."""
+    out = tmp_path_factory.mktemp("small") / "policy"
+    rng = np.random.default_rng(0)
+    widths, states = (5, 3, 2), ("x", "theta", "x.velocity", "theta.velocity")
+    arrays = {"scale": [1.0, 2.0, 3.0, 4.0], "low": [-5.0], "high": [5.0]}
+    for i, shape in enumerate(pairwise(widths)):
+        arrays |= {f"weights/{i}": rng.normal(size=shape)}
+        arrays |= {f"biases/{i}": rng.normal(size=shape[1])}
+    units = dict(
+        zip((*states, "voltage"), ("m", "rad", "m/s", "rad/s", "V"), strict=True)
+    )
+    about = {"format": 1, "layers": 2, "angle": 1, "states": states}
+    about |= {"actions": ["voltage"], "units": units}
+    with new_run(out, "export policy") as writer:
+        plain = {name: np.asarray(x, np.float32) for name, x in arrays.items()}
+        writer.write_arrays("arrays.npz", plain)
+        writer.write_summary({"policy": about})
+    return out
+
+
+@pytest.fixture
+def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hundreds of runs in a moment: none waits for the disk, or asks for versions."""
+    monkeypatch.setattr(os, "fsync", lambda handle: None)
+    monkeypatch.setattr(store, "environment", dict)
+
+
+@pytest.mark.usefixtures("hasty")
+def test_no_malformed_policy_is_accepted(small: Path, tmp_path: Path) -> None:
+    """More than 300 of them; each is refused with the error of its kind."""
+    assert load_policy(small)(np.zeros(4)).shape == (1,)
+    accepted, surprises = [], []
+    found = bad_policies.cases(small)
+    for i, case in enumerate(found):
+        case.make(tmp_path / str(i))
+        try:
+            load_policy(tmp_path / str(i))
+            accepted.append(case.name)
+        except InputError as error:
+            if error.code != case.code:
+                surprises.append(f"{case.name}: {error}")
+        except Exception as error:
+            surprises.append(f"{case.name}: {error!r}")
+    assert len(found) >= 300
+    assert accepted == []
+    assert surprises == []
+
+
+@pytest.mark.usefixtures("hasty")
+def test_sizes_are_checked_before_an_array_is_built(
+    small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor is anything built where only names or units are wrong."""
+    from sim2gp.robot import policy
+
+    def built(content: bytes) -> dict[str, np.ndarray]:
+        raise AssertionError("an array was built")
+
+    monkeypatch.setattr(policy, "load_arrays", built)
+    words = ("declares too much", "units: ", "no rows", "no states", "as <f8")
+    found = [c for c in bad_policies.cases(small) if any(w in c.name for w in words)]
+    assert len(found) > 20
+    for i, case in enumerate(found):
+        case.make(tmp_path / str(i))
+        with pytest.raises(InputError, match=case.code):
+            load_policy(tmp_path / str(i))
+
+
+def test_a_policy_of_the_first_version_still_acts_as_it_did() -> None:
+    """Files and actions that version 0.1.0 wrote."""
+    run = load_policy(GOLDEN / "policy")
+    said = json.loads((GOLDEN / "policy.json").read_text())
+    for s, a in zip(said["states"], said["actions"], strict=True):
+        np.testing.assert_allclose(run(np.asarray(s, "f4")), a, rtol=1e-6)
+
+
+def test_nothing_is_exported_that_a_robot_refuses(
+    policy: Policy, tmp_path: Path
+) -> None:
+    lost = eqx.tree_at(lambda p: p.actor.biases[0], policy, replace_fn=lambda b: b / 0)
+    with pytest.raises(InputError, match="E181"):
+        export_policy(lost, tmp_path / "lost", SYSTEM)
+    assert not (tmp_path / "lost").exists()
 
 
 def test_a_policy_of_another_machine_is_not_named_after_this_one(

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sim2gp.errors import InputError
 from sim2gp.experiments import figure2, swingup
 from sim2gp.experiments.swingup import CONDITIONS, METHODS, TRAINED, Cell
 from sim2gp.planning import MPC, SAC
 from sim2gp.report import figure2 as drawn
 from sim2gp.runs import Progress
 from sim2gp.runs.cells import Cells
-from sim2gp.runs.plain import source
 from sim2gp.tasks import MACHINES
 
 ORACLE = {"hang_return": 50.0, "oracle_return": 150.0, "redrawn": 1, "returns": [150.0]}
@@ -123,7 +123,7 @@ def test_policies_are_trained_where_no_episode_changes_anything(method, monkeypa
 
 
 def test_a_finished_cell_is_not_flown_again(tmp_path: Path, monkeypatch):
-    cells = Cells(tmp_path / "fig2")
+    cells = Cells(tmp_path / "fig2", swingup.__file__)
     cell = Cell("furuta", "nominal", "SIM2GP", 3, 2)
     assert cells.load(cell.name, cell.arguments) is None
     saved = cells.save(cell.name, cell.arguments, {"returns": (1.0, np.float64(2.0))})
@@ -137,13 +137,11 @@ def test_a_finished_cell_is_not_flown_again(tmp_path: Path, monkeypatch):
     monkeypatch.setattr(swingup, "oracle_cell", lambda cell: ORACLE)
     more = dataclasses.replace(cell, episodes=4)
     flown = swingup.fly_cell(more, tmp_path / "fig2")
-    assert flown == {"returns": [], "source": source()}
+    assert flown == {"returns": []}
     for other in (MPC(horizon=7), MPC(lengths=(0.5, 1.0))):
         monkeypatch.setitem(swingup.PLANNERS, "mpc", other)
-        assert cells.load(cell.name, cell.arguments) is None
-    # Damaged, it counts as missing.
-    (cells.folder / f"{cell.name}.json").write_text('{"arguments": ')
-    assert cells.load(cell.name, cell.arguments) is None
+        with pytest.raises(InputError, match=r"E186 .* 1 with other arguments"):
+            cells.load(cell.name, cell.arguments)
 
 
 def test_a_changed_default_of_the_planner_is_another_planner(monkeypatch):
@@ -154,15 +152,6 @@ def test_a_changed_default_of_the_planner_is_another_planner(monkeypatch):
     assert before["planner"]["lengths"] == MPC().lengths
     monkeypatch.setitem(swingup.PLANNERS, "mpc", MPC(lengths=(1.0,)))
     assert cell.arguments != before
-
-
-def test_cells_that_other_code_flew_are_counted():
-    cell = Cell("furuta", "nominal", "SIM2GP", 3, 2)
-    value = {"returns": [1.0, 2.0], "failure": None, "seconds": 1.0}
-    older = dataclasses.replace(cell, seed=4)
-    told = swingup.told({cell: value | {"source": source()}, older: value})
-    assert told["source"] == source()
-    assert told["cells_of_other_source"] == 1
 
 
 def test_a_quick_look_has_a_planner_and_cells_of_its_own(monkeypatch):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
+from sim2gp.errors import InputError
 from sim2gp.experiments import exploring, figure3
 from sim2gp.experiments.exploring import METHODS, Cell, HeldOut
 from sim2gp.experiments.swingup import CONDITIONS, meeting
@@ -138,7 +139,7 @@ def test_what_is_tested_is_the_swing_up_of_the_oracle():
 
 
 def test_a_finished_cell_is_not_flown_again(tmp_path: Path, monkeypatch):
-    cells = Cells(tmp_path / "exploring")
+    cells = Cells(tmp_path / "exploring", exploring.__file__)
     cell = Cell("furuta", "nominal", "SIM2GP", 3, 2)
     values = {"rmse": [1.0, 0.5], "failure": None, "early": []}
     saved = cells.save(cell.name, cell.arguments, values)
@@ -146,9 +147,10 @@ def test_a_finished_cell_is_not_flown_again(tmp_path: Path, monkeypatch):
     more = dataclasses.replace(cell, episodes=3)
     monkeypatch.setattr(exploring, "oracle_cell", lambda cell: {"redrawn": 0})
     monkeypatch.setattr(exploring, "learner_cell", lambda cell, oracle: dict(values))
-    assert "source" in exploring.explore_cell(more, tmp_path / "exploring")
+    assert exploring.explore_cell(more, tmp_path / "exploring") == values
     monkeypatch.setattr(exploring, "EXPLORER", exploring.QUICK_EXPLORER)
-    assert cells.load(cell.name, cell.arguments) is None
+    with pytest.raises(InputError, match=r"E186 .* 1 with other arguments"):
+        cells.load(cell.name, cell.arguments)
     # A first fit that failed is not tried again either.
     lost = {"rmse": [], "failure": "E203", "early": []}
     saved = cells.save(more.name, more.arguments, lost)

@@ -16,10 +16,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-import sim2gp
 from sim2gp.errors import InputError, Sim2GPError
-from sim2gp.runs import DiskError, Progress, RunOwned, load_run, new_run, plain
+from sim2gp.runs import DiskError, Progress, RunOwned, load_run, new_run
 from sim2gp.runs.plain import to_json
+from sim2gp.runs.sealed import seal, unseal
 
 
 def save(path: Path, value: float = 1.0, *, extra: bool = False) -> None:
@@ -203,7 +203,7 @@ def test_second_process_is_told_and_a_killed_one_forgotten(tmp_path: Path) -> No
     assert not (tmp_path / "a" / "half").exists()
 
 
-@pytest.mark.parametrize("name", ["summary.json", "arrays.npz"])
+@pytest.mark.parametrize("name", ["summary.json", "arrays.npz", "manifest.json"])
 def test_every_torn_or_flipped_file_is_noticed(name: str, tmp_path: Path) -> None:
     save(tmp_path / "a")
     path = tmp_path / "a" / name
@@ -217,7 +217,7 @@ def test_every_torn_or_flipped_file_is_noticed(name: str, tmp_path: Path) -> Non
         with pytest.raises(InputError, match="E183"):
             load_run(tmp_path / "a")
     path.unlink()
-    with pytest.raises(InputError, match="E183"):
+    with pytest.raises(InputError, match="E130" if name == "manifest.json" else "E183"):
         load_run(tmp_path / "a")
     path.write_bytes(good)
     load_run(tmp_path / "a")
@@ -229,9 +229,11 @@ def test_foreign_and_newer_folders(tmp_path: Path) -> None:
     save(tmp_path / "a")
     manifest = tmp_path / "a" / "manifest.json"
     text = manifest.read_text()
-    manifest.write_text(text.replace('"format": 1', '"format": 99'))
-    with pytest.raises(InputError, match="E185"):
-        load_run(tmp_path / "a")
+    newer = unseal(manifest.read_bytes()) | {"format": 99}
+    for written in (seal(newer), to_json(newer).encode()):
+        manifest.write_bytes(written)
+        with pytest.raises(InputError, match="E185"):
+            load_run(tmp_path / "a")
     manifest.write_text(text[:50])
     with pytest.raises(InputError, match="E183"):
         load_run(tmp_path / "a")
@@ -305,23 +307,3 @@ def test_progress_lines(capsys: pytest.CaptureFixture[str]) -> None:
     assert list(quiet.track("abc", "letters")) == ["a", "b", "c"]
     quiet.say("nothing")
     assert capsys.readouterr().err == ""
-
-
-def test_the_source_is_named_by_what_it_says(tmp_path: Path):
-    (tmp_path / "cli").mkdir()
-    code, words = tmp_path / "code.py", tmp_path / "cli" / "words.py"
-    names = []
-    for text in (
-        'def f(x):\n    """Twice."""\n    return 2 * x\n',
-        '"""A file."""\n\ndef f(x):\n    return (2 * x)  # twice\n',
-        "def f(x):\n    return 3 * x\n",
-    ):
-        code.write_text(text)
-        words.write_text(text)
-        plain.source.cache_clear()
-        names.append(plain.source(tmp_path))
-    assert names[0] == names[1] != names[2]
-    words.write_text("")
-    plain.source.cache_clear()
-    assert plain.source(tmp_path) == names[2]
-    assert plain.source() == plain.source(Path(sim2gp.__file__).parent)

@@ -349,20 +349,26 @@ class Reproduce(Writes):
     """A look: fewer seeds or arms, fewer episodes (fig2: fewer plans, too)."""
     workers: int | None = None
     """Processes (not figure 1); default one per core."""
+    refresh: bool = False
+    """Compute stored cells again that other code or versions computed."""
+    keep_old: bool = False
+    """Use them; the summary says how many."""
 
     def run(self, progress: Progress) -> dict[str, Any]:
-        more: dict[str, Any] = {
-            "seeds": self.seeds,
-            "episodes": self.episodes,
-            "workers": self.workers,
-        }
+        if self.refresh and self.keep_old:
+            where, one = "--refresh with --keep-old", "one of them"
+            raise usage_error(where, "both", one, "leave one out")
+        more: dict[str, Any] = {}
         if self.figure == "fig1":
-            for name, value in more.items():
-                if value is not None:
-                    where, one = f"--{name} with fig1", "one run in one process"
+            for name in ("seeds", "episodes", "workers", "refresh", "keep_old"):
+                value = getattr(self, name)
+                if value not in (None, False):
+                    where = f"--{name.replace('_', '-')} with fig1"
+                    one = "one run in one process"
                     raise usage_error(where, str(value), one, "leave it out")
-            more = {}
         else:
+            old = "refresh" if self.refresh else "keep" if self.keep_old else "refuse"
+            more = {"seeds": self.seeds, "episodes": self.episodes, "old": old}
             more["workers"] = self.workers or cores()
         if FIGURES[self.figure] in ("figure2", "figure3"):  # of two figures each
             more["figure"] = self.figure

@@ -34,8 +34,7 @@ from sim2gp.planning import (
     Multisine,
     RandomInput,
 )
-from sim2gp.runs.cells import Cells
-from sim2gp.runs.plain import source
+from sim2gp.runs.cells import Cells, Old
 from sim2gp.tasks import Task
 from sim2gp.transitions import Transitions
 from sim2gp.types import Dynamics, Key, in_float64
@@ -257,9 +256,9 @@ def beginnings(
     return out
 
 
-def explore_cell(cell: Cell, out: Path) -> dict[str, Any]:
-    """A cell's values, from the disk if it was flown for as many episodes."""
-    cells = Cells(out)
+def explore_cell(cell: Cell, out: Path, old: Old = "refuse") -> dict[str, Any]:
+    """A cell's values, from the disk if it was run for as many episodes (E186)."""
+    cells = Cells(out, __file__, old)
     stored = cells.load(cell.name, cell.arguments)
     oracle = cell.method == "oracle"
     if stored is not None and (
@@ -269,8 +268,8 @@ def explore_cell(cell: Cell, out: Path) -> dict[str, Any]:
     if oracle:
         values = oracle_cell(cell)
     else:
-        values = learner_cell(cell, explore_cell(reference(cell), out))
-    return cells.save(cell.name, cell.arguments, values | {"source": source()})
+        values = learner_cell(cell, explore_cell(reference(cell), out, old))
+    return cells.save(cell.name, cell.arguments, values)
 
 
 def reference(cell: Cell) -> Cell:

@@ -21,7 +21,7 @@ from sim2gp.experiments.claims import (
     interval,
     told,
 )
-from sim2gp.experiments.record import provenance
+from sim2gp.experiments.record import provenance, reproduce
 from sim2gp.experiments.swingup import (
     CONDITIONS,
     METHODS,
@@ -34,6 +34,7 @@ from sim2gp.experiments.swingup import (
     study,
 )
 from sim2gp.runs import Progress, new_run
+from sim2gp.runs.cells import Old
 from sim2gp.tasks import MACHINES, SOLVED
 
 SEEDS, EPISODES = 5, 10
@@ -67,18 +68,18 @@ def run(
     quick: bool,
     workers: int,
     progress: Progress,
+    old: Old = "refuse",
 ) -> dict[str, Any]:
-    """Fly the missing cells, check the claims, write the run; returns its summary.
+    """Compute missing cells, check the claims, write the run; returns its summary.
 
-    ``figure`` is ``fig2`` or ``fig4``. ``seeds`` and ``episodes`` None are the figure's
-    own numbers. The cells of an earlier run with the same ``out`` are used again, also
-    for fewer episodes. A ``quick`` look is planned with fewer sequences, or trained for
-    less, and has cells of its own.
+    ``seeds`` and ``episodes`` None are the figure's own numbers. Cells of an earlier
+    run with this ``out`` are used again, also for fewer episodes (E186: of another
+    source, see ``old``). A ``quick`` look has fewer plans and cells of its own.
     """
     started = time.perf_counter()
     seeds = seeds or (QUICK_SEEDS if quick else SEEDS)
     episodes = episodes or (QUICK_EPISODES if quick else EPISODES)
-    number, title, planning, methods = FIGURES[figure]
+    number, title, planning, methods = FIGURES[figure]  # fig2 or fig4
     groups = {
         (m, c, w): Cell(m, c, w, seed, episodes, quick=quick, planning=planning)
         for m in MACHINES
@@ -87,8 +88,9 @@ def run(
     }
     numbers = range(seed, seed + seeds)
     with new_run(out, f"reproduce {figure}") as writer:
-        table, details = study(groups, numbers, out, workers=workers, progress=progress)
-        words = f"sim2gp reproduce {figure} --seed {seed} --seeds {seeds} "
+        table, details = study(
+            groups, numbers, out, workers=workers, progress=progress, old=old
+        )
         check = claims if figure == "fig2" else off_policy_claims
         summary: dict[str, Any] = {
             "command": f"reproduce {figure}",
@@ -105,7 +107,7 @@ def run(
             "claims": check(table, np.random.default_rng(seed)),
             **details,
             "tables": [_table(table, methods)],
-            **provenance(words + f"--episodes {episodes}{' --quick' * quick}", started),
+            **provenance(reproduce(figure, seed, seeds, episodes, quick, old), started),
         }
         arrays = {f"figure2/{'/'.join(k)}": v for k, v in table.items()}
         from sim2gp.report import figure2, figure_bytes, write_report

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from sim2gp.experiments import exploring
 from sim2gp.experiments.claims import at_least_as_good, claim, of_median
 from sim2gp.experiments.exploring import (
     METHODS,
@@ -23,11 +24,11 @@ from sim2gp.experiments.exploring import (
     explore_cell,
     reference,
 )
-from sim2gp.experiments.record import provenance
+from sim2gp.experiments.record import provenance, reproduce
 from sim2gp.experiments.stages import in_stages
 from sim2gp.experiments.swingup import CONDITIONS
 from sim2gp.runs import Progress, new_run
-from sim2gp.runs.plain import source
+from sim2gp.runs.cells import Cells, Old
 from sim2gp.tasks import MACHINES
 
 SEEDS, EPISODES = 5, 10
@@ -54,6 +55,7 @@ def run(
     workers: int,
     progress: Progress,
     figure: str = "fig3",
+    old: Old = "refuse",
 ) -> dict[str, Any]:
     """Fly the missing cells, check the claims, write the run; returns its summary.
 
@@ -71,12 +73,10 @@ def run(
         for w in methods
     }
     with new_run(out, f"reproduce {figure}") as writer:
-        flown = _flown(groups, out, workers=workers, progress=progress)
+        flown, about = _flown(groups, out, workers=workers, progress=progress, old=old)
         of_key = {k: [flown[cell] for cell in row] for k, row in groups.items()}
         table = {key: _columns(values, episodes) for key, values in of_key.items()}
         early = {key: _beginnings(values) for key, values in of_key.items()}
-        words = f"sim2gp reproduce {figure} --seed {seed} --seeds {seeds} "
-        words += f"--episodes {episodes}{' --quick' * quick}"
         summary: dict[str, Any] = {
             "command": f"reproduce {figure}",
             "title": "Figures 3 and 5: exploring for information",
@@ -90,9 +90,9 @@ def run(
             "seed": seed,
             "seeds": seeds,
             "claims": claims(table, early, np.random.default_rng(seed)),
-            **_told(flown),
+            **about,
             "tables": _tables(table, methods),
-            **provenance(words, started),
+            **provenance(reproduce(figure, seed, seeds, episodes, quick, old), started),
         }
         arrays = _arrays(table, early)
         from sim2gp.report import figure3, figure_bytes, write_report
@@ -117,8 +117,14 @@ def _arrays(table: Table, early: Mapping[Key, np.ndarray]) -> dict[str, np.ndarr
 
 
 def _flown(
-    groups: Mapping[Key, list[Cell]], out: Path, *, workers: int, progress: Progress
-) -> dict[Cell, dict[str, Any]]:
+    groups: Mapping[Key, list[Cell]],
+    out: Path,
+    *,
+    workers: int,
+    progress: Progress,
+    old: Old,
+) -> tuple[dict[Cell, dict[str, Any]], dict[str, Any]]:
+    """The values of every cell, and what a summary says of their source (E186)."""
     every = list(chain.from_iterable(groups.values()))
     stages = (list(dict.fromkeys(map(reference, every))), every)
 
@@ -126,8 +132,13 @@ def _flown(
         return cell.machine, cell.method
 
     # Both figures are drawn from the same cells.
-    work = partial(explore_cell, out=out.parent / "exploring")
-    return in_stages(stages, work, alike, workers=workers, progress=progress)
+    shared = out.parent / "exploring"
+    stored = Cells(shared, exploring.__file__, old)
+    named = [(cell.name, cell.arguments) for cell in dict.fromkeys(chain(*stages))]
+    stored.check(named)
+    work = partial(explore_cell, out=shared, old=old)
+    flown = in_stages(stages, work, alike, workers=workers, progress=progress)
+    return flown, _told(flown) | stored.summary(named)
 
 
 def _columns(
@@ -259,10 +270,6 @@ def _told(flown: Mapping[Cell, Mapping[str, Any]]) -> dict[str, Any]:
             for cell, value in flown.items()
             if value.get("failure")
         ],
-        "source": source(),
-        "cells_of_other_source": sum(
-            value.get("source") != source() for value in flown.values()
-        ),
         "seconds_of_cells": spent,
     }
 

@@ -19,7 +19,7 @@ from sim2gp.experiments.claims import (
     claim,
     resampled,
 )
-from sim2gp.experiments.record import provenance
+from sim2gp.experiments.record import provenance, reproduce
 from sim2gp.experiments.swingup import (
     METHODS,
     WITH_TERM,
@@ -29,6 +29,7 @@ from sim2gp.experiments.swingup import (
     study,
 )
 from sim2gp.runs import Progress, new_run
+from sim2gp.runs.cells import Old
 from sim2gp.systems.perturbed import STRENGTHS
 from sim2gp.tasks import SOLVED
 
@@ -53,6 +54,7 @@ def run(
     quick: bool,
     workers: int,
     progress: Progress,
+    old: Old = "refuse",
 ) -> dict[str, Any]:
     """Fly the missing cells and write the map; returns its summary.
 
@@ -71,9 +73,10 @@ def run(
         (c, m): Cell(MACHINE, c, m, seed, episodes) for c in conditions for m in METHODS
     }
     with new_run(out, "reproduce mismatch") as writer:
-        table, details = study(groups, numbers, out, workers=workers, progress=progress)
-        words = f"sim2gp reproduce mismatch --seed {seed} --seeds {seeds} "
-        words += f"--episodes {episodes}{' --quick' if quick else ''}"
+        table, details = study(
+            groups, numbers, out, workers=workers, progress=progress, old=old
+        )
+        words = reproduce("mismatch", seed, seeds, episodes, quick, old)
         summary: dict[str, Any] = {
             "command": "reproduce mismatch",
             "title": "Mismatch map: every learner under what its simulator lacks",

@@ -18,6 +18,15 @@ def command(*words: object) -> str:
     return shlex.join(str(word) for word in words if str(word))
 
 
+def reproduce(
+    figure: str, seed: int, seeds: int, episodes: int, quick: bool, old: str
+) -> str:
+    """The command of a study; ``old`` as in `sim2gp.runs.cells`."""
+    numbers = f"--seed {seed} --seeds {seeds} --episodes {episodes}"
+    options = f"{' --quick' * quick}{' --keep-old' * (old == 'keep')}"
+    return f"sim2gp reproduce {figure} {numbers}{options}"
+
+
 def provenance(command_line: str, started: float) -> dict[str, Any]:
     """Keys of the summary; ``started`` is the `time.perf_counter` of the start."""
     return {

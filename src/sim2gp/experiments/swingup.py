@@ -34,8 +34,7 @@ from sim2gp.oracle import accept_truth, flights
 from sim2gp.planning import ICEM, MPC, SAC, AbstractPlanner, World
 from sim2gp.randomised import randomised_world
 from sim2gp.runs import Progress
-from sim2gp.runs.cells import Cells
-from sim2gp.runs.plain import source
+from sim2gp.runs.cells import Cells, Old
 from sim2gp.systems import Candidate
 from sim2gp.systems.base import AbstractMechanism
 from sim2gp.systems.effects import AbstractEffect, RailFriction, Spring
@@ -260,12 +259,9 @@ def _fly(cell: Cell, redrawn: int, note: Callable[[Trajectory], None]) -> None:
     )
 
 
-def fly_cell(cell: Cell, out: Path) -> dict[str, Any]:
-    """A cell's values, from the disk if it was flown for as many episodes.
-
-    They name the code that flew them, which may be an older one's: `told` counts those.
-    """
-    cells = Cells(out)
+def fly_cell(cell: Cell, out: Path, old: Old = "refuse") -> dict[str, Any]:
+    """A cell's values, from the disk if it was run for as many episodes (E186)."""
+    cells = Cells(out, __file__, old)
     stored = cells.load(cell.name, cell.arguments)
     if stored is not None and (
         len(stored["returns"]) >= cell.episodes or stored.get("failure")
@@ -274,9 +270,9 @@ def fly_cell(cell: Cell, out: Path) -> dict[str, Any]:
     if cell.method == "oracle":
         values = oracle_cell(cell)
     else:
-        oracle = fly_cell(reference(cell), out)
+        oracle = fly_cell(reference(cell), out, old)
         values = learner_cell(cell, int(oracle["redrawn"]))
-    return cells.save(cell.name, cell.arguments, values | {"source": source()})
+    return cells.save(cell.name, cell.arguments, values)
 
 
 def study(
@@ -286,8 +282,13 @@ def study(
     *,
     workers: int,
     progress: Progress,
+    old: Old = "refuse",
 ) -> tuple[dict[Group, Float[np.ndarray, "seeds E"]], dict[str, Any]]:
-    """Scores of each group's cell, flown with every seed, and what a summary tells."""
+    """Scores of each group's cell, run with every seed, and what a summary says.
+
+    Raises `InputError` E186 before the first episode for stored cells that this source
+    did not compute, and ``old`` does not allow.
+    """
     cells = {
         group: [replace(cell, seed=seed) for seed in seeds]
         for group, cell in groups.items()
@@ -302,7 +303,10 @@ def study(
         return cell.machine if whole else (cell.machine, *learner)
 
     stages = (list(dict.fromkeys(map(reference, every))), every)
-    work = partial(fly_cell, out=out)
+    stored = Cells(out, __file__, old)
+    named = [(cell.name, cell.arguments) for cell in dict.fromkeys(chain(*stages))]
+    stored.check(named)
+    work = partial(fly_cell, out=out, old=old)
     flown = in_stages(stages, work, alike, workers=workers, progress=progress)
     table = {
         group: scores(
@@ -312,7 +316,7 @@ def study(
         )
         for group, row in cells.items()
     }
-    return table, told(flown)
+    return table, told(flown) | stored.summary(named)
 
 
 def reference(cell: Cell) -> Cell:
@@ -371,9 +375,5 @@ def told(flown: Mapping[Cell, Mapping[str, Any]]) -> dict[str, Any]:
             if value.get("failure")
         ],
         "redrawn_truths": redrawn,
-        "source": source(),
-        "cells_of_other_source": sum(
-            value.get("source") != source() for value in flown.values()
-        ),
         "seconds_of_cells": spent,
     }

@@ -15,8 +15,9 @@ from sim2gp.errors import InputError
 from sim2gp.gaussian import Gaussian
 from sim2gp.models import AbstractBelief
 from sim2gp.planning import Policy
-from sim2gp.robot.policy import FORMAT
+from sim2gp.robot.format import FORMAT, check_shapes, check_values, header
 from sim2gp.runs import new_run
+from sim2gp.runs.archive import Declared
 from sim2gp.runs.store import Writer
 from sim2gp.systems import AbstractSystem, BlackBox, MuJoCo
 from sim2gp.systems.actuator import bare
@@ -30,7 +31,8 @@ TOGETHER = 32
 def export_policy(policy: Policy, out: Path | str, system: AbstractSystem) -> None:
     """Write a trained policy for `load_policy`; ``system`` names its channels.
 
-    Raises ValueError where the policy sees another number of states.
+    Raises ValueError where the policy sees another number of states, `InputError` as
+    `load_policy` does for what it would refuse, such as weights that are not finite.
     """
     if policy.observe.scale.size != len(system.states):
         seen, known = policy.observe.scale.size, len(system.states)
@@ -52,10 +54,15 @@ def export_policy(policy: Policy, out: Path | str, system: AbstractSystem) -> No
         "angle": angle,
         **_channels(system),
     }
+    plain = {name: np.asarray(x, np.float32) for name, x in arrays.items()}
+    summary = {"title": "A trained policy", "policy": about}
+    # As it will be read: nothing is written that a robot refuses.
+    declared = {name: Declared(x.shape, x.dtype) for name, x in plain.items()}
+    check_shapes(header(summary, str(out)), declared, str(out))
+    check_values(plain, str(out))
     with new_run(out, "export policy") as writer:
-        plain = {name: np.asarray(x, np.float32) for name, x in arrays.items()}
         writer.write_arrays("arrays.npz", plain)
-        writer.write_summary({"title": "A trained policy", "policy": about})
+        writer.write_summary(summary)
 
 
 def export_model(

@@ -6,10 +6,16 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from sim2gp.errors import InputError, NotFinite
-from sim2gp.runs import Run, load_run
-
-FORMAT = 1
+from sim2gp.errors import NotFinite
+from sim2gp.robot.format import (
+    LARGEST,
+    check_shapes,
+    check_values,
+    header,
+    refused,
+)
+from sim2gp.runs.archive import declarations, load_arrays
+from sim2gp.runs.store import read_run
 
 
 @dataclass(frozen=True)
@@ -66,50 +72,28 @@ class NumpyPolicy:
 def load_policy(folder: Path | str) -> NumpyPolicy:
     """Read what `export_policy` wrote.
 
-    Raises `InputError` E133 for a run that is no policy, or one of another format, E181
-    for numbers that are not finite, and what `load_run` raises: a damaged file is never
-    half used.
+    Everything is checked first (`sim2gp.robot.format`), sizes before the first array is
+    built. Raises `InputError` E133 for a run that is no policy, E181 for numbers that
+    are not finite, E185 for a newer format, and what `load_run` raises: a damaged file
+    is never half used.
     """
-    run = load_run(folder)
-    about, arrays = run.summary.get("policy"), run.arrays
-    if not isinstance(about, dict) or about.get("format") != FORMAT:
-        raise _refused(run, "another run" if about is None else "another format")
-    layers = range(int(about["layers"]))
+    run = read_run(folder)
+    about = header(run.summary, where=str(run.path))
+    content = run.arrays if run.arrays is not None else b""
     try:
-        scale, low, high = (arrays[name] for name in ("scale", "low", "high"))
-        weights = tuple(arrays[f"weights/{i}"] for i in layers)
-        biases = tuple(arrays[f"biases/{i}"] for i in layers)
-    except KeyError as error:
-        raise _refused(run, f"no array {error}") from error
-    for x in (scale, low, high, *weights, *biases):
-        if x.dtype != np.float32:
-            raise _refused(run, f"numbers of {x.dtype}")
-    _check_finite(run)
-    states, actions = tuple(about["states"]), tuple(about["actions"])
-    angle = about["angle"]
-    return NumpyPolicy(states, actions, weights, biases, scale, low, high, angle)
-
-
-def _check_finite(run: Run) -> None:
-    for name, x in run.arrays.items():
-        bad = int(np.size(x) - np.isfinite(x).sum())
-        if bad:
-            raise InputError(
-                "E181",
-                "policy with numbers that are not finite",
-                where=f"{run.path}, array {name}",
-                got=f"{bad} of {np.size(x)}",
-                expected="finite numbers",
-                fix="train it again: its training diverged",
-            )
-
-
-def _refused(run: Run, got: str) -> InputError:
-    return InputError(
-        "E133",
-        "not a policy that can be run",
-        where=str(run.path),
-        got=got,
-        expected=f"a policy that was exported, of format {FORMAT}",
-        fix="export it again with sim2gp.robot.export",
+        check_shapes(about, declarations(content, LARGEST), where=str(run.path))
+        x = load_arrays(content)
+    except ValueError as error:
+        raise refused(str(run.path), str(error)) from error
+    check_values(x, where=str(run.path))
+    layers = range(about["layers"])
+    return NumpyPolicy(
+        states=tuple(about["states"]),
+        actions=tuple(about["actions"]),
+        weights=tuple(x[f"weights/{i}"] for i in layers),
+        biases=tuple(x[f"biases/{i}"] for i in layers),
+        scale=x["scale"],
+        low=x["low"],
+        high=x["high"],
+        angle=about["angle"],
     )

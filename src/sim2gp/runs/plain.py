@@ -1,8 +1,5 @@
 """Results as plain data: JSON that every reader accepts, and what made them."""
 
-import ast
-import functools
-import hashlib
 import importlib.metadata
 import json
 import math
@@ -14,11 +11,6 @@ from typing import Any
 import numpy as np
 
 from sim2gp.errors import Sim2GPError
-
-#: What draws and words results, and does not make them.
-TELLING = ("cli", "report")
-DOCUMENTED = ast.Module | ast.ClassDef | ast.FunctionDef
-PACKAGE = Path(__file__).parents[1]
 
 
 def to_json(values: Mapping[str, Any]) -> str:
@@ -58,19 +50,3 @@ def version(name: str) -> str:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
         return "not installed"
-
-
-@functools.cache
-def source(package: Path = PACKAGE) -> str:
-    """A short name of what the code says, whatever its comments and docstrings."""
-    digest = hashlib.sha256()
-    for path in sorted(package.rglob("*.py")):
-        where = path.relative_to(package)
-        if where.parts[0] in TELLING:
-            continue
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        for node in ast.walk(tree):
-            if isinstance(node, DOCUMENTED) and ast.get_docstring(node, clean=False):
-                del node.body[0]
-        digest.update(f"{where.as_posix()} {ast.dump(tree)}".encode())
-    return digest.hexdigest()[:12]

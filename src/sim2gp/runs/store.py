@@ -13,7 +13,6 @@ import errno
 import fcntl
 import hashlib
 import io
-import json
 import os
 import shutil
 from collections.abc import Iterator, Mapping
@@ -25,10 +24,11 @@ from typing import Any
 import numpy as np
 
 from sim2gp.errors import InputError, Sim2GPError
+from sim2gp.runs.archive import load_arrays
+from sim2gp.runs.manifest import FORMAT, MANIFEST, damaged, not_a_run, read_manifest
 from sim2gp.runs.plain import environment, to_json, version
+from sim2gp.runs.sealed import parse, seal
 
-FORMAT = 1
-MANIFEST = "manifest.json"
 SUMMARY = "summary.json"
 ARRAYS = "arrays.npz"
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG)
@@ -155,32 +155,64 @@ def check_absent(path: Path) -> None:
     )
 
 
+@dataclass(frozen=True)
+class Stored:
+    """A run that is whole: its folder, its summary, the bytes of its arrays (or None).
+
+    No array is built yet.
+    """
+
+    path: Path
+    summary: dict[str, Any]
+    arrays: bytes | None
+
+
 def load_run(path: Path | str) -> Run:
     """Read a run's summary and arrays, checked by its manifest (E130, E183, E185).
 
-    Reports and pictures are not read: they may be drawn anew from these two.
+    Reports and pictures are not read: they may be drawn again from these two.
     """
+    stored = read_run(path)
+    if stored.arrays is None:
+        return Run(stored.path, stored.summary, {})
+    try:
+        arrays = load_arrays(stored.arrays)
+    except ValueError as error:
+        raise damaged(stored.path, ARRAYS, str(error)) from error
+    return Run(stored.path, stored.summary, arrays)
+
+
+def read_run(path: Path | str) -> Stored:
+    """Read a run without building its arrays (E130, E183, E185)."""
     path = Path(path)
     place = path if path.exists() or not _previous(path).exists() else _previous(path)
-    files = _read_manifest(place)["files"]
-    contents = {}
-    for name, entry in files.items():
-        if name not in (SUMMARY, ARRAYS):
-            continue
-        try:
-            content = (place / name).read_bytes()
-        except OSError as error:
-            raise _damaged(path, name, (error.strerror or "").lower()) from error
-        if hashlib.sha256(content).hexdigest() != entry["sha256"]:
-            got = f"{len(content)} bytes of another checksum"
-            raise _damaged(path, name, got)
-        contents[name] = content
-    summary = json.loads(contents[SUMMARY]) if SUMMARY in contents else {}
-    arrays = {}
-    if ARRAYS in contents:
-        with np.load(io.BytesIO(contents[ARRAYS]), allow_pickle=False) as stored:
-            arrays = {key: stored[key] for key in stored.files}
-    return Run(path, summary, arrays)
+    files = read_manifest(place)["files"]
+    if SUMMARY not in files:
+        raise not_a_run(path, f"a {MANIFEST} without {SUMMARY}")
+    contents = {
+        name: _read_file(place / name, path, files[name])
+        for name in (SUMMARY, ARRAYS)
+        if name in files
+    }
+    try:
+        summary = parse(contents[SUMMARY])
+    except ValueError as error:
+        raise damaged(path, SUMMARY, str(error)) from error
+    return Stored(path, summary, contents.get(ARRAYS))
+
+
+def _read_file(file: Path, path: Path, entry: dict[str, Any]) -> bytes:
+    """The bytes that the manifest's entry describes (E183)."""
+    try:
+        size = file.stat().st_size
+        content = file.read_bytes() if size == entry["bytes"] else b""
+    except OSError as error:
+        raise damaged(path, file.name, (error.strerror or "").lower()) from error
+    if size != entry["bytes"]:
+        raise damaged(path, file.name, f"{size} bytes, not {entry['bytes']}")
+    if hashlib.sha256(content).hexdigest() != entry["sha256"]:
+        raise damaged(path, file.name, f"{size} bytes of another checksum")
+    return content
 
 
 def disk_error(path: Path, error: OSError) -> Sim2GPError:
@@ -275,8 +307,7 @@ def _commit(writer: Writer, path: Path, command: str) -> None:
         "environment": environment(),
         "files": writer.files,
     }
-    content = to_json(manifest)
-    writer.write_text(MANIFEST, content)
+    writer.write_bytes(MANIFEST, seal(manifest))
     for folder in sorted({(writer.folder / n).parent for n in writer.files}):
         _sync(folder)
     check_target(path)
@@ -313,7 +344,7 @@ def _settle(path: Path) -> None:
         os.rename(previous, path)
         return
     try:
-        written = {*_read_manifest(previous)["files"], MANIFEST}
+        written = {*read_manifest(previous)["files"], MANIFEST}
     except InputError:
         written = {MANIFEST}  # damaged: nothing says what the run had written
     for file in [f for f in previous.rglob("*") if f.is_file()]:
@@ -330,42 +361,3 @@ def _sync(folder: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
-
-
-def _read_manifest(path: Path) -> dict[str, Any]:
-    target = path / MANIFEST
-    try:
-        manifest = json.loads(target.read_text(encoding="utf-8"))
-        number, files = manifest["format"], manifest["files"]
-    except OSError as error:
-        raise InputError(
-            "E130",
-            "not a run",
-            where=str(path),
-            got=f"{MANIFEST}: {(error.strerror or '').lower()}",
-            expected="a folder that a sim2gp command wrote",
-            fix="name the --out folder of an earlier command",
-        ) from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise _damaged(path, MANIFEST, "unreadable JSON") from error
-    if number > FORMAT or not isinstance(files, dict):
-        raise InputError(
-            "E185",
-            "run of a newer format",
-            where=str(target),
-            got=number,
-            expected=f"at most {FORMAT}",
-            fix="update sim2gp",
-        )
-    return dict(manifest)
-
-
-def _damaged(path: Path, name: str, got: str) -> InputError:
-    return InputError(
-        "E183",
-        "damaged run",
-        where=f"{path}/{name}",
-        got=got,
-        expected="the file as it was written",
-        fix="run the command again",
-    )
