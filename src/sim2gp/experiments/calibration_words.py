@@ -47,9 +47,7 @@ def verdict(
     }
 
 
-def _runs(
-    failed: np.ndarray, off: Float[np.ndarray, " L"]
-) -> list[Float[np.ndarray, "..."]]:
+def _runs(failed: np.ndarray, off: Float[np.ndarray, " L"]) -> list[np.ndarray]:
     """Neighbouring levels that fail in one direction."""
     sign = np.where(failed, np.sign(off), 0.0)
     cuts = np.flatnonzero(np.diff(sign)) + 1

@@ -92,18 +92,9 @@ def summarise(
     ]
     tables.append(_by_log(crps[:, :, at], held, at, models, logs))
     away = [n for n, entry in entries.items() if entry["crps_change"] is None]
-    hold, regression = np.sqrt(_pooled(held.trivial**2, held.valid))
-    measured, said = held.valid.any(axis=0), []
-    for i, h in zip(at, horizons, strict=True):
-        error = np.where(measured[i], table.rmse[kept, i], np.nan)
-        said.append(
-            forecast_sentence(
-                f"Error of {models[kept]} at {h:g} s",
-                dict(zip(channels, error.tolist(), strict=True)),
-                compared(channels, error, hold[i], regression[i]),
-                units,
-            )
-        )
+    said = _against_trivial(
+        held, table.rmse[kept], models[kept], channels, at, horizons, units
+    )
     summary = {
         "headline": " ".join([scoring.sentence(models, against, kept, words), *said]),
         "best": models[kept],
@@ -119,6 +110,28 @@ def summarise(
             if name not in away:
                 arrays[f"curve/{name}/{channel}"] = table.rmse[k, :, c]
     return summary, arrays
+
+
+def _against_trivial(
+    held: Held,
+    rmse: Float[np.ndarray, "R c"],
+    model: str,
+    channels: Sequence[str],
+    at: Sequence[int],
+    horizons: Sequence[float],
+    units: Mapping[str, str],
+) -> list[str]:
+    """A sentence for each horizon: a model's errors next to those without mechanics."""
+    trivial = np.sqrt(_pooled(held.trivial**2, held.valid))
+    measured = np.asarray(held.valid.any(axis=0))
+    said = []
+    for i, h in zip(at, horizons, strict=True):
+        error = np.where(measured[i], rmse[i], np.nan)
+        against = compared(channels, error, trivial[0, i], trivial[1, i])
+        named = dict(zip(channels, error.tolist(), strict=True))
+        about = f"Error of {model} at {h:g} s"
+        said.append(forecast_sentence(about, named, against, units))
+    return said
 
 
 def units_of(held: Held, logs: Sequence[Log]) -> tuple[np.ndarray, str]:
@@ -227,8 +240,8 @@ def _by_horizon(
         "rows": rows,
         "note": "Root mean square error and CRPS in the channel's unit, nll in nats, "
         "pooled over windows that start every 0.1 s; change of CRPS over all channels "
-        f"with a 95 % interval (bootstrap over {words}). Of a single number CRPS is the "
-        "absolute error; the regression is linear, on start and inputs.",
+        f"with a 95 % interval (bootstrap over {words}). CRPS of a single number is "
+        "its absolute error; the regression is linear, on start and inputs.",
     }
 
 
