@@ -42,11 +42,11 @@ INPUTS = (
         (TESTS, "extra"),
     ),
     Mutant(
-        "inputs: every file of a group says what nothing takes",
-        "project/project.py",
-        'if note.code != "W105" or about not in seen:',
-        "if True:",
-        ("test_project.py", "logs_are_found"),
+        "inputs: every file says what holds for all",
+        "logs/notes.py",
+        "if count > 1:",
+        "if False:",
+        ("test_logs.py", "said_once"),
     ),
     Mutant(
         "inputs: a pickle is text",

@@ -134,18 +134,21 @@ def evaluation() -> Run:
         "windows": 1423,
         "horizon": 1.0,
         "calibration": {
-            "horizon": 1.0, "windows": 1423, "independent": 142,
-            "text": "The 90 % band of q1 held 91 % of the measurements.",
+            "horizon": 1.0, "windows": 1423, "independent": 12,
+            "blocks": "12 recordings",
+            "text": "q2: the 30 to 70 % bands hold too few measurements.",
         },
     }  # fmt: skip
     level = np.linspace(0.05, 0.99, 20)
     arrays |= {
         "calibration/level": level,
-        "calibration/low": level - 0.1 * np.sqrt(level * (1 - level)),
-        "calibration/high": level + 0.1 * np.sqrt(level * (1 - level)),
         "calibration/share/q1": level**0.9,
         "calibration/share/q2": level**1.3,
     }
+    for channel in ("q1", "q2"):
+        for end, sign in (("low", -1), ("high", 1)):
+            zone = level + sign * 0.1 * np.sqrt(level * (1 - level))
+            arrays[f"calibration/{end}/{channel}"] = zone
     return summary, arrays
 
 

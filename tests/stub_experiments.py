@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from sim2gp.logs import Log
+from sim2gp.logs import Log, note_lines
 from sim2gp.project import Project
 from sim2gp.runs import Progress, new_run
 
@@ -47,7 +47,7 @@ def identify(
         "nuts": nuts,
         "longer": longer,
         "held_out": held_out,
-        "warnings": [str(note) for log in logs for note in log.notes],
+        "warnings": note_lines(logs),
     }
     with new_run(out, "identify") as run, progress.task("fit", 2) as task:
         task.advance("half")

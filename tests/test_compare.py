@@ -124,6 +124,11 @@ def test_a_missing_term_calls_for_a_residual(cable: Path) -> None:
     assert summary["headline"].startswith("The logs support the simulator plus a")
     assert "RES-FS" in summary["headline"]
     assert "4 of 4 logs" in summary["headline"]
+    for horizon in (0.2, 0.4):
+        assert f"Error of RES-FS at {horizon} s: q1 " in summary["headline"]
+    assert "times the error of" in summary["headline"]
+    names = [row[0] for row in summary["tables"][0]["rows"]]
+    assert names == [*SOME, "holding still", "regression"]
 
 
 def test_a_simulator_without_fault_is_kept(folder: Path, cable: Path) -> None:

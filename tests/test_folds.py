@@ -1,4 +1,4 @@
-"""What is held out of a fit, and what is said of bands: by counting."""
+"""What is held out of a fit: by counting."""
 
 import math
 from pathlib import Path
@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 
 from sim2gp.experiments import folds
-from sim2gp.experiments.calibration import LEVELS, calibration
 from sim2gp.experiments.folds import fold, held_out
 from sim2gp.experiments.motion import film
 from sim2gp.experiments.prediction import (
-    Judged,
     drawn,
     predicted,
     rows_for,
@@ -70,60 +68,6 @@ def test_the_end_of_the_only_recording_is_left_out() -> None:
 
 def test_too_short_a_recording_holds_nothing_out() -> None:
     assert parts(log("a.csv", 0.45))[0] is None
-
-
-def judged(z: np.ndarray) -> Judged:
-    """Forecasts at the horizons .1 and .5 s whose standardised errors are ``z``."""
-    both = np.stack([0.0 * z, z], axis=1)
-    valid = np.isfinite(both)
-    none = np.zeros_like(both)
-    scale = np.full_like(both, 0.2)
-    return Judged(
-        np.array([50, 250]), valid, 0.2 * np.where(valid, both, 0.0), scale, none, none,
-        None, np.zeros(len(z), int), valid, valid,
-    )  # fmt: skip
-
-
-def quantiles(count: int) -> np.ndarray:
-    """Standardised errors that are exactly Gaussian."""
-    from statistics import NormalDist
-
-    return np.asarray([NormalDist().inv_cdf((k + 0.5) / count) for k in range(count)])
-
-
-def test_honest_bands_lie_on_the_diagonal() -> None:
-    z = np.stack([quantiles(2000), 2.0 * quantiles(2000), 0.5 * quantiles(2000)], 1)
-    about, arrays = calibration(judged(z), ["right", "narrow", "wide"], 0.5)
-    np.testing.assert_allclose(
-        arrays["calibration/share/right"], np.asarray(LEVELS), atol=1e-3
-    )
-    at = LEVELS.index(0.9)
-    # Within 1.645 sd of a forecast that is off by twice, or half of, what it says.
-    assert arrays["calibration/share/narrow"][at] == pytest.approx(0.589, abs=2e-3)
-    assert arrays["calibration/share/wide"][at] == pytest.approx(0.999, abs=1e-3)
-    assert (about["windows"], about["independent"]) == (2000, 400)
-    low, high = (arrays[f"calibration/{end}"][at] for end in ("low", "high"))
-    assert high - low == pytest.approx(2 * 1.6449 * math.sqrt(0.09 / 400), rel=1e-3)
-    said = about["text"].split("The 90 % band of ")
-    assert "90 % of the measurements, as it should" in said[1]
-    assert "too narrow" in said[2]
-    assert "wider than it need be" in said[3]
-
-
-def test_few_windows_accuse_nobody() -> None:
-    z = np.stack([np.full(6, 0.1), np.array([0.1, 0.2, np.nan, 0.3, 0.4, 2.5])], 1)
-    about, arrays = calibration(judged(z), ["all", "some"], 0.5)
-    assert about["independent"] == 1
-    assert "100 % of the measurements, as it should" in about["text"]
-    assert arrays["calibration/share/some"][LEVELS.index(0.9)] == pytest.approx(0.8)
-
-
-def test_a_channel_that_was_not_measured_has_no_curve() -> None:
-    z = np.stack([quantiles(20), np.full(20, np.nan)], axis=1)
-    about, arrays = calibration(judged(z), ["seen", "unseen"], 0.5)
-    assert "calibration/share/unseen" not in arrays
-    assert "unseen" not in about["text"]
-    assert about["windows"] == 20
 
 
 def test_neither_fit_nor_band_sees_what_is_held_out(

@@ -149,6 +149,12 @@ def test_identify_forecasts_a_log_that_it_left_out(run: Path) -> None:
     assert about["left_out"] == "log2"
     assert about["windows"] == 7  # every 0.1 s, half a second before the log's end
     assert about["open_loop_rmse"]["alpha"] < 0.2 * about["hold_rmse"]["alpha"]
+    ratio = about["trivial"]["alpha"]["ratio"]
+    assert ratio < 0.2
+    for words in (about["headline"], (run / "report.html").read_text()):
+        assert "A fit that had not seen log2 forecasts it 0.5 s ahead" in words
+        assert f"rad, {ratio:.2g} times the error of holding still" in words
+    assert about["calibration"]["channels"]["alpha"]["verdict"] == "too few to say"
     logs = {key.split("/")[1] for key in x if key.startswith("unseen/")}
     assert logs == {"log2"}
     both = [x[f"{kind}/log2/predicted/alpha"] for kind in ("unseen", "trace")]
@@ -205,6 +211,9 @@ def test_evaluate_predicts_a_log_from_anywhere(
     assert summary["one_step_rmse"]["alpha"] < 0.01
     assert [row[0] for row in summary["tables"][1]["rows"]] == ["log3", "pooled"]
     assert "training logs" not in " ".join(summary["warnings"])
+    assert "times the error of" in summary["headline"]
+    for table in summary["tables"][:2]:
+        assert {"alpha, held", "alpha, regression"} <= set(table["columns"])
     assert summary["command_line"] == (
         f"sim2gp evaluate {run} --logs {log} --horizon 0.2 --out {out}"
     )

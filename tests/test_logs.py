@@ -10,7 +10,15 @@ from hypothesis import strategies as st
 
 from recordings import Channel
 from sim2gp.errors import InputError
-from sim2gp.logs import Column, Log, period_matches, read_log, shared_rows
+from sim2gp.logs import (
+    Column,
+    Log,
+    Note,
+    note_lines,
+    period_matches,
+    read_log,
+    shared_rows,
+)
 from sim2gp.logs.units import UNITS, factor
 
 STATES = (
@@ -309,3 +317,47 @@ def test_real_furuta_has_spaces_in_its_header(shared_data: Path) -> None:
         assert len(log) == 10000
         assert log.period == pytest.approx(0.002)
         assert np.all(np.abs(log.channels["alpha"] - math.pi) < 0.3)
+
+
+def noted(source: str, *notes: Note) -> Log:
+    t = np.arange(2.0)
+    return Log(source[:-4], source, t, {}, {}, {}, notes=notes)
+
+
+def test_what_holds_for_many_logs_is_said_once(tmp_path: Path) -> None:
+    """43 files with one unused column and uneven stamps: two lines, not 86."""
+    logs = []
+    for k in range(43):
+        table = np.column_stack([swing(60), np.zeros(60)])
+        table[30:, 0] += 2e-3 + 1e-4 * k  # another period in each file
+        path = write(tmp_path / f"log{k}.csv", table, f"{HEADER},spare{k // 40}")
+        logs += read(path)
+    lines = note_lines(logs)
+    assert len(lines) == 3
+    assert lines[0].startswith("W110 in 43 logs, the first: period varies in")
+    assert f"{logs[0].source}: 10, 10, 12 ms" in lines[0]
+    assert lines[1].startswith("W105 in 40 logs, the first: columns of")
+    assert lines[1].endswith("nothing takes: spare0")
+    assert lines[2].startswith("W105 in 3 logs")
+    assert lines[2].endswith("nothing takes: spare1")
+
+
+def test_what_several_notes_say_of_one_log_is_kept() -> None:
+    gaps = [Note("W111", f"gap of {k} s in a.csv before line {9 * k}") for k in (1, 2)]
+    one = noted("a.csv", *gaps, Note("W117", "constant input u in a.csv"))
+    other = noted("b.csv", Note("W117", "constant input v in b.csv"))
+    assert note_lines([one, other]) == [
+        *(str(note) for note in gaps),
+        "W117 constant input u in a.csv",
+        "W117 constant input v in b.csv",
+    ]
+    shared = [Note("W128", f"{k} rows of {k}.csv were also fitted to") for k in "ab"]
+    assert note_lines([noted("a.csv"), noted("b.csv")], [shared[0], *shared]) == [
+        "W128 a rows of a.csv were also fitted to",
+        "W128 b rows of b.csv were also fitted to",
+    ]
+    more = [Note("W128", f"{k} rows of {'ab'[k]}.csv are known") for k in (0, 1)]
+    assert note_lines([noted("a.csv"), noted("b.csv")], more) == [
+        "W128 in 2 logs, the first: 0 rows of a.csv are known"
+    ]
+    assert note_lines([]) == []

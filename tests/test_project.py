@@ -314,11 +314,6 @@ def test_logs_are_found_and_read(tmp_path: Path) -> None:
     assert [log.name for log in logs] == ["a[0]", "a[1]", "b[0]", "b[1]"]
     assert set(logs[0].channels) == {"q1", "q2"}
     assert set(logs[0].inputs) == {"torque1", "torque2"}
-    # Files of a group are alike: what nothing takes is said once.
-    text = BASE.replace('"pos_meas2"', '"pos_meas1"')
-    again = load(tmp_path, text).load_logs()
-    said = [(log.name, n.text) for log in again for n in log.notes if n.code == "W105"]
-    assert [(name, x.rpartition(": ")[2]) for name, x in said] == [("a", "pos_meas2")]
     again = project.read_logs([tmp_path / "logs" / "b.csv"])
     np.testing.assert_array_equal(again[0].time, logs[2].time)
 

@@ -20,11 +20,12 @@ import numpy as np
 
 from sim2gp.errors import InputError
 from sim2gp.experiments import scoring
+from sim2gp.experiments.baselines import regression_errors
 from sim2gp.experiments.compare_summary import Held, summarise
 from sim2gp.experiments.evaluate import check_horizon, windows_for
-from sim2gp.experiments.prediction import channels, cut_logs, recordings
+from sim2gp.experiments.prediction import channels, cut_logs, recordings, subset
 from sim2gp.experiments.record import command, provenance
-from sim2gp.logs import Log
+from sim2gp.logs import Log, note_lines
 from sim2gp.models import NLM, FunctionSpace, Residual, ResidualFunctionSpace, Sim2GP
 from sim2gp.models.auto import log_scores
 from sim2gp.models.base import AbstractModel
@@ -110,6 +111,7 @@ def run(
         whole = _fit(setup, [], jax.random.fold_in(key, len(folds)))
         task.advance("evidence")
         names = channels(project.system, setup.windows)
+        units = {c.name: c.unit for c in project.system.physical_states}
         summary, arrays = summarise(
             parts,
             list(models),
@@ -118,6 +120,7 @@ def run(
             np.asarray(setup.steps.steps) * setup.period,
             setup.horizons,
             np.random.default_rng(seed),
+            units,
         )
         summary["models"]["SIM2GP"]["log_evidence"] = float(whole.log_evidence)
         asked = "--horizon", *(f"{h:g}" for h in horizons), "--seed", seed
@@ -130,9 +133,9 @@ def run(
             "folds": len(folds),
             "n_logs": len(set(recordings(setup.logs))),
             "n_transitions": len(setup.samples.first),
-            "units": {c.name: c.unit for c in project.system.physical_states},
+            "units": units,
         }
-        summary["warnings"] += [str(note) for log in setup.logs for note in log.notes]
+        summary["warnings"] += note_lines(setup.logs)
         summary |= provenance(line, started)
         from sim2gp.report import write_report
 
@@ -233,12 +236,22 @@ def fold(
     return Held(
         np.stack(error),
         np.stack(sd),
+        _trivial(setup, test),
         setup.steps.valid[test],
         setup.steps.log[test],
         setup.grid.since[test],
         np.asarray(steps),
         held.count,
     )
+
+
+def _trivial(setup: Setup, test: np.ndarray) -> np.ndarray:
+    """Errors of the start held and of the linear regression, as `Held.trivial`."""
+    train, tested = subset(setup.grid, ~test), subset(setup.grid, test)
+    rows = stride_of(setup.period) * np.asarray(setup.steps.steps)
+    start = np.asarray(tested.windows.start)[:, list(setup.steps.outputs)]
+    hold = start[:, None] - setup.steps.y[test]
+    return np.stack([hold, regression_errors(train, tested, rows)])
 
 
 def _fit(setup: Setup, left: Sequence[int], key: jax.Array) -> WindowsBelief:

@@ -1,7 +1,7 @@
 """What a comparison of models says: summary keys, tables, curves, the verdict."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sim2gp.experiments import scoring
+from sim2gp.experiments.baselines import compared, forecast_sentence
 from sim2gp.experiments.prediction import recordings
 from sim2gp.experiments.scoring import Paired
 from sim2gp.logs import Log
@@ -23,6 +24,7 @@ class Held:
 
     error: Float[np.ndarray, "models W R c"]  # prediction minus measurement
     sd: Float[np.ndarray, "models W R c"]
+    trivial: Float[np.ndarray, "2 W R c"]  # errors of the start held, and a regression
     valid: Bool[np.ndarray, "W R c"]
     log: Int[np.ndarray, " W"]
     since: Float[np.ndarray, " W"]  # s, on the log's clock
@@ -37,6 +39,7 @@ class Held:
         return cls(
             np.concatenate([part.error for part in parts], axis=1),
             np.concatenate([part.sd for part in parts], axis=1),
+            np.concatenate([part.trivial for part in parts], axis=1),
             np.concatenate([part.valid for part in parts]),
             np.concatenate([part.log for part in parts]),
             np.concatenate([part.since for part in parts]),
@@ -63,6 +66,7 @@ def summarise(
     seconds: Float[np.ndarray, " R"],
     horizons: Sequence[float],
     rng: np.random.Generator,
+    units: Mapping[str, str],
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Summary keys and curves; the verdict counts ``horizons`` alone.
 
@@ -88,8 +92,11 @@ def summarise(
     ]
     tables.append(_by_log(crps[:, :, at], held, at, models, logs))
     away = [n for n, entry in entries.items() if entry["crps_change"] is None]
+    said = _against_trivial(
+        held, table.rmse[kept], models[kept], channels, at, horizons, units
+    )
     summary = {
-        "headline": scoring.sentence(models, against, kept, words),
+        "headline": " ".join([scoring.sentence(models, against, kept, words), *said]),
         "best": models[kept],
         "horizons": list(horizons),
         "windows": int(held.valid[:, at].any(axis=(1, 2)).sum()),
@@ -103,6 +110,28 @@ def summarise(
             if name not in away:
                 arrays[f"curve/{name}/{channel}"] = table.rmse[k, :, c]
     return summary, arrays
+
+
+def _against_trivial(
+    held: Held,
+    rmse: Float[np.ndarray, "R c"],
+    model: str,
+    channels: Sequence[str],
+    at: Sequence[int],
+    horizons: Sequence[float],
+    units: Mapping[str, str],
+) -> list[str]:
+    """A sentence for each horizon: a model's errors next to those without mechanics."""
+    trivial = np.sqrt(_pooled(held.trivial**2, held.valid))
+    measured = np.asarray(held.valid.any(axis=0))
+    said = []
+    for i, h in zip(at, horizons, strict=True):
+        error = np.where(measured[i], rmse[i], np.nan)
+        against = compared(channels, error, trivial[0, i], trivial[1, i])
+        named = dict(zip(channels, error.tolist(), strict=True))
+        about = f"Error of {model} at {h:g} s"
+        said.append(forecast_sentence(about, named, against, units))
+    return said
 
 
 def units_of(held: Held, logs: Sequence[Log]) -> tuple[np.ndarray, str]:
@@ -197,13 +226,22 @@ def _by_horizon(
         found = scoring.paired(sums[k], sums[0], rng)
         row += [scoring.percent(found), f"{found.better} of {found.units}"]
         rows.append(row if k else [*row[:-2], "", ""])
+    for name, off in zip(("holding still", "regression"), held.trivial, strict=True):
+        off, counts = off[None, :, [i]], held.valid[:, [i]]
+        rmse, size = np.sqrt(_pooled(off**2, counts)), _pooled(np.abs(off), counts)
+        row = [name]
+        for c in range(len(channels)):
+            values = (rmse[0, 0, c], size[0, 0, c])
+            row += [*(_figure(x, ".4f", "too few windows") for x in values), ""]
+        rows.append([*row, *[""] * (len(channels) + 2)])
     return {
         "title": f"Forecasts of what was left out, {horizon} s ahead",
         "columns": columns,
         "rows": rows,
         "note": "Root mean square error and CRPS in the channel's unit, nll in nats, "
         "pooled over windows that start every 0.1 s; change of CRPS over all channels "
-        f"with a 95 % interval (bootstrap over {words}).",
+        f"with a 95 % interval (bootstrap over {words}). CRPS of a single number is "
+        "its absolute error; the regression is linear, on start and inputs.",
     }
 
 
@@ -237,5 +275,5 @@ def _plain(x: float) -> float | None:
     return float(x) if math.isfinite(x) else None
 
 
-def _figure(x: float, how: str) -> str:
-    return format(x, how) if math.isfinite(x) else "ran away"
+def _figure(x: float, how: str, missing: str = "ran away") -> str:
+    return format(x, how) if math.isfinite(x) else missing

@@ -16,6 +16,7 @@ import jax
 import numpy as np
 
 from sim2gp.errors import InputError
+from sim2gp.experiments.baselines import forecast_sentence, regression_errors
 from sim2gp.experiments.calibration import calibration
 from sim2gp.experiments.folds import fold, without
 from sim2gp.experiments.identified import Identified, stood
@@ -29,7 +30,6 @@ from sim2gp.experiments.prediction import (
     judged,
     predicted,
     recordings,
-    regression_errors,
     rows_for,
     scores,
     trace_arrays,
@@ -37,7 +37,7 @@ from sim2gp.experiments.prediction import (
 )
 from sim2gp.experiments.record import command, provenance
 from sim2gp.gaussian import Gaussian
-from sim2gp.logs import Log, shared_rows
+from sim2gp.logs import Log, Note, note_lines, shared_rows
 from sim2gp.models.grid import CURVE, Grid, evaluation_windows, steps_of
 from sim2gp.models.windows import Windows
 from sim2gp.project import Project
@@ -67,21 +67,21 @@ def run(
         grid = windows_for(tested, found, longest, horizon)
         result = predicted(system, fit.plain, grid, horizon)
         train = _training(fit)
-        linear = None
+        linear = np.full((len(grid.windows), len(rows), len(result.mean[0, 0])), np.nan)
         if train is not None:
             known = evaluation_windows(train, system, longest=longest)
-            linear = regression_errors(known, grid, horizon)
+            linear = regression_errors(known, grid, rows)
         task.advance("forecasts")
         names = channels(system, grid.windows)
         whole = judged(rows, grid, result, fit.band, linear)
         summary, arrays = scores(whole, names, tested, horizon)
-        summary["calibration"], shares = calibration(whole, names, horizon)
+        summary["calibration"], shares = calibration(whole, names, tested, horizon)
         arrays |= shares
         picture = drawn(result, fit.band, grid)
         arrays |= trace_arrays(picture, grid, tested, names)
-        notes = _said(tested) + list(map(str, shared_rows(train or (), tested)))
+        notes = note_lines(tested, shared_rows(train or (), tested))
         if train is None:
-            notes.append("the training logs were not found: no regression beside")
+            notes.append("the training logs were not found: no regression to compare")
         about, moves = film(
             system, fit.plain, picture, grid, tested,
             "Forecasts over what was recorded",
@@ -141,14 +141,14 @@ def leave_one_out(
             task.advance(f"without {logs[left[0]].name}")
         whole = joined(parts)
         summary, curves = scores(whole, names, logs, horizon)
-        summary["calibration"], shares = calibration(whole, names, horizon)
+        summary["calibration"], shares = calibration(whole, names, logs, horizon)
         arrays |= shares
         summary["tables"].append(_constants_table(project, files, logs, constants))
         summary |= {
             "command": "evaluate",
             "title": f"{project.name}: each log predicted by a fit of the others",
             "folds": len(files),
-            "warnings": [*_said(logs), *_repeated(logs, files)],
+            "warnings": note_lines(logs, _repeated(logs, files)),
         }
         asked = "--horizon", f"{horizon:g}", "--out", out
         line = command("sim2gp", "evaluate", project.path, *asked)
@@ -217,17 +217,13 @@ def windows_for(
     )
 
 
-def _said(logs: Sequence[Log]) -> list[str]:
-    return [str(note) for log in logs for note in log.notes]
-
-
-def _repeated(logs: Sequence[Log], files: Sequence[str]) -> list[str]:
+def _repeated(logs: Sequence[Log], files: Sequence[str]) -> list[Note]:
     """Rows that a fold both learns from and is judged by (W128)."""
     sets = [[log for log in logs if log.source == file] for file in files]
-    notes = []
+    notes: list[Note] = []
     for i, tested in enumerate(sets):
         others = [log for group in sets[:i] + sets[i + 1 :] for log in group]
-        notes += [str(note) for note in shared_rows(others, tested)]
+        notes += shared_rows(others, tested)
     return notes
 
 
@@ -262,12 +258,15 @@ def _write(
 ) -> None:
     """Headline, report and files of a run."""
     unit = units(project.system)
-    error = ", ".join(
-        f"{name} {value:.3g} {unit[name]} ({100 * summary['coverage90'][name]:.0f} % "
-        "inside the 90 % band)"
-        for name, value in summary["open_loop_rmse"].items()
+    summary["headline"] = forecast_sentence(
+        f"Open-loop error at {summary['horizon']:g} s",
+        summary["open_loop_rmse"],
+        summary["trivial"],
+        unit,
+        summary["coverage90"],
     )
-    summary["headline"] = f"Open-loop error at {summary['horizon']:g} s: {error}."
+    if summary["losses"]:
+        summary["headline"] += f" {summary['losses']}"
     summary["units"] = unit
     summary["trace_note"] = (
         "Forecasts of half a second from causal starts, of logs that the fit has not "

@@ -13,12 +13,12 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool
 
+from sim2gp.experiments.baselines import regression_errors
 from sim2gp.experiments.prediction import (
     Judged,
     judged,
     predicted,
     recordings,
-    regression_errors,
     rows_for,
     subset,
 )
@@ -120,7 +120,7 @@ def fold(
     seen = result.of(part.known).at(curve)
     seen = eqx.tree_at(lambda f: f.valid, seen, seen.valid & before[..., None])
     band = fit_band(seen, train, part.recordings)
-    linear = regression_errors(train, tested, horizon)
+    linear = regression_errors(train, tested, rows)
     result = result.of(part.test)
     found = judged(rows, tested, result, band, linear)
     return Fold(belief.posterior, band, found, tested, result)

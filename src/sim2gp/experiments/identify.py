@@ -38,7 +38,7 @@ from sim2gp.experiments.record import command, provenance
 from sim2gp.experiments.told_intervals import lacking_table, told_intervals
 from sim2gp.experiments.unseen import Unseen, unseen
 from sim2gp.gaussian import Gaussian
-from sim2gp.logs import Log
+from sim2gp.logs import Log, note_lines
 from sim2gp.models.forecast import Band, compile_forecast, fit_band
 from sim2gp.models.grid import CURVE, Grid, evaluation_windows
 from sim2gp.models.windows import (
@@ -245,7 +245,7 @@ def _summarise(
             "input_sd": dict(zip(actions, band.input_sd.tolist(), strict=True)),
             "inflation": band.inflation,
         },
-        "warnings": [str(note) for log in logs for note in log.notes],
+        "warnings": note_lines(logs),
         "trace_note": "Forecasts of half a second from causal starts, of the logs that "
         "were fitted; they know the recorded inputs and nothing else of the future.",
         **listed,

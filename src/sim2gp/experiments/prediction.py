@@ -1,9 +1,8 @@
 """What identify and evaluate share: windows of a project's logs, scores, traces.
 
 A forecast is judged at the last sample of its window, errors pooled over windows as a
-root mean square. Beside the model stand two predictors without mechanics: the state
-held, and a linear regression on start state and every input of the window. Recorded in
-closed loop, the inputs leak the future, which is how a regression can win.
+root mean square, next to those of two predictors without mechanics
+(`sim2gp.experiments.baselines`).
 """
 
 from collections.abc import Sequence
@@ -13,6 +12,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from sim2gp.experiments.baselines import compared, loss_sentence
 from sim2gp.gaussian import Gaussian
 from sim2gp.logs import Log
 from sim2gp.models.cutting import cut
@@ -91,7 +91,10 @@ def predicted(
 
 
 class Judged(eqx.Module):
-    """Held-out forecasts with their bands, and the trivial predictors' errors."""
+    """Held-out forecasts with their bands, and the trivial predictors' errors.
+
+    The regression's are NaN where it had too few windows to learn from.
+    """
 
     rows: Int[np.ndarray, " R"]
     valid: Bool[np.ndarray, "W R c"]
@@ -99,7 +102,7 @@ class Judged(eqx.Module):
     scale: Float[np.ndarray, "W R c"]
     log_prob: Float[np.ndarray, "W R c"]
     hold: Float[np.ndarray, "W R c"]
-    regression: Float[np.ndarray, "W c"] | None  # at the horizon
+    regression: Float[np.ndarray, "W R c"]
     log: Int[np.ndarray, " W"]
     inside90: Bool[np.ndarray, "W R c"]
     inside95: Bool[np.ndarray, "W R c"]
@@ -110,7 +113,7 @@ def judged(
     grid: Grid,
     found: Forecast,
     band: Band,
-    regression: np.ndarray | None,
+    regression: Float[np.ndarray, "W R c"],
 ) -> Judged:
     """Forecasts of ``grid``'s windows held against their band."""
     y, found = np.asarray(grid.windows.y), found.at(rows)
@@ -136,38 +139,9 @@ def joined(parts: Sequence[Judged]) -> Judged:
     fields = {
         name: np.concatenate([getattr(part, name) for part in parts])
         for name in first.__dataclass_fields__
-        if name not in ("rows", "regression")
+        if name != "rows"
     }
-    known = [part.regression for part in parts if part.regression is not None]
-    whole = np.concatenate(known) if len(known) == len(parts) else None
-    return Judged(rows=first.rows, regression=whole, **fields)
-
-
-def regression_errors(
-    train: Grid, test: Grid, horizon: float
-) -> Float[np.ndarray, "W c"] | None:
-    """Errors of the linear regression; None where it has more unknowns than windows."""
-    row = steps_of(horizon)
-    (x, moved, known), (x2, moved2, _) = (_features(g, row) for g in (train, test))
-    if known.sum() <= x.shape[1]:
-        return None
-    weights = np.linalg.lstsq(x[known], moved[known], rcond=None)[0]
-    return np.asarray(x2 @ weights - moved2)
-
-
-def _features(grid: Grid, row: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    w = grid.windows
-    edges = PERIOD * np.arange(row + 1)
-    inputs = [
-        np.diff(np.interp(edges, knots, column))
-        for knots, area in zip(w.knots, w.area, strict=True)
-        for column in np.asarray(area).T
-    ]
-    u = np.asarray(inputs).reshape(len(w), -1) / PERIOD
-    start = np.asarray(w.start)
-    x = np.concatenate([start, u, np.ones((len(w), 1))], axis=1)
-    moved = np.asarray(w.y)[:, row] - start[:, list(w.outputs)]
-    return x, moved, np.all(np.asarray(w.mask)[:, row], axis=1, keepdims=False).ravel()
+    return Judged(rows=first.rows, **fields)
 
 
 def scores(
@@ -176,7 +150,8 @@ def scores(
     """Summary keys, tables and curves of a held-out evaluation."""
     at = int(np.searchsorted(found.rows, steps_of(horizon)))
     one = int(np.searchsorted(found.rows, 1))
-    model, hold = _rms(found.error, found.valid), _rms(found.hold, found.valid)
+    each = (found.error, found.hold, found.regression)
+    model, hold, regression = (_rms(x, found.valid) for x in each)
     share90 = _share(found.inside90, found.valid)
     share95 = _share(found.inside95, found.valid)
     nll = _mean(-found.log_prob, found.valid)
@@ -194,13 +169,18 @@ def scores(
         "coverage95": named(share95[at]),
         "hold_rmse": named(hold[at]),
     }
-    if found.regression is not None:
-        summary["regression_rmse"] = named(_rms(found.regression, found.valid[:, at]))
+    if np.isfinite(regression[at]).all():
+        summary["regression_rmse"] = named(regression[at])
+    measured = found.valid[:, at].any(axis=0)
+    error = np.where(measured, model[at], np.nan)
+    summary["trivial"] = compared(names, error, hold[at], regression[at])
+    summary["losses"] = loss_sentence(_against_by_log(found, names, logs, at))
     some = np.asarray(found.valid.any(axis=(0, 2)))
     curve = np.asarray([i for i in np.flatnonzero(some) if i != one or at == one])
     seconds = found.rows[curve] * PERIOD
+    trivial = hold, regression
     summary["tables"] = [
-        _by_horizon(found, names, curve, seconds, model, hold, share90, share95),
+        _by_horizon(found, names, curve, seconds, model, trivial, share90, share95),
         _by_log(found, names, logs, at, horizon),
     ]
     arrays: dict[str, np.ndarray] = {"curve/horizon": seconds}
@@ -221,18 +201,20 @@ def _by_horizon(
     curve: np.ndarray,
     seconds: np.ndarray,
     model: np.ndarray,
-    hold: np.ndarray,
+    trivial: tuple[np.ndarray, np.ndarray],
     share90: np.ndarray,
     share95: np.ndarray,
 ) -> dict[str, Any]:
     columns = ["horizon, s", "windows"]
     for name in names:
-        columns += [name, f"{name}, held", f"{name} in 90 %", f"{name} in 95 %"]
+        columns += [name, f"{name}, held", f"{name}, regression"]
+        columns += [f"{name} in 90 %", f"{name} in 95 %"]
+    hold, regression = trivial
     rows = []
     for i, s in zip(curve, seconds, strict=True):
         row: list[Any] = [f"{s:.3g}", str(int(found.valid[:, i].any(axis=1).sum()))]
         for c in range(len(names)):
-            row += [f"{model[i, c]:.4f}", f"{hold[i, c]:.4f}"]
+            row += [f"{model[i, c]:.4f}", f"{hold[i, c]:.4f}", _shown(regression[i, c])]
             row += [f"{share90[i, c]:.3f}", f"{share95[i, c]:.3f}"]
         rows.append(row)
     return {
@@ -240,8 +222,8 @@ def _by_horizon(
         "columns": columns,
         "rows": rows,
         "note": "Root mean square error of the last sample of open-loop windows that "
-        "start every 0.1 s; held: the start predicted to stay; the share of samples "
-        "inside the predicted bands.",
+        "start every 0.1 s; held: the start predicted to stay; regression: linear, on "
+        "start and inputs; the share of samples inside the predicted bands.",
     }
 
 
@@ -255,14 +237,13 @@ def _by_log(
     for k in [*range(len(logs)), None]:
         which = np.ones(len(found.log), bool) if k is None else found.log == k
         valid = found.valid[which, at]
-        model, hold = (_rms(x[which, at], valid) for x in (found.error, found.hold))
+        each = (found.error, found.hold, found.regression)
+        model, hold, regression = (_rms(x[which, at], valid) for x in each)
         share = _share(found.inside90[which, at], valid)
         row = ["pooled" if k is None else logs[k].name, str(int(valid.any(1).sum()))]
         for c in range(len(names)):
-            regression = "not enough windows"
-            if found.regression is not None:
-                regression = f"{_rms(found.regression[which], valid)[c]:.4f}"
-            row += [f"{model[c]:.4f}", f"{hold[c]:.4f}", regression, f"{share[c]:.3f}"]
+            row += [f"{model[c]:.4f}", f"{hold[c]:.4f}", _shown(regression[c])]
+            row.append(f"{share[c]:.3f}")
         rows.append(row)
     return {
         "title": f"Error at {horizon:g} s, log by log",
@@ -271,6 +252,25 @@ def _by_log(
         "note": "The regression sees every input of the window; recorded in closed "
         "loop, these leak the future angle.",
     }
+
+
+def _against_by_log(
+    found: Judged, names: Sequence[str], logs: Sequence[Log], at: int
+) -> dict[str, dict[str, dict[str, Any]]]:
+    """What `compared` finds in every log that was measured at the horizon."""
+    out = {}
+    for k in np.unique(found.log).tolist():
+        valid = found.valid[which := found.log == k, at]
+        each = (found.error, found.hold, found.regression)
+        model, hold, regression = (_rms(x[which, at], valid) for x in each)
+        model = np.where(valid.any(axis=0), model, np.nan)
+        out[logs[k].name] = compared(names, model, hold, regression)
+    return out
+
+
+def _shown(regression: float) -> str:
+    """An error of the regression, which may have had too few windows to learn from."""
+    return f"{regression:.4f}" if np.isfinite(regression) else "not enough windows"
 
 
 def drawn(found: Forecast, band: Band, grid: Grid) -> Picture:

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from sim2gp.errors import DeadParameters, NotConverged, NotFinite
+from sim2gp.experiments.baselines import forecast_sentence
 from sim2gp.experiments.calibration import calibration
 from sim2gp.experiments.folds import Fold, fold, held_out
 from sim2gp.experiments.prediction import (
@@ -20,6 +21,7 @@ from sim2gp.experiments.prediction import (
     drawn,
     scores,
     trace_arrays,
+    units,
 )
 from sim2gp.logs import Log
 from sim2gp.models.grid import CURVE, Grid, steps_of
@@ -64,11 +66,18 @@ def unseen(
         return _none(f"a fit without {part.words} failed ({error}).")
     names = channels(project.system, windows)
     summary, arrays = scores(found.judged, names, logs, horizon)
-    summary["calibration"], shares = calibration(found.judged, names, horizon)
+    summary["calibration"], shares = calibration(found.judged, names, logs, horizon)
     del summary["tables"]
     picture = drawn(found.forecast, found.band, found.tested)
     traces = trace_arrays(picture, found.tested, logs, names, PREFIX)
     summary["left_out"] = part.words
+    summary["headline"] = forecast_sentence(
+        f"A fit that had not seen {part.words} forecasts it {horizon:g} s ahead with a "
+        "root mean square error of",
+        summary["open_loop_rmse"],
+        summary["trivial"],
+        units(project.system),
+    )
     summary["text"] = (
         f"The constants were fitted once more without {part.words}, which that fit "
         "then forecast, knowing its inputs. The other sections rest on all of the data."

@@ -7,5 +7,6 @@ from sim2gp.logs.formats import columns_of as columns_of
 from sim2gp.logs.log import Column as Column
 from sim2gp.logs.log import Log as Log
 from sim2gp.logs.log import Note as Note
+from sim2gp.logs.notes import note_lines as note_lines
 from sim2gp.logs.read import read_log as read_log
 from sim2gp.logs.resample import Resample as Resample

@@ -97,7 +97,7 @@ class Project:
             )
         if strict:
             none_unused(logs)
-        return tuple(_uniquely_named(_said_once(logs)))
+        return tuple(_uniquely_named(logs))
 
     def read_logs(
         self, files: Iterable[Path | str], configuration: str | None = None
@@ -294,21 +294,6 @@ def _no_group(source: Source) -> InputError:
         expected="one that says how columns are named",
         fix="add a [[logs]] table with columns",
     )
-
-
-def _said_once(logs: Sequence[Log]) -> list[Log]:
-    """Files of a group are alike: what nothing takes is said of the first of them."""
-    seen: set[tuple[int, str]] = set()
-    out = []
-    for log in logs:
-        kept = []
-        for note in log.notes:
-            about = (log.group, note.text.rpartition(": ")[2])
-            if note.code != "W105" or about not in seen:
-                kept.append(note)
-                seen.add(about)
-        out.append(replace(log, notes=tuple(kept)))
-    return out
 
 
 def _uniquely_named(logs: Sequence[Log]) -> list[Log]:

@@ -122,42 +122,46 @@ def noise_and_misfit(summary: Summary) -> Raw:
 
 def calibration(summary: Summary, arrays: Arrays) -> Raw:
     """How many held-out measurements lie in the bands, level by level."""
-    levels = arrays.get("calibration/level")
     prefix = "calibration/share/"
     names = [key[len(prefix) :] for key in arrays if key.startswith(prefix)]
-    if levels is None or not names:
+    if not names:
         return Raw("")
-    ends = (0.0, 1.0)
-    axes = svg.Axes(ends, ends, 520.0, 400.0, x_label="promised")
-    levels = np.asarray(levels, float)
-    marks = [
-        svg.band(
-            axes, levels, arrays["calibration/low"], arrays["calibration/high"], "quiet"
-        ),
-        svg.line(axes, np.array(ends), np.array(ends), "quiet"),
-    ]
-    for index, name in enumerate(names):
-        share, css = arrays[prefix + name], _COLOURS[index % 6]
-        marks.append(svg.line(axes, levels, share, css))
     about = (summary.get("held_out") or summary).get("calibration") or {}
     counted = (
         f"{number(about.get('windows'))} forecasts over {number(about.get('horizon'))} "
-        f"s, as good as {number(about.get('independent'))} that do not overlap"
+        f"s, judged by {about.get('blocks') or 'none'}"
     )
-    drawing = svg.chart(axes, marks, title="share inside the band")
+    drawings = [_curve_of_shares(arrays, name, i) for i, name in enumerate(names)]
     return section(
         "calibration",
         "Calibration",
         paragraph(about.get("text") or ""),
-        legend([(_COLOURS[i % 6], name) for i, name in enumerate(names)]),
-        Raw(f'<figure class="solo">{drawing}</figure>\n'),
+        cards(drawings, "wide"),
         paragraph(
-            "How often a band held the measurement, against how often it should: on "
-            "the line it tells the truth, below it is too narrow, above too wide. "
-            f"{counted}; in the shade nine in ten honest curves lie at a level.",
+            "How often a band held the measurement, against how often it should: below "
+            "the line bands are too narrow, above it too wide. "
+            f"{counted}. Of 100 forecasts with the right spread, 95 stay in the shade "
+            "at all levels and in all channels; with fewer than eight independent "
+            "blocks of windows there is none.",
             "soft",
         ),
     )
+
+
+def _curve_of_shares(arrays: Arrays, name: str, index: int) -> Raw:
+    """One channel's calibration curve, with its simultaneous band and the diagonal."""
+    levels = np.asarray(arrays["calibration/level"], float)
+    share = np.asarray(arrays[f"calibration/share/{name}"], float)
+    low, high = (arrays.get(f"calibration/{end}/{name}") for end in ("low", "high"))
+    ends, css = (0.0, 1.0), _COLOURS[index % 6]
+    axes = svg.Axes(ends, ends, 440.0, 340.0, x_label="stated share")
+    marks = [svg.line(axes, np.array(ends), np.array(ends), "quiet")]
+    if low is not None and high is not None:
+        marks.insert(0, svg.band(axes, levels, low, high, "quiet"))
+        outside = (share < low) | (share > high)
+        marks.append(svg.dots(axes, levels[outside], share[outside], css))
+    marks.append(svg.line(axes, levels, share, css))
+    return svg.chart(axes, marks, title=name, unit="share inside the band")
 
 
 def _with_unit(summary: Summary, channel: str) -> Raw:
@@ -170,6 +174,8 @@ def _by_channel(summary: Summary) -> Raw:
     """Errors and coverage with a row per channel and a line for the pooled ones."""
     known = {
         "open_loop_rmse": "error at the horizon",
+        "hold_rmse": "of holding still",
+        "regression_rmse": "of a linear regression",
         "one_step_rmse": "one-step error",
         "nll": "negative log-likelihood",
         "coverage90": "inside the 90 % band",

@@ -103,17 +103,8 @@ def _learned(summary: Summary) -> str:
         and not misfit.get("alarm")
     ):
         said.append(str(misfit["verdict"]))
-    if isinstance(unseen, Mapping) and unseen.get("open_loop_rmse"):
-        units = summary.get("units") or {}
-        errors = [
-            f"{number(error, 2)} {units.get(name, '')} ({name})"
-            for name, error in unseen["open_loop_rmse"].items()
-        ]
-        ahead = number(unseen.get("horizon"), 2)
-        said.append(
-            f"A fit that had not seen {unseen.get('left_out')} forecasts it {ahead} s "
-            f"ahead with a root mean square error of {', '.join(errors)}."
-        )
+    if isinstance(unseen, Mapping) and unseen.get("headline"):
+        said.append(str(unseen["headline"]))
     return " ".join(filter(None, said))
 
 

@@ -14,7 +14,14 @@ LONGEST = 12  # numbers of a list that are still printed
 _HIDDEN = (
     *("warnings", "versions", "animation", "figure1", "units", "tables", "command"),
     *("configurations", "candidates", "misfit_as_it_is", "diff"),
-    "intervals.allowed_for",
+    *(
+        "intervals.allowed_for",
+        "trivial",
+        "losses",
+        "held_out.trivial",
+        "held_out.losses",
+    ),
+    *("calibration.channels", "held_out.calibration.channels"),
 )
 _HIDDEN_COLUMNS = {
     "parameters": ("meaning", "note", "partners", "low", "high"),
