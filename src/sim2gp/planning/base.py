@@ -14,8 +14,10 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from sim2gp import checks
 from sim2gp.types import Action, Box, Dynamics, Key, Reward, Scalar, State
 
 #: A rollout beyond this magnitude has diverged, whatever its units.
@@ -92,10 +94,17 @@ class Observation(eqx.Module):
 
     angle: the state whose turns do not count, as (sin, cos), or None.
     scale: of every state; what a world's state carries beyond these is not seen.
+
+    Raises `InputError` E148 for a scale that is not positive, or an angle that is none
+    of the states.
     """
 
     scale: Float[Array, " n"]
     angle: int | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self) -> None:
+        checks.positive_or_infinite("Observation", scale=self.scale)
+        checks.index("Observation", np.shape(self.scale)[0], angle=self.angle)
 
     def __call__(self, s: State) -> Float[Array, " o"]:
         scaled = s[: self.scale.size] / self.scale
@@ -119,6 +128,9 @@ class World(eqx.Module):
     travel with the machine: a fast pendulum wants a short plan and restless noise, a
     slow one the opposite, and a planner built without arguments is right on both.
     So does what a policy sees of a state; None is the state as it is.
+
+    Raises `InputError` E148 for a number that cannot be; E140, E123 and E173 for a
+    function of another shape, of no real numbers, or that raises.
     """
 
     dynamics: Dynamics
@@ -132,6 +144,34 @@ class World(eqx.Module):
     planning_iterations: int = eqx.field(static=True, default=4)
     noise_colour: float = eqx.field(static=True, default=1.0)
     seen: Observation | None = None
+
+    def __check_init__(self) -> None:
+        lengths = {"horizon": self.horizon, "planning_horizon": self.planning_horizon}
+        checks.count("World", **lengths, planning_iterations=self.planning_iterations)
+        checks.whole("World", history=self.history)
+        checks.finite("World", noise_colour=self.noise_colour)
+        checks.positive_or_infinite("World", state_bound=self.state_bound)
+        self._check_functions()
+
+    def _check_functions(self) -> None:
+        """That the dynamics move a start, and the objective pays for it."""
+        s = checks.shapes(self.reset, jax.random.key(0))
+        if not isinstance(s, jax.ShapeDtypeStruct) or len(s.shape) != 1:
+            got, name = f"{s}", checks.name_of(self.reset)
+            raise checks.another_shape("a start", name, got, (1,), "a state's")
+        checks.same_shape("World", s.shape, state_bound=self.state_bound)
+        low, dynamics, objective = self.actions.low, self.dynamics, self.objective
+        a = jax.ShapeDtypeStruct(np.shape(low), jnp.result_type(low))
+        checks.returns("a next state", dynamics, (s, a), s.shape, meaning="the state's")
+        name = type(objective).__name__
+        rewards = f"{name}.along"
+        carry = checks.shapes(objective.init, name=f"{name}.init")
+        S, A = (jax.ShapeDtypeStruct((2, *x.shape), x.dtype) for x in (s, a))
+        if isinstance(objective, MarkovObjective):
+            name = rewards = checks.name_of(objective.reward)
+        paid = objective, carry, s, a, s
+        checks.returns("a reward", _paid, paid, (), name=name, meaning="a number")
+        checks.returns("rewards", objective.along, (carry, S, A, S), (2,), name=rewards)
 
     @property
     def observe(self) -> Observation:
@@ -149,6 +189,11 @@ class World(eqx.Module):
         if self.state_bound is not None:
             s2 = jnp.clip(s2, -self.state_bound, self.state_bound)
         return s2, usable
+
+
+def _paid(objective: AbstractObjective, *step: Any) -> Any:
+    """The reward of one step, without the carry."""
+    return objective.step(*step)[1]
 
 
 class AbstractPlanner(eqx.Module):

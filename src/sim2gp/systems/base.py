@@ -23,6 +23,7 @@ import jax.numpy as jnp
 from equinox import AbstractVar
 from jaxtyping import Array, Float
 
+from sim2gp import checks
 from sim2gp.configurations import Which
 from sim2gp.errors import InputError, nearest
 from sim2gp.parameters import Parameter, Parameters, parameters_of, unknown_parameter
@@ -39,6 +40,7 @@ class Channel:
     """One state or input: its name, unit, whether it is an angle, and its limits.
 
     The limits are the machine's, in the channel's unit; a system never enforces them.
+    Raises `InputError` E141 for limits that are reversed or NaN.
     """
 
     name: str
@@ -47,6 +49,10 @@ class Channel:
     low: float = -math.inf
     high: float = math.inf
 
+    def __post_init__(self) -> None:
+        where = f"limits of {self.name}"
+        checks.bounds(where, self.low, self.high, unbounded=True, empty=True)
+
 
 class AbstractSystem(eqx.Module):
     """A machine: how it flows under a constant input, and its one-step map ``step``.
@@ -54,9 +60,15 @@ class AbstractSystem(eqx.Module):
     ``states`` name what `step` carries: the physical states that `flow` takes on, then,
     newest first, ``history`` past actions (none but for delayed inputs).
     All fields are static: a system is not data, its ``params`` are.
+
+    Constructing one traces what its author wrote, once: E140, E123 or E173 for a
+    function of another shape, of no real numbers, or that raises.
     """
 
     parameters: AbstractVar[Parameters]
+
+    def __check_init__(self) -> None:
+        self.check_functions()
 
     @property
     @abc.abstractmethod
@@ -113,6 +125,40 @@ class AbstractSystem(eqx.Module):
     def physical_states(self) -> tuple[Channel, ...]:
         """The states that `flow` takes on, without the carried past actions."""
         return self.states[: len(self.states) - self.history * len(self.actions)]
+
+    def check_functions(self) -> None:
+        """That `flow` moves a state (E140, E123, E173).
+
+        A system whose author wrote something else than `flow` checks that instead.
+        """
+        self.check_returns("a next state", self.flow, 0.01)
+
+    def check_returns(
+        self,
+        what: str,
+        function: Callable[..., Any],
+        *more: Any,
+        name: str = "",
+        size: int | None = None,
+    ) -> None:
+        """That ``function(params, s, a, *more)`` has a number for each state.
+
+        Or ``size`` numbers; E140, E123 and E173 otherwise.
+        """
+        n, m = len(self.physical_states), len(self.actions)
+        given = jnp.result_type(float)
+        s, a, scalar = (jax.ShapeDtypeStruct(x, given) for x in ((n,), (m,), ()))
+        values = dict.fromkeys(names_of(self.parameters), scalar)
+        owner = type(self).__name__
+        params = checks.shapes(self.record, values, name=f"{owner}.record")
+        checks.returns(
+            what,
+            function,
+            (params, s, a, *more),
+            (n if size is None else size,),
+            name=name or f"{owner}.{checks.name_of(function)}",
+            meaning="a number for each state" if size is None else "",
+        )
 
     def nominal(self) -> Any:
         """The record of published constants; a prior median where there is none."""
@@ -171,6 +217,9 @@ class Bound(eqx.Module):
     params: Any
     dt: float = eqx.field(static=True)
 
+    def __check_init__(self) -> None:
+        checks.positive("a step of a system", dt=self.dt)
+
     def __call__(self, s: State, a: Action) -> State:
         return self.system.step(self.params, s, a, self.dt)
 
@@ -208,6 +257,10 @@ class AbstractODE(AbstractPlant):
     def ode(self, params: Any, s: State, a: Action) -> State:
         """Time derivative of the physical state under a constant input, per second."""
 
+    def check_functions(self) -> None:
+        """That `ode` has a derivative of each state: RK4 would broadcast a number."""
+        self.check_returns("a derivative", self.ode, name=f"{type(self).__name__}.ode")
+
     def flow(self, params: Any, s: State, a: Action, h: float | Scalar) -> State:
         return rk4(lambda x, u: self.ode(params, x, u), s, a, h)
 
@@ -220,6 +273,13 @@ class AbstractMechanism(AbstractODE):
     """
 
     locked: AbstractVar[tuple[bool, bool]]
+
+    def check_functions(self) -> None:
+        """That inertia and forces are those of two joints."""
+        for what, f, size in (("inertia", _inertia, 3), ("forces", _forces, 2)):
+            name = f"{type(self).__name__}.{what}"
+            function = jax.tree_util.Partial(f, self)
+            self.check_returns(what, function, name=name, size=size)
 
     @abc.abstractmethod
     def inertia(self, params: Any, q: Float[Array, " 2"]) -> Inertia:
@@ -247,6 +307,18 @@ class AbstractMechanism(AbstractODE):
     def joint(self, name: str) -> int:
         """Index of a joint by the name of its position channel (E103 if unknown)."""
         return index_of(name, self.states[:2])
+
+
+def _inertia(
+    system: AbstractMechanism, params: Any, s: State, a: Action
+) -> Float[Array, " 3"]:
+    """`AbstractMechanism.inertia` as one array."""
+    return jnp.stack(system.inertia(params, s[:2]))
+
+
+def _forces(system: AbstractMechanism, params: Any, s: State, a: Action) -> Any:
+    """`AbstractMechanism.forces` of a whole state."""
+    return system.forces(params, s[:2], s[2:4], a)
 
 
 def solve_two(

@@ -35,6 +35,9 @@ class Configured(AbstractSystem):
     def __init__(self, system: AbstractSystem, parameters: Parameters) -> None:
         self.system, self.parameters = system, parameters
 
+    def check_functions(self) -> None:
+        """The machine inside has checked its own."""
+
     @property
     def states(self) -> tuple[Channel, ...]:
         return self.system.states
