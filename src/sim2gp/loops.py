@@ -102,12 +102,10 @@ def posterior_sampling(
     ``update_every`` is None or a number of steps after which the belief learns within
     the episode (`within`). Without a ``final_fit`` the last episode is flown and not
     learned from: where returns are all that is asked. ``on_episode`` is called after
-    each fit. Raises what the fit raises, `NotFinite`, and `InputError` E148 for a
-    number that cannot be.
+    each fit. Raises what the fit raises, `NotFinite`, and E148 for an impossible count.
     """
-    where = "posterior_sampling"
-    checks.count(where, episodes=episodes, update_every=update_every)
-    checks.whole(where, history=history)
+    checks.count("a run", episodes=episodes, update_every=update_every)
+    checks.whole("a run", history=history)
     m = task.actions.low.size
     data = Transitions.empty(episodes * task.horizon, task.size + history * m, m)
     belief = model.init(key_for(key, 0, Purpose.INIT))

@@ -27,6 +27,7 @@ from sim2gp import checks
 from sim2gp.configurations import Which
 from sim2gp.errors import InputError, nearest
 from sim2gp.parameters import Parameter, Parameters, parameters_of, unknown_parameter
+from sim2gp.systems.written import check_mechanism, check_returns, names_of
 from sim2gp.types import Action, Scalar, State
 
 #: Of RK4 inside the windows that logs are cut into, s.
@@ -131,34 +132,8 @@ class AbstractSystem(eqx.Module):
 
         A system whose author wrote something else than `flow` checks that instead.
         """
-        self.check_returns("a next state", self.flow, 0.01)
-
-    def check_returns(
-        self,
-        what: str,
-        function: Callable[..., Any],
-        *more: Any,
-        name: str = "",
-        size: int | None = None,
-    ) -> None:
-        """That ``function(params, s, a, *more)`` has a number for each state.
-
-        Or ``size`` numbers; E140, E123 and E173 otherwise.
-        """
-        n, m = len(self.physical_states), len(self.actions)
-        given = jnp.result_type(float)
-        s, a, scalar = (jax.ShapeDtypeStruct(x, given) for x in ((n,), (m,), ()))
-        values = dict.fromkeys(names_of(self.parameters), scalar)
-        owner = type(self).__name__
-        params = checks.shapes(self.record, values, name=f"{owner}.record")
-        checks.returns(
-            what,
-            function,
-            (params, s, a, *more),
-            (n if size is None else size,),
-            name=name or f"{owner}.{checks.name_of(function)}",
-            meaning="a number for each state" if size is None else "",
-        )
+        name = f"{type(self).__name__}.flow"
+        check_returns(self, "a next state", self.flow, 0.01, name=name)
 
     def nominal(self) -> Any:
         """The record of published constants; a prior median where there is none."""
@@ -259,7 +234,8 @@ class AbstractODE(AbstractPlant):
 
     def check_functions(self) -> None:
         """That `ode` has a derivative of each state: RK4 would broadcast a number."""
-        self.check_returns("a derivative", self.ode, name=f"{type(self).__name__}.ode")
+        name = f"{type(self).__name__}.ode"
+        check_returns(self, "a derivative", self.ode, name=name)
 
     def flow(self, params: Any, s: State, a: Action, h: float | Scalar) -> State:
         return rk4(lambda x, u: self.ode(params, x, u), s, a, h)
@@ -276,10 +252,7 @@ class AbstractMechanism(AbstractODE):
 
     def check_functions(self) -> None:
         """That inertia and forces are those of two joints."""
-        for what, f, size in (("inertia", _inertia, 3), ("forces", _forces, 2)):
-            name = f"{type(self).__name__}.{what}"
-            function = jax.tree_util.Partial(f, self)
-            self.check_returns(what, function, name=name, size=size)
+        check_mechanism(self)
 
     @abc.abstractmethod
     def inertia(self, params: Any, q: Float[Array, " 2"]) -> Inertia:
@@ -307,18 +280,6 @@ class AbstractMechanism(AbstractODE):
     def joint(self, name: str) -> int:
         """Index of a joint by the name of its position channel (E103 if unknown)."""
         return index_of(name, self.states[:2])
-
-
-def _inertia(
-    system: AbstractMechanism, params: Any, s: State, a: Action
-) -> Float[Array, " 3"]:
-    """`AbstractMechanism.inertia` as one array."""
-    return jnp.stack(system.inertia(params, s[:2]))
-
-
-def _forces(system: AbstractMechanism, params: Any, s: State, a: Action) -> Any:
-    """`AbstractMechanism.forces` of a whole state."""
-    return system.forces(params, s[:2], s[2:4], a)
 
 
 def solve_two(
@@ -401,20 +362,6 @@ def table_of(parameters: Parameters | Sequence[Parameter]) -> Parameters:
     if isinstance(parameters, Parameters):
         return parameters
     return Parameters(tuple(parameters))
-
-
-def names_of(table: Parameters) -> tuple[str, ...]:
-    """Names of all constants, those that are learned and then those that are fixed."""
-    return *table.names, *(name for name, _ in table.fixed)
-
-
-def named_once(table: Parameters, *channels: Sequence[Channel]) -> None:
-    """Every constant, state and input has a name of its own (E145)."""
-    names = [*names_of(table), *(c.name for group in channels for c in group)]
-    for name in names:
-        if names.count(name) > 1:
-            fix = "give each constant, state and input a name of its own"
-            raise InputError("E145", "a name given twice", got=name, fix=fix)
 
 
 def index_of(name: str, channels: Sequence[Channel], *, where: str = "") -> int:

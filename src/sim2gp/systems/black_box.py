@@ -22,8 +22,9 @@ from sim2gp import checks
 from sim2gp.errors import InputError
 from sim2gp.parameters import Parameter, Parameters
 from sim2gp.systems.actuator import LONGEST_MEAN
-from sim2gp.systems.base import AbstractPlant, Channel, named_once, names_of, table_of
+from sim2gp.systems.base import AbstractPlant, Channel, table_of
 from sim2gp.systems.external import AbstractSimulator, Differences, flow, untouched
+from sim2gp.systems.written import named_once, names_of
 from sim2gp.types import Action, Scalar, State
 
 Step = Callable[[dict[str, Any], np.ndarray, np.ndarray, Any], Any]

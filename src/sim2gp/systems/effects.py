@@ -41,10 +41,8 @@ class AbstractEffect(eqx.Module):
     """One missing piece of physics, on the channel ``where``, of one ``magnitude``.
 
     ``what`` names the effect, ``unit`` its magnitude's unit (``{}`` stands for the
-    channel's own), ``max_substep`` the RK4 substep it needs in seconds.
-
-    Raises `InputError` E148 for a magnitude that is not finite; those with a width, a
-    speed or a smoothing where it is not positive.
+    channel's own), ``max_substep`` the RK4 substep it needs in seconds. Raises E148 for
+    a magnitude that is not finite, a width or so that is not positive.
     """
 
     where: AbstractVar[str]

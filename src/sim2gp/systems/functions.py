@@ -12,7 +12,8 @@ import equinox as eqx
 
 from sim2gp import checks
 from sim2gp.parameters import Parameter, Parameters
-from sim2gp.systems.base import AbstractODE, Channel, named_once, names_of, table_of
+from sim2gp.systems.base import AbstractODE, Channel, table_of
+from sim2gp.systems.written import check_returns, named_once, names_of
 from sim2gp.types import Action, Scalar, State
 
 Constants = dict[str, Scalar]
@@ -55,7 +56,7 @@ class ODE(AbstractODE):
     def check_functions(self) -> None:
         """The user's function itself, under the user's name for it."""
         name = checks.name_of(self.function)
-        self.check_returns("a derivative", self.function, name=name)
+        check_returns(self, "a derivative", self.function, name=name)
 
     @property
     def states(self) -> tuple[Channel, ...]:

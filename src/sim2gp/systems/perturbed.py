@@ -32,6 +32,7 @@ from sim2gp.systems.effects import (
     RodInertia,
     Spring,
 )
+from sim2gp.systems.written import check_returns
 from sim2gp.types import Action, Scalar, State
 
 STRENGTHS = ("mild", "middle", "strong")
@@ -109,7 +110,7 @@ class Perturbed(AbstractMechanism):
             ):
                 name = f"{type(effect).__name__}.{what}"
                 function = jax.tree_util.Partial(f, self.system, effect)
-                self.check_returns(what, function, name=name, size=size)
+                check_returns(self, what, function, name=name, size=size)
 
     @property
     def states(self) -> tuple[Channel, ...]:
