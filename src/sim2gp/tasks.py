@@ -23,7 +23,17 @@ from sim2gp.errors import InputError
 from sim2gp.systems import AbstractEffect, AbstractSystem, CartPole, Furuta, InputDelay
 from sim2gp.systems.base import AbstractMechanism
 from sim2gp.systems.perturbed import perturb
-from sim2gp.types import Action, Box, Dynamics, Key, Reward, Scalar, State, in_float64
+from sim2gp.types import (
+    Action,
+    Box,
+    Dynamics,
+    Key,
+    Reward,
+    Scalar,
+    State,
+    check_reward,
+    in_float64,
+)
 
 #: A task's states are bounded at so many times the box that models are trusted in.
 TRUSTED = 3.0
@@ -91,7 +101,7 @@ class Task(eqx.Module):
         a = jax.ShapeDtypeStruct(m, jnp.result_type(self.actions.low))
         meaning = "the state with its past actions" if self.history else "the state's"
         checks.returns("a next state", self.dynamics, (s, a), (size,), meaning=meaning)
-        checks.returns("a reward", self.reward, (s, a, s), (), meaning="a number")
+        check_reward(self.reward, s, a)
 
     @property
     def size(self) -> int:

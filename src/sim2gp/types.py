@@ -53,6 +53,11 @@ class Box(eqx.Module):
         checks.bounds("Box", self.low, self.high, empty=True)
 
 
+def check_reward(reward: Reward, s: Any, a: Any) -> None:
+    """That a reward of a step between such states is a number (E140, E123, E173)."""
+    checks.returns("a reward", reward, (s, a, s), (), meaning="a number")
+
+
 def in_float64(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """Run a host-side function with float64 switched on, and only inside it.
 

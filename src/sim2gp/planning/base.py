@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from sim2gp import checks
-from sim2gp.types import Action, Box, Dynamics, Key, Reward, Scalar, State
+from sim2gp.types import Action, Box, Dynamics, Key, Reward, Scalar, State, check_reward
 
 #: A rollout beyond this magnitude has diverged, whatever its units.
 DIVERGED = 1e10
@@ -120,6 +120,11 @@ class Observation(eqx.Module):
         return self.scale.size + (self.angle is not None)
 
 
+def _paid(objective: AbstractObjective, *step: Any) -> Any:
+    """The reward of one step, without the carry."""
+    return objective.step(*step)[1]
+
+
 class World(eqx.Module):
     """One draw of everything a planner needs; a pytree, so a new draw is new data.
 
@@ -156,22 +161,26 @@ class World(eqx.Module):
     def _check_functions(self) -> None:
         """That the dynamics move a start, and the objective pays for it."""
         s = checks.shapes(self.reset, jax.random.key(0))
-        if not isinstance(s, jax.ShapeDtypeStruct) or len(s.shape) != 1:
-            got, name = f"{s}", checks.name_of(self.reset)
-            raise checks.another_shape("a start", name, got, (1,), "a state's")
-        checks.same_shape("World", s.shape, state_bound=self.state_bound)
-        low, dynamics, objective = self.actions.low, self.dynamics, self.objective
+        shape = getattr(s, "shape", ())
+        if len(shape) != 1:
+            name, whose = checks.name_of(self.reset), "a number for each state"
+            got = shape if shape else f"a {type(s).__name__}"
+            raise checks.another_shape("a start", name, got, (1,), whose)
+        checks.same_shape("World", shape, state_bound=self.state_bound)
+        low, objective = self.actions.low, self.objective
         a = jax.ShapeDtypeStruct(np.shape(low), jnp.result_type(low))
-        checks.returns("a next state", dynamics, (s, a), s.shape, meaning="the state's")
-        name = type(objective).__name__
-        rewards = f"{name}.along"
-        carry = checks.shapes(objective.init, name=f"{name}.init")
-        S, A = (jax.ShapeDtypeStruct((2, *x.shape), x.dtype) for x in (s, a))
+        whose = "the state's"
+        checks.returns("a next state", self.dynamics, (s, a), shape, meaning=whose)
         if isinstance(objective, MarkovObjective):
-            name = rewards = checks.name_of(objective.reward)
-        paid = objective, carry, s, a, s
-        checks.returns("a reward", _paid, paid, (), name=name, meaning="a number")
-        checks.returns("rewards", objective.along, (carry, S, A, S), (2,), name=rewards)
+            check_reward(objective.reward, s, a)
+            return
+        name = type(objective).__name__
+        carry = checks.shapes(objective.init, name=f"{name}.init")
+        paid = jax.tree_util.Partial(_paid, objective)
+        checks.returns("a reward", paid, (carry, s, a, s), (), name=f"{name}.step")
+        S, A = (jax.ShapeDtypeStruct((2, *x.shape), x.dtype) for x in (s, a))
+        many, name = (carry, S, A, S), f"{name}.along"
+        checks.returns("rewards", objective.along, many, (2,), name=name)
 
     @property
     def observe(self) -> Observation:
@@ -189,11 +198,6 @@ class World(eqx.Module):
         if self.state_bound is not None:
             s2 = jnp.clip(s2, -self.state_bound, self.state_bound)
         return s2, usable
-
-
-def _paid(objective: AbstractObjective, *step: Any) -> Any:
-    """The reward of one step, without the carry."""
-    return objective.step(*step)[1]
 
 
 class AbstractPlanner(eqx.Module):

@@ -13,7 +13,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from sim2gp import checks
 from sim2gp.errors import InputError, nearest
@@ -159,7 +158,7 @@ def _input(
 
 def _inertia(
     system: AbstractMechanism, effect: AbstractEffect, params: Any, s: State, a: Action
-) -> Float[Array, " 3"]:
+) -> Any:
     """`AbstractEffect.inertia`, likewise, as one array."""
     one = jnp.ones((), s.dtype)
     return jnp.stack(effect.inertia(system, params.system, one, s[:2]))

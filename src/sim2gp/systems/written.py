@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from sim2gp import checks
 from sim2gp.errors import InputError
@@ -66,9 +65,7 @@ def check_mechanism(system: "AbstractMechanism") -> None:
         check_returns(system, what, function, name=name, size=size)
 
 
-def _inertia(
-    system: "AbstractMechanism", params: Any, s: State, a: Action
-) -> Float[Array, " 3"]:
+def _inertia(system: "AbstractMechanism", params: Any, s: State, a: Action) -> Any:
     """`AbstractMechanism.inertia` as one array."""
     return jnp.stack(system.inertia(params, s[:2]))
 
