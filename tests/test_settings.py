@@ -300,13 +300,9 @@ def test_what_is_no_number_is_refused(rule) -> None:
 
 def test_words_and_shapes() -> None:
     """What the types of these tests would stop before."""
-    with pytest.raises(
-        InputError, match=r"^E148 horizon in Task: got 2\.5, "
-    ):
+    with pytest.raises(InputError, match=r"^E148 horizon in Task: got 2\.5, "):
         checks.count("Task", horizon=2.5)
-    with pytest.raises(
-        InputError, match=r"^E145 unknown mode in X: got jont"
-    ):
+    with pytest.raises(InputError, match=r"^E145 unknown mode in X: got jont"):
         checks.one_of("X", ("seq_sum", "joint"), mode="jont")
     with pytest.raises(InputError, match=r"^E140 start in Task: got shape \(3,\), exp"):
         checks.same_shape("Task", (2,), noise=np.ones(2), start=np.ones(3))

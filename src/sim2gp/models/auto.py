@@ -51,9 +51,11 @@ class AutoBelief(AbstractBelief):
     seen: Int[Array, ""]
 
     @property
+    @in_float64
     def noise(self) -> Float[Array, " d"]:
         return jnp.stack([b.noise for b in self.beliefs])[self.index]
 
+    @in_float64
     def parameters(self) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
         each = [b.parameters() for b in self.beliefs]
         if len({mean.size for mean, _ in each}) > 1:

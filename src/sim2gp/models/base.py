@@ -57,6 +57,7 @@ class AbstractBelief(eqx.Module):
         """
         return self
 
+    @in_float64
     def parameters(self) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
         """Virtual mean and sd of a simulator's constants; empty where there are none.
 
@@ -134,8 +135,10 @@ class DeterministicBelief(AbstractBelief):
     def parameters(self) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
         return self.belief.parameters()
 
+    @in_float64
     def latent(self, s: State, a: Action) -> Gaussian:
-        mean = self.point()(s, a)
+        s, a = (jnp.asarray(x, jnp.float32) for x in (s, a))  # a draw's precision
+        mean = self.point()(s, a).astype(self.noise.dtype)
         return Gaussian(mean, jnp.zeros((mean.size, 1), mean.dtype))
 
     def predict(self, s: State, a: Action) -> Gaussian:
