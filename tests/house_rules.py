@@ -10,8 +10,8 @@ from collections.abc import Iterator
 #: Imports point down; rooms of one layer do not see each other, but for SIBLINGS.
 LAYERS: tuple[frozenset[str], ...] = (
     frozenset(
-        "types errors linalg gaussian least_squares arrowhead laplace em bijections "
-        "configurations weighed parameters transitions ahead descent".split()
+        "types errors checks linalg gaussian least_squares arrowhead laplace em "
+        "bijections configurations weighed parameters transitions ahead descent".split()
     ),
     frozenset({"systems", "logs"}),
     frozenset({"models", "tasks", "planning"}),
@@ -31,6 +31,8 @@ SIBLINGS: frozenset[tuple[str, str]] = frozenset(
         ("robot", "runs"),
         ("ahead", "types"),
         ("types", "errors"),
+        ("types", "checks"),
+        ("checks", "errors"),
         ("descent", "types"),
         ("gaussian", "linalg"),
         ("gaussian", "types"),
@@ -42,8 +44,10 @@ SIBLINGS: frozenset[tuple[str, str]] = frozenset(
         ("parameters", "weighed"),
         ("weighed", "types"),
         ("weighed", "errors"),
+        ("weighed", "checks"),
         ("parameters", "types"),
         ("parameters", "errors"),
+        ("parameters", "checks"),
         ("parameters", "gaussian"),
         ("transitions", "types"),
         ("transitions", "errors"),

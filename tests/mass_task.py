@@ -80,6 +80,10 @@ class GainBelief(AbstractBelief):
     mean: Array
     sd: Array
 
+    @property
+    def noise(self) -> Array:
+        return single(*NOISE)
+
     def latent(self, s: State, a: Array) -> Gaussian:
         raise NotImplementedError
 

@@ -8,6 +8,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from linear_system import linear, transitions
+from sim2gp.errors import InputError
 from sim2gp.models import Auto, Residual, Sim2GP
 from sim2gp.models.auto import choose, log_scores
 
@@ -156,5 +157,5 @@ def test_choice(gaps, expected):
 
 
 def test_one_model_is_no_choice():
-    with pytest.raises(ValueError, match="choose from 1"):
+    with pytest.raises(InputError, match=r"^E148 models in Auto: got 1"):
         Auto([Sim2GP(linear(P, D), dt=1.0)])

@@ -50,6 +50,10 @@ class Known(AbstractBelief):
     common: Array  # (D, P, n)
     each: Array  # (D, M, n)
 
+    @property
+    def noise(self) -> Array:
+        return jnp.ones(D)
+
     def sensitivity(self, s: State, a: Action) -> tuple[Array, Array]:
         return self.common @ s, self.each @ s
 

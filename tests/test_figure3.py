@@ -96,6 +96,10 @@ class Off(AbstractBelief):
     truth: jax.Array
     off: float
 
+    @property
+    def noise(self):
+        return jnp.asarray([0.1, 0.2, 0.3, 0.4])
+
     def predict(self, s, a):
         i = jnp.argmin(jnp.sum((self.truth[:, 0] - s[None]) ** 2, axis=1))
         scale = jnp.diag(jnp.asarray([0.1, 0.2, 0.3, 0.4]))

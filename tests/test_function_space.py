@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from linear_system import Linear, linear, transitions
-from sim2gp.errors import NotFinite
+from sim2gp.errors import InputError, NotFinite
 from sim2gp.gaussian import Gaussian
 from sim2gp.models import (
     FunctionSpace,
@@ -369,9 +369,9 @@ def test_growing_data_retrace_nothing(fitted):
 
 def test_options_are_checked():
     sim = Sim2GP(linear(P, D))
-    with pytest.raises(ValueError, match="literal"):
+    with pytest.raises(InputError, match=r"^E145 .*literal"):
         FunctionSpace(sim, objective="best")
-    with pytest.raises(ValueError, match="posterior"):
+    with pytest.raises(InputError, match=r"^E145 .*posterior"):
         FunctionSpace(sim, fs_prior="lagged")
     literal = FunctionSpace(sim, objective="literal")
     assert literal.pretrain == 0

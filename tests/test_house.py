@@ -269,12 +269,12 @@ def test_wheel_is_the_package(tmp_path: Path) -> None:
 
 def test_shapes_are_checked_under_pytest() -> None:
     """The import hook of pyproject.toml is at work; users do not pay for it."""
-    from sim2gp.types import Box
+    from sim2gp.gaussian import Gaussian
 
     with pytest.raises(TypeCheckError):
-        Box(low=jnp.zeros(2), high=jnp.zeros(3))
-    code = "import jax.numpy as jnp; from sim2gp.types import Box; "
-    run_python(code + "Box(low=jnp.zeros(2), high=jnp.zeros(3))")
+        Gaussian(jnp.zeros(2), jnp.zeros((3, 3)))
+    code = "import jax.numpy as jnp; from sim2gp.gaussian import Gaussian; "
+    run_python(code + "Gaussian(jnp.zeros(2), jnp.zeros((3, 3)))")
 
 
 def test_unpickling_shells_and_network_are_refused() -> None:

@@ -104,7 +104,7 @@ def test_scores() -> None:
     assert tasks.episodes_to_95([191.5], 30.0, 200.0) == 1
     assert tasks.episodes_to_95(returns[:2], 30.0, 200.0) is None
     assert tasks.episodes_to_95([], 30.0, 200.0) is None
-    with pytest.raises(ValueError, match="not above hanging"):
+    with pytest.raises(InputError, match=r"^E148 oracle .*more than the 30"):
         tasks.score(10.0, 30.0, 30.0)
 
 
@@ -202,5 +202,5 @@ def test_truths_outside_lie_beyond_their_bounds(system):
 
 
 def test_an_unknown_truth_is_refused():
-    with pytest.raises(ValueError, match="4sd"):
+    with pytest.raises(InputError, match=r"^E145 .*got 4sd"):
         tasks.draw_truth(Furuta(), KEY, "4sd")

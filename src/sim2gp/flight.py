@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp.errors import NotFinite, of_callbacks, warn
+from sim2gp.gaussian import Gaussian
 from sim2gp.planning import (
     AbstractObjective,
     AbstractPlanner,
@@ -86,20 +87,41 @@ class Reset(eqx.Module):
         return jnp.concatenate([start, jnp.zeros(self.past, start.dtype)])
 
 
+class DrawnReset(eqx.Module):
+    """A start, and constants drawn for it."""
+
+    start: Callable[[Key], State]
+    constants: Gaussian
+
+    def __call__(self, key: Key) -> State:
+        where, which = jax.random.split(key)
+        return jnp.concatenate([self.start(where), self.constants.sample(which)])
+
+
 def world_of(
-    task: Task, dynamics: Dynamics, objective: AbstractObjective, *, history: int = 0
+    task: Task,
+    dynamics: Dynamics,
+    objective: AbstractObjective,
+    *,
+    history: int = 0,
+    constants: Gaussian | None = None,
 ) -> World:
     """A draw and an objective, within what the task lets a planner know.
 
-    ``history`` is the number of past actions in the state of ``dynamics``.
+    ``history`` is the number of past actions in the state of ``dynamics``. Where the
+    state ends in ``constants``, every reset draws them.
     """
     m = task.actions.low.size
-    free = jnp.full(history * m, jnp.inf, task.state_bound.dtype)
+    start: Callable[[Key], State] = Reset(task, history * m)
+    more = history * m
+    if constants is not None:
+        start, more = DrawnReset(start, constants), more + constants.mean.size
+    free = jnp.full(more, jnp.inf, task.state_bound.dtype)
     past = jnp.tile(0.5 * (task.actions.high - task.actions.low), history)
     return World(
         dynamics,
         objective,
-        Reset(task, history * m),
+        start,
         task.actions,
         task.horizon,
         state_bound=jnp.concatenate([task.state_bound, free]),

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from sim2gp import checks
 from sim2gp.errors import of_callbacks
 from sim2gp.exploration import InformationGain, Optimistic, Restrained
 from sim2gp.flight import (
@@ -46,8 +47,8 @@ class Episode(eqx.Module):
 class History(eqx.Module):
     """A whole run, as numpy arrays: E episodes of T steps.
 
-    ``parameter_mean`` and ``parameter_sd`` (virtual) have E + 1 rows, the prior first;
-    they are None for beliefs without parameters. ``belief`` has seen all episodes;
+    ``parameter_mean`` and ``parameter_sd`` (virtual) have E + 1 rows, the prior first,
+    and no columns for beliefs without parameters. ``belief`` has seen all episodes;
     ``planner`` is the planner's last state, in which SAC keeps its policy.
     """
 
@@ -55,8 +56,8 @@ class History(eqx.Module):
     action: Float[np.ndarray, "E T m"]
     reward: Float[np.ndarray, "E T"]
     failed: Bool[np.ndarray, "E T"]
-    parameter_mean: Float[np.ndarray, "rounds p"] | None
-    parameter_sd: Float[np.ndarray, "rounds p"] | None
+    parameter_mean: Float[np.ndarray, "rounds p"]
+    parameter_sd: Float[np.ndarray, "rounds p"]
     belief: AbstractBelief
     data: Transitions
     planner: Any
@@ -101,8 +102,10 @@ def posterior_sampling(
     ``update_every`` is None or a number of steps after which the belief learns within
     the episode (`within`). Without a ``final_fit`` the last episode is flown and not
     learned from: where returns are all that is asked. ``on_episode`` is called after
-    each fit. Raises what the fit raises, and `NotFinite`.
+    each fit. Raises what the fit raises, `NotFinite`, and E148 for an impossible count.
     """
+    checks.count("a run", episodes=episodes, update_every=update_every)
+    checks.whole("a run", history=history)
     m = task.actions.low.size
     data = Transitions.empty(episodes * task.horizon, task.size + history * m, m)
     belief = model.init(key_for(key, 0, Purpose.INIT))
@@ -243,6 +246,7 @@ def psal(
     ``together`` is `InformationGain`'s. The states stay within the box that models are
     trusted in; going beyond it by as much again costs ``limit_cost`` nats a step.
     """
+    checks.not_negative("psal", limit_cost=limit_cost)
     bound, cost = task.trusted, jnp.asarray(limit_cost, jnp.float32)
 
     def objective(belief: AbstractBelief) -> AbstractObjective:
@@ -274,6 +278,7 @@ def optimism(
 
     ``weight`` is that of one noise sd of doubt about the next state (`Optimistic`).
     """
+    checks.not_negative("optimism", weight=weight)
     each = jnp.asarray(weight, jnp.float32)
 
     def objective(belief: AbstractBelief) -> AbstractObjective:
@@ -291,32 +296,27 @@ def optimism(
     )
 
 
-def _parameters(belief: AbstractBelief) -> tuple[np.ndarray, np.ndarray] | None:
-    """Virtual mean and sd of the constants, where the belief has any."""
-    moments = getattr(belief, "parameters", None)
-    if moments is None:
-        return None
-    mean, sd = moments()
+def _parameters(belief: AbstractBelief) -> tuple[np.ndarray, np.ndarray]:
+    """Virtual mean and sd of the constants, as they are now."""
+    mean, sd = belief.parameters()
     return np.asarray(mean), np.asarray(sd)
 
 
 def _history(
     trajectories: list[Trajectory],
-    summaries: list[tuple[np.ndarray, np.ndarray] | None],
+    summaries: list[tuple[np.ndarray, np.ndarray]],
     belief: AbstractBelief,
     data: Transitions,
     planner: Any,
 ) -> History:
     flown = jax.tree.map(lambda *leaves: np.stack(leaves), *trajectories)
-    known = [summary for summary in summaries if summary is not None]
-    complete = len(known) == len(summaries)
     return History(
         flown.state,
         flown.action,
         flown.reward,
         flown.failed,
-        np.stack([mean for mean, _ in known]) if complete else None,
-        np.stack([sd for _, sd in known]) if complete else None,
+        np.stack([mean for mean, _ in summaries]),
+        np.stack([sd for _, sd in summaries]),
         belief,
         data,
         planner,

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from sim2gp import checks
 from sim2gp.errors import NotFinite, Sim2GPError
 from sim2gp.flight import Purpose, Trajectory, episode, key_for, oracle_world
 from sim2gp.planning import AbstractPlanner, World
@@ -38,6 +39,7 @@ def fly_oracle(
     It plans without noise and flies the noisy task. It swings up when the pole stands
     over the last second of every episode; the first one that does not ends the run.
     """
+    checks.count("fly_oracle", episodes=episodes)
     returns, up = [], True
     world = oracle_world(task)
     for trajectory in flights(task, world, planner, key=key, episodes=episodes):
@@ -90,6 +92,7 @@ def accept_truth(
     beyond its bounds a machine spins faster than the substeps can follow). Raises
     `Sim2GPError` E204 when ``attempts`` draws all fail.
     """
+    checks.count("accept_truth", attempts=attempts)
     diverged = 0
     for attempt in range(attempts):
         record = draw_truth(system, key_for(key, attempt, Purpose.TRUTH), truth)

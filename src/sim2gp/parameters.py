@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sim2gp import bijections
+from sim2gp import bijections, checks
 from sim2gp.configurations import Configuration, Which, valued
 from sim2gp.errors import InputError, nearest
 from sim2gp.gaussian import Gaussian
@@ -35,6 +35,10 @@ class Parameter:
 
     ``mean`` and ``sd`` describe the virtual value; ``nominal`` is the published
     physical value, where there is one.
+
+    Raises `InputError` E141 for an unknown map and for bounds that the map cannot have,
+    E144 for a prior's mean or sd that cannot be, E148 for a nominal value that is not
+    finite.
     """
 
     name: str
@@ -56,14 +60,13 @@ class Parameter:
                 expected=f"one of {', '.join(bijections.MAPS)}",
             )
         boxed = self.map in ("box", "log_box")
-        finite = math.isfinite(self.low) and math.isfinite(self.high)
-        if boxed and not (finite and self.low < self.high):
+        where = self.name or "a parameter"
+        checks.bounds(where, self.low, self.high, unbounded=not boxed)
+        if self.map == "softplus" and not math.isfinite(self.low):
+            expected = "a finite bound to be above"
+            got = f"{self.low:g}"
             raise InputError(
-                "E141",
-                f"bounds of {self.name or 'a parameter'}",
-                got=f"low = {self.low:g}, high = {self.high:g}",
-                expected="finite bounds with low < high",
-                fix="swap the bounds, or fix the value if they are equal",
+                "E141", f"lower bound of {where}", got=got, expected=expected
             )
         if self.map == "log_box" and self.low <= 0.0:
             raise InputError(
@@ -72,13 +75,8 @@ class Parameter:
                 got=f"{self.low:g}",
                 expected="a positive bound for a logarithmic box",
             )
-        if not (math.isfinite(self.mean) and 0.0 < self.sd < math.inf):
-            raise InputError(
-                "E144",
-                f"prior of {self.name}",
-                got=f"mean {self.mean:g}, sd {self.sd:g}",
-                expected="a finite mean and a positive, finite sd",
-            )
+        checks.moments(f"the prior of {where}", self.mean, self.sd)
+        checks.finite(where, nominal=self.nominal)
 
     def constrain(self, tt: float) -> float:
         """Physical value of a virtual one (host-side scalar)."""
@@ -145,13 +143,7 @@ def prior_from_moments(
     Raises `InputError` E142 where no such prior exists, E144 for a sd that is not
     positive.
     """
-    if not (math.isfinite(mean) and 0.0 < sd < math.inf):
-        raise InputError(
-            "E144",
-            f"prior of {parameter.name}",
-            got=f"mean = {mean:g}, sd = {sd:g}",
-            expected="a finite mean and a positive sd",
-        )
+    checks.moments(f"the prior of {parameter.name or 'a parameter'}", mean, sd)
     if low is not None or high is not None:
         low = parameter.low if low is None else low
         high = parameter.high if high is None else high
@@ -227,13 +219,17 @@ class Parameters(eqx.Module):
 
     Of a machine in several ``configurations``, the columns of all of them: ``mass`` for
     those that share it, ``mass @ payload`` where a configuration has its own. Sums of
-    constants that were ``weighed`` are part of every fit.
+    constants that were ``weighed`` are part of every fit. Raises `InputError` E148 for
+    a value held fixed that is not finite.
     """
 
     free: tuple[Parameter, ...] = eqx.field(static=True)
     fixed: tuple[tuple[str, float], ...] = eqx.field(static=True, default=())
     configurations: tuple[Configuration, ...] = eqx.field(static=True, default=())
     weighed: tuple[Weighed, ...] = eqx.field(static=True, default=())
+
+    def __check_init__(self) -> None:
+        checks.finite("the constants held fixed", **dict(self.fixed))
 
     def __len__(self) -> int:
         return len(self.free)

@@ -18,11 +18,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from sim2gp import checks
 from sim2gp.errors import InputError
 from sim2gp.systems import AbstractEffect, AbstractSystem, CartPole, Furuta, InputDelay
 from sim2gp.systems.base import AbstractMechanism
 from sim2gp.systems.perturbed import perturb
-from sim2gp.types import Action, Box, Dynamics, Key, Reward, Scalar, State, in_float64
+from sim2gp.types import (
+    Action,
+    Box,
+    Dynamics,
+    Key,
+    Reward,
+    Scalar,
+    State,
+    check_reward,
+    in_float64,
+)
 
 #: A task's states are bounded at so many times the box that models are trusted in.
 TRUSTED = 3.0
@@ -45,6 +56,10 @@ class Task(eqx.Module):
     pole: which state is the angle that must end upright.
     planning_horizon, planning_iterations, noise_colour: what suits this machine.
     truth: the hidden constants by name, for reports and tests only.
+
+    Raises `InputError` E144 for a sd that is negative or not finite, E148 for another
+    number that cannot be, E140 for arrays or functions of another shape; E123 and E173
+    for functions whose answers are no real numbers, and that raise.
     """
 
     dynamics: Dynamics
@@ -63,6 +78,30 @@ class Task(eqx.Module):
     planning_horizon: int = eqx.field(static=True, default=30)
     planning_iterations: int = eqx.field(static=True, default=4)
     noise_colour: float = eqx.field(static=True, default=1.0)
+
+    def __check_init__(self) -> None:
+        n = np.shape(self.noise)
+        alike = {"start": self.start, "start_sd": self.start_sd}
+        checks.same_shape("Task", n, **alike, state_bound=self.state_bound)
+        checks.deviation_or_zero("Task", noise=self.noise, start_sd=self.start_sd)
+        checks.finite("Task", start=self.start, noise_colour=self.noise_colour)
+        checks.positive_or_infinite("Task", state_bound=self.state_bound)
+        checks.positive("Task", dt=self.dt)
+        lengths = {"horizon": self.horizon, "planning_horizon": self.planning_horizon}
+        checks.count("Task", **lengths, planning_iterations=self.planning_iterations)
+        checks.whole("Task", history=self.history)
+        checks.index("Task", self.size, pole=self.pole)
+        self._check_functions()
+
+    def _check_functions(self) -> None:
+        """Of a state with its past actions: the next one, and a number."""
+        m, kind = np.shape(self.actions.low), jnp.result_type(self.start)
+        size = self.size + self.history * m[0]
+        s = jax.ShapeDtypeStruct((size,), kind)
+        a = jax.ShapeDtypeStruct(m, jnp.result_type(self.actions.low))
+        meaning = "the state with its past actions" if self.history else "the state's"
+        checks.returns("a next state", self.dynamics, (s, a), (size,), meaning=meaning)
+        check_reward(self.reward, s, a)
 
     @property
     def size(self) -> int:
@@ -211,11 +250,10 @@ def draw_truth(system: AbstractSystem, key: Key, truth: str = "prior") -> Any:
 
     ``truth`` is one of `TRUTHS`: from the system's own prior, or with every constant 2
     or 3 prior sd from its mean (in virtual space), or a fifth beyond its bounds, each
-    on a random side. Raises ValueError for another word, E142 where a constant has no
-    bounds to be beyond.
+    on a random side. Raises `InputError` E145 for another word, E142 where a constant
+    has no bounds to be beyond.
     """
-    if truth not in TRUTHS:
-        raise ValueError(f"truth is {truth!r}, not one of {', '.join(TRUTHS)}")
+    checks.one_of("draw_truth", TRUTHS, truth=truth)
     table = system.parameters
     side = jnp.where(jax.random.bernoulli(key, shape=(len(table),)), 1.0, -1.0)
     prior = table.prior()
@@ -252,10 +290,13 @@ def _hanging_return(task: Task) -> Scalar:
 def score(returned: float, hanging: float, oracle: float) -> float:
     """``(R - R_hang) / (R_oracle - R_hang)``: 0 for doing nothing, 1 for the oracle.
 
-    Raises ValueError where the oracle is no better than doing nothing.
+    Raises `InputError` E148 for returns that are not finite, and where the oracle is no
+    better than doing nothing.
     """
+    checks.finite("a score", returned=returned, hanging=hanging, oracle=oracle)
     if not oracle > hanging:
-        raise ValueError(f"oracle return {oracle:g} is not above hanging {hanging:g}")
+        got, expected = f"{oracle:g}", f"more than the {hanging:g} of doing nothing"
+        raise InputError("E148", "oracle", where="a score", got=got, expected=expected)
     return (returned - hanging) / (oracle - hanging)
 
 

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from sim2gp import checks
 from sim2gp.errors import of_callbacks
 
 State = Float[Array, " n"]
@@ -39,10 +40,22 @@ _T = TypeVar("_T")
 
 
 class Box(eqx.Module):
-    """The set of actions ``low <= a <= high``, in the units of the channels."""
+    """The set of actions ``low <= a <= high``, in the units of the channels.
+
+    Raises `InputError` E141 for bounds that are reversed or not finite.
+    """
 
     low: Float[Array, " m"]
     high: Float[Array, " m"]
+
+    def __check_init__(self) -> None:
+        checks.same_shape("Box", np.shape(self.low), high=self.high)
+        checks.bounds("Box", self.low, self.high, empty=True)
+
+
+def check_reward(reward: Reward, s: Any, a: Any) -> None:
+    """That a reward of a step between such states is a number (E140, E123, E173)."""
+    checks.returns("a reward", reward, (s, a, s), (), meaning="a number")
 
 
 def in_float64(function: Callable[_P, _R]) -> Callable[_P, _R]:

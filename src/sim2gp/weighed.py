@@ -6,13 +6,13 @@ A sum of constants is linear in ``theta`` and not in their virtual values, so it
 more row of the least squares, not a change of the independent prior.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sim2gp import checks
 from sim2gp.errors import InputError
 from sim2gp.types import Scalar
 
@@ -28,14 +28,7 @@ class Weighed:
 
     def check(self, ranges: Mapping[str, tuple[float, float]]) -> None:
         """That the constants can make up the sum, within ``ranges`` (E142, E144)."""
-        if not (math.isfinite(self.value) and 0.0 < self.sd < math.inf):
-            raise InputError(
-                "E144",
-                "a weighed sum",
-                where=" + ".join(self.of),
-                got=f"value = {self.value:g}, sd = {self.sd:g}",
-                expected="a finite value and a positive sd",
-            )
+        checks.moments(f"the measured {' + '.join(self.of)}", self.value, self.sd)
         pairs = list(zip(self.of, self.weights, strict=True))
         low, high = (
             sum(pick(w * end for end in ranges[name]) for name, w in pairs if w != 0.0)

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sim2gp import checks
 from sim2gp.gaussian import Gaussian
 from sim2gp.least_squares import over
 from sim2gp.linalg import triangular
@@ -38,6 +39,9 @@ class Experiment(eqx.Module):
     start_sd: how uncertain the start of every window is, before its samples.
     period: of commands and samples, s; ``window`` periods make a window.
     substep: of the integration at most, s.
+
+    Raises `InputError` E144 for a sd that cannot be, E148 for another number, E140 for
+    arrays of another shape.
     """
 
     system: AbstractSystem
@@ -51,6 +55,17 @@ class Experiment(eqx.Module):
     window: int = eqx.field(static=True)
     substep: float = eqx.field(static=True, default=WINDOW_SUBSTEP)
     corrected: Gaussian | None = None
+
+    def __check_init__(self) -> None:
+        checks.deviation("Experiment", noise=self.noise)
+        checks.deviation_or_zero("Experiment", start_sd=self.start_sd)
+        checks.finite("Experiment", start=self.start)
+        checks.positive("Experiment", period=self.period, substep=self.substep)
+        checks.count("Experiment", steps=self.steps, window=self.window)
+        n = len(self.system.physical_states)
+        checks.index("Experiment", n, outputs=self.outputs)
+        checks.same_shape("Experiment", (n,), start=self.start, start_sd=self.start_sd)
+        checks.same_shape("Experiment", (len(self.outputs),), noise=self.noise)
 
     @property
     def substeps(self) -> int:

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sim2gp import checks
 from sim2gp.ahead import ahead
 from sim2gp.descent import Moments, adam, descend
 from sim2gp.design.experiment import (
@@ -82,15 +83,19 @@ def design(
     draws: int = DRAWS,
     starts: int = STARTS,
 ) -> Designed:
-    """The best commands found. Raises E150 where none of them keeps the limits.
+    """The best commands found.
+
+    Raises `InputError` E150 where none of them keeps the limits, E148 for no draws or
+    starts.
 
     Their worth is averaged over ``draws`` of the constants, the mean being the first.
     The best of what is found from so many random motions.
     """
+    checks.count("design", draws=draws, starts=starts)
     experiment, goal, limits = jax.tree.map(jnp.asarray, (experiment, goal, limits))
     p = experiment.belief.mean.size
     search, *others = jax.random.split(key, 4)
-    informed, trials, checks = (
+    informed, trials, held_out = (
         jax.random.normal(k, (count, p))
         for k, count in zip(others, (draws, TRIALS, CHECKED), strict=True)
     )
@@ -98,12 +103,12 @@ def design(
     nothing = jnp.zeros((experiment.steps, limits.low.size))
     rough, coarse = _coarser(experiment, signal)
     improve = _climber(rough, coarse, goal, limits, informed, trials)
-    _checked.compile_for(experiment, limits, nothing, checks)
+    _checked.compile_for(experiment, limits, nothing, held_out)
     _worth.compile_for(experiment, goal, informed, nothing)
 
     def one(key: Key) -> Designed:
         U = signal.commands(improve(key).astype(float), limits)
-        U, states, bad = _kept(experiment, limits, U, checks)
+        U, states, bad = _kept(experiment, limits, U, held_out)
         worth, scale, middle = _worth(experiment, goal, informed, U)
         low, high = np.quantile(np.asarray(states), [0.05, 0.95], axis=0)
         return Designed(

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sim2gp import checks
 from sim2gp.design.limits import Limits, kept
 from sim2gp.planning.mpc import from_unit
 from sim2gp.planning.noise import coloured_noise
@@ -22,10 +23,17 @@ COLOUR = 1.0  # of free random motions: power falls as one over frequency
 
 
 class AbstractSignal(eqx.Module):
-    """A map from ``(k, m)`` coefficients in ``[-1, 1]`` to commands."""
+    """A map from ``(k, m)`` coefficients in ``[-1, 1]`` to commands.
+
+    Raises `InputError` E148 for a number that cannot be.
+    """
 
     period: float = eqx.field(static=True)
     steps: int = eqx.field(static=True)
+
+    def __check_init__(self) -> None:
+        checks.positive(type(self).__name__, period=self.period)
+        checks.count(type(self).__name__, steps=self.steps)
 
     @property
     @abstractmethod
@@ -46,6 +54,10 @@ class Multisine(AbstractSignal):
 
     tones: int = eqx.field(static=True, default=12)
     highest: float = eqx.field(static=True, default=3.0)
+
+    def __check_init__(self) -> None:
+        checks.count("Multisine", tones=self.tones)
+        checks.positive("Multisine", highest=self.highest)
 
     @property
     def coefficients(self) -> int:
@@ -74,6 +86,9 @@ class Free(AbstractSignal):
     """Straight lines between knots ``spacing`` seconds apart."""
 
     spacing: float = eqx.field(static=True, default=0.1)
+
+    def __check_init__(self) -> None:
+        checks.positive("Free", spacing=self.spacing)
 
     @property
     def coefficients(self) -> int:

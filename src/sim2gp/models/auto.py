@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from sim2gp.errors import InputError
 from sim2gp.gaussian import Gaussian
 from sim2gp.models.base import AbstractBelief, AbstractModel
 from sim2gp.models.information import Sensitivity
@@ -36,6 +37,9 @@ class AutoDraw(eqx.Module):
 class AutoBelief(AbstractBelief):
     """All beliefs, and which one speaks.
 
+    Its constants are the chosen one's, and none where some have other constants than
+    others, or have none: what a run keeps side by side has one size.
+
     scores: mean log score of each model on the episode of the last choice, nats per
         transition; zeros before any.
     seen: number of transitions that the beliefs have been fitted to.
@@ -45,6 +49,19 @@ class AutoBelief(AbstractBelief):
     index: Int[Array, ""]
     scores: Float[Array, " models"]
     seen: Int[Array, ""]
+
+    @property
+    @in_float64
+    def noise(self) -> Float[Array, " d"]:
+        return jnp.stack([b.noise for b in self.beliefs])[self.index]
+
+    @in_float64
+    def parameters(self) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
+        each = [b.parameters() for b in self.beliefs]
+        if len({mean.size for mean, _ in each}) > 1:
+            return super().parameters()
+        means, sds = (jnp.stack(x) for x in zip(*each, strict=True))
+        return means[self.index], sds[self.index]
 
     def latent(self, s: State, a: Action) -> Gaussian:
         return self._spoken([b.latent(s, a) for b in self.beliefs])
@@ -90,14 +107,15 @@ class Auto(AbstractModel):
     """Choose among ``models``, given from simple to complex, episode by episode.
 
     Every fit after the first takes the rows that are new to it as the newest episode.
-    Raises ValueError for fewer than two models.
+    Raises `InputError` E148 for fewer than two models.
     """
 
     models: tuple[AbstractModel, ...]
 
     def __init__(self, models: Sequence[AbstractModel]) -> None:
         if len(models) < 2:
-            raise ValueError(f"nothing to choose from {len(models)} model")
+            got, expected = f"{len(models)} to choose from", "two or more"
+            raise InputError("E148", "models", where="Auto", got=got, expected=expected)
         self.models = tuple(models)
 
     @in_float64
@@ -153,7 +171,7 @@ def log_scores(belief: AbstractBelief, data: Transitions) -> Float[Array, " capa
 def _log_scores(belief: AbstractBelief, data: Transitions) -> Float[Array, " capacity"]:
     def one(s: Array, a: Array, s2: Array) -> Scalar:
         predictive = belief.predict(s, a)
-        d = belief.noise.size  # type: ignore[attr-defined]
+        d = belief.noise.size
         return Gaussian(predictive.mean[:d], predictive.scale[:d]).log_prob(s2[:d])
 
     each = jax.vmap(one)(data.state, data.action, data.next_state)

@@ -5,10 +5,12 @@ stand the point estimate (certainty equivalence) and the unlearned prior mean.
 """
 
 from abc import abstractmethod
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from equinox import AbstractVar
 from jaxtyping import Array, Float
 
 from sim2gp.gaussian import Gaussian
@@ -18,7 +20,18 @@ from sim2gp.types import Action, Dynamics, Key, Scalar, State, double, in_float6
 
 
 class AbstractBelief(eqx.Module):
-    """A distribution over dynamics: what is believed after some data."""
+    """A distribution over dynamics: what is believed after some data.
+
+    ``noise`` is the sd of one step of each physical state, state units.
+    """
+
+    if TYPE_CHECKING:  # a field or a property; to mypy an abstract field is the first
+
+        @property
+        def noise(self) -> Float[Array, " d"]: ...
+
+    else:
+        noise: AbstractVar[Float[Array, " d"]]
 
     @abstractmethod
     def latent(self, s: State, a: Action) -> Gaussian:
@@ -43,6 +56,15 @@ class AbstractBelief(eqx.Module):
         find out about that finds out nothing.
         """
         return self
+
+    @in_float64
+    def parameters(self) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
+        """Virtual mean and sd of a simulator's constants; empty where there are none.
+
+        As many at every call: a run keeps them side by side.
+        """
+        nothing = jnp.zeros(0, self.noise.dtype)
+        return nothing, nothing
 
     @abstractmethod
     def sensitivity(self, s: State, a: Action) -> Sensitivity:
@@ -99,12 +121,24 @@ class AbstractModel(eqx.Module):
 
 
 class DeterministicBelief(AbstractBelief):
-    """A belief whose draws all are one function."""
+    """A belief whose draws all are one function.
+
+    Its noise and constants are those of ``belief``, whose best function that is.
+    """
 
     belief: AbstractBelief
 
+    @property
+    def noise(self) -> Float[Array, " d"]:
+        return self.belief.noise
+
+    def parameters(self) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
+        return self.belief.parameters()
+
+    @in_float64
     def latent(self, s: State, a: Action) -> Gaussian:
-        mean = self.point()(s, a)
+        s, a = (jnp.asarray(x, jnp.float32) for x in (s, a))  # a draw's precision
+        mean = self.point()(s, a).astype(self.noise.dtype)
         return Gaussian(mean, jnp.zeros((mean.size, 1), mean.dtype))
 
     def predict(self, s: State, a: Action) -> Gaussian:

@@ -7,16 +7,17 @@ input is held until the next row.
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from sim2gp import checks
 from sim2gp.errors import InputError
 from sim2gp.logs import Log
 from sim2gp.models.stretch import DELAY_BLUR
 from sim2gp.models.windows import Windows
-from sim2gp.systems.base import AbstractSystem
+from sim2gp.systems.base import AbstractSystem, index_of
 
 HALF_WIDTH = 0.025  # s, half the span of the local parabola that guesses a start
 PAST = 0.049  # s, the span of the causal one: 25 samples of 2 ms
@@ -41,8 +42,14 @@ def cut(
     A ``causal`` start knows the past alone and stands where forecasts start, 0.1 s
     into the log first: an excitation that switches on that grid makes the error of a
     filtered start depend on its phase (measured: twice the error between).
-    Raises `InputError` E116 where nothing can be cut, E103 where a state is missing.
+    Raises `InputError` E116 where nothing can be cut, E103 where a state is missing or
+    unknown, E144 for a sd or a floor that is not positive, E145 for another ``start``,
+    E148 for a length that is negative.
     """
+    checks.not_negative("cut", window=window)
+    checks.one_of("cut", get_args(Start), start=start)
+    checks.deviation("start_sd", **(start_sd or {}))
+    checks.deviation("floor", **(floor or {}))
     measured = measured_states(logs, system, every=window == 0.0)
     pieces = []
     for k, log in enumerate(logs):
@@ -175,12 +182,13 @@ def _with_stated(
     floor: Mapping[str, float] | None,
 ) -> Windows:
     """What the user states replaces what was guessed from the data."""
-    names = [channel.name for channel in system.physical_states]
+    states = system.physical_states
+    channels = [c for name in measured for c in states if c.name == name]
     sd, quantum = windows.start_sd.copy(), windows.floor.copy()
     for name, value in (start_sd or {}).items():
-        sd[:, names.index(name)] = value
+        sd[:, index_of(name, states, where="start_sd")] = value
     for name, value in (floor or {}).items():
-        quantum[measured.index(name)] = value
+        quantum[index_of(name, channels, where="floor")] = value
     return dataclasses.replace(windows, start_sd=sd, floor=quantum)
 
 

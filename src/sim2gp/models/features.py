@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from sim2gp import checks
 from sim2gp.systems.base import AbstractSystem, index_of
 from sim2gp.transitions import Transitions
 from sim2gp.types import Action, Key, State
@@ -42,8 +43,9 @@ class Encoding(eqx.Module):
         """From the channels' limits; ``reach`` gives half-widths for some by name.
 
         A channel with neither takes `REACH` of its unit, or 1. Raises `InputError`
-        E103 for an unknown name.
+        E103 for an unknown name, E148 for a half-width that is not positive.
         """
+        checks.positive("reach", **reach)
         channels = (*system.states, *system.actions)
         for name in reach:
             index_of(name, channels, where="reach")
@@ -76,6 +78,14 @@ class Encoding(eqx.Module):
         """Half the box of each physical state."""
         pairs = zip(self.low, self.high, strict=True)
         return jnp.asarray([0.5 * (high - low) for low, high in pairs])[: self.outputs]
+
+
+def check_training(
+    where: str, hidden: tuple[int, ...], *, steps: int, refit_steps: int
+) -> None:
+    """That a network has layers, and a number of steps of training (E148)."""
+    checks.count(where, hidden=hidden or math.nan)
+    checks.whole(where, steps=steps, refit_steps=refit_steps)
 
 
 class Network(eqx.Module):

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from sim2gp import checks
 from sim2gp.errors import NotFinite
 from sim2gp.gaussian import Gaussian, lower_factor
 from sim2gp.models import features, hybrid, matching, nlm
@@ -43,6 +44,8 @@ class FunctionSpace(AbstractModel):
     pretrain: steps of distillation before the first fit, three times ``steps`` unless
         given (none for ``"literal"``).
     steps, refit_steps: as in `ResidualFunctionSpace`; other options as in `NLM`.
+
+    Raises `InputError` E145 for another word, E148 for a number that cannot be.
     """
 
     sim: Sim2GP
@@ -66,13 +69,15 @@ class FunctionSpace(AbstractModel):
         refit_steps: int = 1000,
         reach: Mapping[str, float] | None = None,
     ) -> None:
-        if fs_prior not in FS_PRIORS:
-            names = ", ".join(FS_PRIORS)
-            raise ValueError(f"fs_prior is {fs_prior!r}, not one of {names}")
+        checks.one_of("FunctionSpace", FS_PRIORS, fs_prior=fs_prior)
+        checks.whole("FunctionSpace", pretrain=pretrain)
         self.sim = sim
         self.encoding = Encoding.of(sim.system, reach or {})
         self.objective = objective_of(objective)
         self.hidden = tuple(hidden)
+        features.check_training(
+            "FunctionSpace", self.hidden, steps=steps, refit_steps=refit_steps
+        )
         pretrain = 3 * steps if pretrain is None else pretrain
         self.pretrain = 0 if objective == "literal" else pretrain
         self.steps = steps
@@ -172,10 +177,8 @@ def _fit(
 
 
 def objective_of(name: str) -> Objective:
-    """The named objective; ValueError lists what there is."""
-    if name not in OBJECTIVES:
-        names = ", ".join(OBJECTIVES)
-        raise ValueError(f"objective is {name!r}, not one of {names}")
+    """The named objective (E145)."""
+    checks.one_of("matching", OBJECTIVES, objective=name)
     return OBJECTIVES[name]
 
 

@@ -13,6 +13,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from sim2gp import checks
 from sim2gp.logs import Log
 from sim2gp.models.cutting import (
     SPACING,
@@ -56,8 +57,9 @@ def evaluation_windows(
     """Windows of up to ``longest`` seconds of all logs; rows are grid samples.
 
     A window whose start rests on a masked sample is left out; a masked row is not
-    compared.
+    compared. Raises `InputError` E148 for a length that is not positive.
     """
+    checks.positive("evaluation_windows", longest=longest)
     states = [channel.name for channel in system.physical_states]
     actions = [channel.name for channel in system.actions]
     measured = measured_states(logs, system)

@@ -162,6 +162,8 @@ class NLM(AbstractModel):
     steps, refit_steps: Adam steps of the first fit and of later, warm-started ones.
     reach: half-widths of the box of states by channel name, where the channels' own
     limits do not say (`features.REACH`).
+
+    Raises `InputError` E148 for a width, a number of steps or a reach that cannot be.
     """
 
     encoding: Encoding
@@ -180,6 +182,9 @@ class NLM(AbstractModel):
     ) -> None:
         self.encoding = Encoding.of(system, reach or {})
         self.hidden = tuple(hidden)
+        features.check_training(
+            "NLM", self.hidden, steps=steps, refit_steps=refit_steps
+        )
         self.steps = steps
         self.refit_steps = refit_steps
 

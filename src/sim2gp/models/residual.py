@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from sim2gp import checks
 from sim2gp.descent import chosen
 from sim2gp.gaussian import LOG_2PI
 from sim2gp.models import features, hybrid, last_layer, nlm
@@ -37,7 +38,7 @@ class Residual(AbstractModel):
     mode: ``"seq_sum"`` adds two independent posteriors (slightly conservative: both
         may claim the same residual), ``"joint"`` is the exact posterior of constants
         and layer together, linearised at the simulator's MAP.
-    Other options as in `NLM`.
+    Other options as in `NLM`. Raises `InputError` E145 for another mode.
     """
 
     sim: Sim2GP
@@ -57,11 +58,13 @@ class Residual(AbstractModel):
         refit_steps: int = 500,
         reach: Mapping[str, float] | None = None,
     ) -> None:
-        if mode not in MODES:
-            raise ValueError(f"mode is {mode!r}, not one of {', '.join(MODES)}")
+        checks.one_of("Residual", MODES, mode=mode)
         self.sim = sim
         self.encoding = Encoding.of(sim.system, reach or {})
         self.hidden = tuple(hidden)
+        features.check_training(
+            "Residual", self.hidden, steps=steps, refit_steps=refit_steps
+        )
         self.steps = steps
         self.refit_steps = refit_steps
         self.mode = mode

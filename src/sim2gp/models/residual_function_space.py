@@ -66,6 +66,9 @@ class ResidualFunctionSpace(AbstractModel):
         self.encoding = Encoding.of(sim.system, reach or {})
         self.objective = objective_of(objective)
         self.hidden = tuple(hidden)
+        features.check_training(
+            "ResidualFunctionSpace", self.hidden, steps=steps, refit_steps=refit_steps
+        )
         self.steps = steps
         self.refit_steps = refit_steps
 

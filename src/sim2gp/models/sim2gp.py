@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from sim2gp import checks
 from sim2gp.arrowhead import Blocks, Noise
 from sim2gp.em import expectation
 from sim2gp.gaussian import LOG_2PI, Gaussian
@@ -90,6 +91,8 @@ class Sim2GP(AbstractModel):
     ``"linearized"`` (the paper's Gaussian process) or ``"nonlinear"``. A ``frozen``
     simulator takes ``prior`` as the last word on its constants, because other data or
     the same ones in another form have made it: a fit then learns the noise alone.
+    Raises `InputError` E148 for a period that is not positive, E140 for a prior of
+    another number of constants, E145 for other ``draws``.
     """
 
     system: AbstractSystem
@@ -108,10 +111,12 @@ class Sim2GP(AbstractModel):
         draws: str = "linearized",
         frozen: bool = False,
     ) -> None:
-        if draws not in ("linearized", "nonlinear"):
-            raise ValueError(f"draws is {draws!r}, not 'linearized' or 'nonlinear'")
+        checks.one_of("Sim2GP", ("linearized", "nonlinear"), draws=draws)
+        checks.positive("Sim2GP", dt=dt)
         self.system = system
         self.prior = system.parameters.prior() if prior is None else prior
+        p = len(system.parameters)
+        checks.same_shape("Sim2GP", (p,), prior=self.prior.mean)
         self.dt = dt
         self.linear = draws == "linearized"
         self.frozen = frozen

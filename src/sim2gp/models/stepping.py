@@ -312,7 +312,7 @@ def _ensemble(
     steps: tuple[int, ...],
     outputs: tuple[int, ...],
 ) -> tuple[Array, Array]:
-    noise = belief.noise.astype(jnp.float32)[None, None]  # type: ignore[attr-defined]
+    noise = belief.noise.astype(jnp.float32)[None, None]
     (W, K, _), d, at = action.shape, noise.size, np.asarray(steps) - 1
 
     def rolled(f: Dynamics, s: State, actions: Array, noises: Array) -> Array:

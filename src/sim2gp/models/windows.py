@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from sim2gp import checks
 from sim2gp.ahead import ahead
 from sim2gp.arrowhead import Blocks, Noise, eliminate
 from sim2gp.em import expectation
@@ -321,10 +322,13 @@ def fit_windows(
     is believed but for what was weighed. The descent begins at the prior's mean and
     elsewhere, or where another fit of windows like these stands, ``near`` this one's:
     that is quick, and with as many ``starts`` compiles nothing. Raises `NotConverged`,
-    `NotFinite` or `DeadParameters`.
+    `NotFinite` or `DeadParameters`, and `InputError` E148 for no starts, E140 for a
+    prior of another number of constants.
     """
+    checks.count("fit_windows", starts=starts)
     prior = system.parameters.prior() if prior is None else prior
-    p = prior.mean.size
+    p = len(system.parameters)
+    checks.same_shape("fit_windows", (p,), prior=prior.mean)
     exact = jax.tree.map(jnp.asarray, windows)
     if near is None:
         first = jnp.zeros((starts, p))

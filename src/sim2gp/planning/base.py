@@ -14,9 +14,11 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from sim2gp.types import Action, Box, Dynamics, Key, Reward, Scalar, State
+from sim2gp import checks
+from sim2gp.types import Action, Box, Dynamics, Key, Reward, Scalar, State, check_reward
 
 #: A rollout beyond this magnitude has diverged, whatever its units.
 DIVERGED = 1e10
@@ -92,10 +94,17 @@ class Observation(eqx.Module):
 
     angle: the state whose turns do not count, as (sin, cos), or None.
     scale: of every state; what a world's state carries beyond these is not seen.
+
+    Raises `InputError` E148 for a scale that is not positive, or an angle that is none
+    of the states.
     """
 
     scale: Float[Array, " n"]
     angle: int | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self) -> None:
+        checks.positive_or_infinite("Observation", scale=self.scale)
+        checks.index("Observation", np.shape(self.scale)[0], angle=self.angle)
 
     def __call__(self, s: State) -> Float[Array, " o"]:
         scaled = s[: self.scale.size] / self.scale
@@ -111,6 +120,11 @@ class Observation(eqx.Module):
         return self.scale.size + (self.angle is not None)
 
 
+def _paid(objective: AbstractObjective, *step: Any) -> Any:
+    """The reward of one step, without the carry."""
+    return objective.step(*step)[1]
+
+
 class World(eqx.Module):
     """One draw of everything a planner needs; a pytree, so a new draw is new data.
 
@@ -119,6 +133,9 @@ class World(eqx.Module):
     travel with the machine: a fast pendulum wants a short plan and restless noise, a
     slow one the opposite, and a planner built without arguments is right on both.
     So does what a policy sees of a state; None is the state as it is.
+
+    Raises `InputError` E148 for a number that cannot be; E140, E123 and E173 for a
+    function of another shape, of no real numbers, or that raises.
     """
 
     dynamics: Dynamics
@@ -132,6 +149,38 @@ class World(eqx.Module):
     planning_iterations: int = eqx.field(static=True, default=4)
     noise_colour: float = eqx.field(static=True, default=1.0)
     seen: Observation | None = None
+
+    def __check_init__(self) -> None:
+        lengths = {"horizon": self.horizon, "planning_horizon": self.planning_horizon}
+        checks.count("World", **lengths, planning_iterations=self.planning_iterations)
+        checks.whole("World", history=self.history)
+        checks.finite("World", noise_colour=self.noise_colour)
+        checks.positive_or_infinite("World", state_bound=self.state_bound)
+        self._check_functions()
+
+    def _check_functions(self) -> None:
+        """That the dynamics move a start, and the objective pays for it."""
+        s = checks.shapes(self.reset, jax.random.key(0))
+        shape = getattr(s, "shape", ())
+        if len(shape) != 1:
+            name, whose = checks.name_of(self.reset), "a number for each state"
+            got = shape if shape else f"a {type(s).__name__}"
+            raise checks.another_shape("a start", name, got, (1,), whose)
+        checks.same_shape("World", shape, state_bound=self.state_bound)
+        low, objective = self.actions.low, self.objective
+        a = jax.ShapeDtypeStruct(np.shape(low), jnp.result_type(low))
+        whose = "the state's"
+        checks.returns("a next state", self.dynamics, (s, a), shape, meaning=whose)
+        if isinstance(objective, MarkovObjective):
+            check_reward(objective.reward, s, a)
+            return
+        name = type(objective).__name__
+        carry = checks.shapes(objective.init, name=f"{name}.init")
+        paid = jax.tree_util.Partial(_paid, objective)
+        checks.returns("a reward", paid, (carry, s, a, s), (), name=f"{name}.step")
+        S, A = (jax.ShapeDtypeStruct((2, *x.shape), x.dtype) for x in (s, a))
+        many, name = (carry, S, A, S), f"{name}.along"
+        checks.returns("rewards", objective.along, many, (2,), name=name)
 
     @property
     def observe(self) -> Observation:

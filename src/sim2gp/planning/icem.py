@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sim2gp import checks
 from sim2gp.planning.base import World, masked
 from sim2gp.planning.noise import coloured_noise
 from sim2gp.planning.update import AbstractUpdate, Evaluate, Plan
@@ -30,6 +31,8 @@ class ICEM(AbstractUpdate):
     reuse: share of the elites that compete again, also in the next step.
     smoothing: weight of the old mean and sd in the new.
     decay: above 1, iteration ``i`` draws ``samples / decay^i`` (never under 2 elites).
+
+    Raises `InputError` E148 for a setting that cannot be, more elites than samples too.
     """
 
     samples: int = eqx.field(static=True, default=160)
@@ -41,6 +44,15 @@ class ICEM(AbstractUpdate):
     reuse: float = eqx.field(static=True, default=0.3)
     smoothing: float = eqx.field(static=True, default=0.1)
     decay: float = eqx.field(static=True, default=1.0)
+
+    def __check_init__(self) -> None:
+        sizes = {"samples": self.samples, "iterations": self.iterations}
+        checks.count("ICEM", **sizes, elites=self.elites)
+        checks.at_most("ICEM", "samples", elites=self.elites, samples=self.samples)
+        checks.finite("ICEM", noise_colour=self.noise_colour)
+        checks.positive("ICEM", sd=self.sd, decay=self.decay)
+        checks.positive_share("ICEM", finest=self.finest)
+        checks.share("ICEM", reuse=self.reuse, smoothing=self.smoothing)
 
     def init(self, horizon: int, size: int, dtype: jnp.dtype) -> Plan:
         mean = jnp.zeros((horizon, size), dtype)

@@ -10,6 +10,7 @@ first action. Hence plans of several lengths compete (`promising`), at no cost: 
 plan is the beginning of a long one.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,6 +19,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from sim2gp import checks
 from sim2gp.planning.base import AbstractPlanner, World, masked, rollout
 from sim2gp.planning.icem import ICEM
 from sim2gp.planning.update import AbstractUpdate, Plan
@@ -37,12 +39,18 @@ class MPC(AbstractPlanner):
 
     lengths: of the plans that compete, as shares of the horizon.
     every: steps of a plan that are executed before the next one is made.
+
+    Raises `InputError` E148 for a setting that cannot be.
     """
 
     update: AbstractUpdate = ICEM()
     horizon: int | None = eqx.field(static=True, default=None)
     lengths: tuple[float, ...] = eqx.field(static=True, default=(0.5, 0.75, 1.0))
     every: int = eqx.field(static=True, default=1)
+
+    def __check_init__(self) -> None:
+        checks.count("MPC", horizon=self.horizon, every=self.every)
+        checks.positive_share("MPC", lengths=self.lengths or math.nan)
 
     def init(self, world: World, *, key: Key) -> Underway:
         box = world.actions

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from sim2gp import checks
 from sim2gp.planning.base import World, masked
 from sim2gp.planning.noise import coloured_noise
 from sim2gp.planning.update import AbstractUpdate, Evaluate, Plan
@@ -27,6 +28,8 @@ class MPPI(AbstractUpdate):
 
     effective: the effective sample size, as a share of the valid samples.
     sd: of the coloured noise, in half-widths of the action box.
+
+    Raises `InputError` E148 for a setting that cannot be.
     """
 
     samples: int = eqx.field(static=True, default=128)
@@ -34,6 +37,12 @@ class MPPI(AbstractUpdate):
     effective: float = eqx.field(static=True, default=0.25)
     noise_colour: float | None = eqx.field(static=True, default=None)
     sd: float = eqx.field(static=True, default=0.5)
+
+    def __check_init__(self) -> None:
+        checks.count("MPPI", samples=self.samples, iterations=self.iterations)
+        checks.positive_share("MPPI", effective=self.effective)
+        checks.finite("MPPI", noise_colour=self.noise_colour)
+        checks.positive("MPPI", sd=self.sd)
 
     def init(self, horizon: int, size: int, dtype: jnp.dtype) -> Plan:
         none = jnp.zeros((0, horizon, size), dtype)

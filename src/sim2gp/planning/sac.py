@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from sim2gp import checks
 from sim2gp.descent import Moments, adam, adam_step
 from sim2gp.planning.base import AbstractPlanner, Observation, World
 from sim2gp.planning.mpc import from_unit
@@ -130,6 +131,8 @@ class SAC(AbstractPlanner):
     scattered: share of those that begin anywhere: a world, unlike a machine, can.
     discount, rate, slow: of rewards per step, of Adam, of the critics' slow copies.
     scale: of the rewards, against the entropy of the policy.
+
+    Raises `InputError` E148 for a setting that cannot be.
     """
 
     hidden: tuple[int, ...] = eqx.field(static=True, default=(64, 64))
@@ -144,6 +147,14 @@ class SAC(AbstractPlanner):
     rate: float | Scalar = 1e-3
     slow: float | Scalar = 0.02
     scale: float | Scalar = 1.0
+
+    def __check_init__(self) -> None:
+        sizes = {"worlds": self.worlds, "steps": self.steps, "updates": self.updates}
+        checks.count("SAC", **sizes, batch=self.batch, capacity=self.capacity)
+        checks.count("SAC", hidden=self.hidden)
+        shares = {"replayed": self.replayed, "scattered": self.scattered}
+        checks.share("SAC", **shares, discount=self.discount, slow=self.slow)
+        checks.not_negative("SAC", rate=self.rate, scale=self.scale)
 
     def init(self, world: World, *, key: Key) -> Learner:
         first, second, third = jax.random.split(key, 3)

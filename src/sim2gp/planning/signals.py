@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from sim2gp import checks
 from sim2gp.planning.base import AbstractPlanner, World, masked, rollout
 from sim2gp.planning.icem import ICEM
 from sim2gp.planning.mpc import from_unit
@@ -53,10 +54,14 @@ class AbstractSignal(AbstractPlanner):
 
 
 class RandomInput(AbstractSignal):
-    """Coloured noise, clipped to the box; ``sd`` in half-widths of it."""
+    """Coloured noise, clipped to the box; ``sd`` in half-widths of it (E148)."""
 
     colour: float = eqx.field(static=True, default=1.0)
     sd: float = eqx.field(static=True, default=0.5)
+
+    def __check_init__(self) -> None:
+        checks.finite("RandomInput", colour=self.colour)
+        checks.positive("RandomInput", sd=self.sd)
 
     def prepare(self, state: Tape, world: World, data: Any, *, key: Key) -> Tape:
         noise = coloured_noise(key, 1, state.signal, self.colour)[0]
@@ -67,11 +72,18 @@ class Chirp(AbstractSignal):
     """A sine whose frequency rises by the same factor each second; its phase is drawn.
 
     The inputs of a machine with several start a half-turn over their number apart.
+    Raises `InputError` E148 for a frequency or an amplitude that cannot be, E141 where
+    the lowest frequency is not below the highest.
     """
 
     lowest: float = eqx.field(static=True, default=2e-3)
     highest: float = eqx.field(static=True, default=0.1)
     amplitude: float = eqx.field(static=True, default=0.9)
+
+    def __check_init__(self) -> None:
+        checks.positive("Chirp", lowest=self.lowest, highest=self.highest)
+        checks.bounds("frequencies of Chirp", self.lowest, self.highest)
+        checks.positive_share("Chirp", amplitude=self.amplitude)
 
     def prepare(self, state: Tape, world: World, data: Any, *, key: Key) -> Tape:
         T, m = state.signal.shape
@@ -87,12 +99,16 @@ class Chirp(AbstractSignal):
 class Multisine(AbstractSignal):
     """A sum of sines, amplitudes and phases chosen by what the world says they earn.
 
-    tones: how many, evenly spaced up to ``highest``.
+    tones: how many, evenly spaced up to ``highest`` (E148).
     """
 
     tones: int = eqx.field(static=True, default=8)
     highest: float = eqx.field(static=True, default=0.06)
     update: AbstractUpdate = ICEM(samples=64, iterations=16, elites=8, noise_colour=0.0)
+
+    def __check_init__(self) -> None:
+        checks.count("Multisine", tones=self.tones)
+        checks.positive("Multisine", highest=self.highest)
 
     def prepare(self, state: Tape, world: World, data: Any, *, key: Key) -> Tape:
         return _optimised(self, state, world, key)

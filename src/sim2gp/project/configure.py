@@ -17,8 +17,8 @@ from sim2gp.project.priors import located, prior
 from sim2gp.project.schema import ParameterSpec, ProjectSpec
 from sim2gp.project.source import Source
 from sim2gp.systems import AbstractSystem, configured
-from sim2gp.systems.base import names_of
 from sim2gp.systems.configured import with_weighed
+from sim2gp.systems.written import names_of
 from sim2gp.weighed import Weighed
 
 

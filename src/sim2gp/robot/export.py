@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sim2gp import checks
 from sim2gp.errors import InputError
 from sim2gp.gaussian import Gaussian
 from sim2gp.models import AbstractBelief
@@ -84,8 +85,11 @@ def export_model(
     in float32, for `jax.export.deserialize`; whether another version of JAX reads it is
     JAX's word.
     Raises `InputError` E134 where the belief has no constants, E135 where writing
-    compiled code needs what is not installed.
+    compiled code needs what is not installed, E148 for a period or a number of draws
+    that cannot be.
     """
+    checks.positive("export_model", dt=dt)
+    checks.count("export_model", draws=draws)
     known = getattr(belief, "posterior", None)
     if known is None or known.mean.size != len(system.parameters):
         raise InputError(

@@ -185,7 +185,7 @@ def each_episode(sink: Sink, name: str = "") -> Callable[[Any], None]:
         found = {"return": float(flown.reward.sum())}
         found["failed_plans"] = float(flown.failed.sum())
         table = getattr(getattr(belief, "system", None), "parameters", ())
-        if table and hasattr(belief, "parameters"):
+        if table:
             at = in_float64(lambda: table.constrain(belief.parameters()[0]))()
             names = (f"constants/{name}" for name in table.names)
             found |= dict(zip(names, at.tolist(), strict=True))

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from equinox import AbstractVar
 from jaxtyping import Array, Float
 
+from sim2gp import checks
 from sim2gp.errors import InputError
 from sim2gp.parameters import Parameter, Parameters
 from sim2gp.systems.base import AbstractSystem, Channel, delayed_means
@@ -49,6 +50,9 @@ class AbstractInputPath(AbstractSystem):
 
     system: AbstractVar[AbstractSystem]
     past: AbstractVar[int]
+
+    def check_functions(self) -> None:
+        """The machine inside has checked its own."""
 
     @property
     def states(self) -> tuple[Channel, ...]:
@@ -91,7 +95,8 @@ class Actuated(AbstractInputPath):
     ``delay_max`` seconds of past actions of ``period`` seconds are carried in the
     state, as channels ``voltage[-1]``, ``voltage[-2]``, ...; without it the delay is
     left to the caller of `flow` (the likelihood over windows). Raises `InputError` E145
-    for an unknown name, E141 for a delay that can be negative.
+    for an unknown name, E141 for a delay that can be negative or has no end, E148 for a
+    period that is not positive or a negative ``delay_max``.
     """
 
     system: AbstractSystem
@@ -109,6 +114,8 @@ class Actuated(AbstractInputPath):
     ) -> None:
         if isinstance(system, Actuated):
             raise InputError("E145", "system is actuated already")
+        checks.not_negative("Actuated", delay_max=delay_max)
+        checks.positive("Actuated", period=period)
         table = system.parameters.merge(_neutral(system.actions))
         if parameters is not None:
             table = _same_names(table, parameters)
@@ -116,13 +123,13 @@ class Actuated(AbstractInputPath):
         self.parameters = table.replace(**dict(actuators or {}))
         self.past = math.ceil(delay_max / period - 1e-9)
         for channel in system.actions:
-            low, _ = self._delay_range(channel)
-            if low < 0.0:
+            low, high = self._delay_range(channel)
+            if low < 0.0 or high == math.inf:
                 raise InputError(
                     "E141",
                     f"{channel.name}.delay",
-                    got=f"down to {low:g} s",
-                    expected="a delay of zero or more",
+                    got=f"from {low:g} to {high:g} s",
+                    expected="a delay of zero or more, with an end",
                     fix="give it a box [0, high]",
                 )
 

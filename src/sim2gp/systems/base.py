@@ -23,9 +23,11 @@ import jax.numpy as jnp
 from equinox import AbstractVar
 from jaxtyping import Array, Float
 
+from sim2gp import checks
 from sim2gp.configurations import Which
 from sim2gp.errors import InputError, nearest
 from sim2gp.parameters import Parameter, Parameters, parameters_of, unknown_parameter
+from sim2gp.systems.written import check_mechanism, check_returns, names_of
 from sim2gp.types import Action, Scalar, State
 
 #: Of RK4 inside the windows that logs are cut into, s.
@@ -39,6 +41,7 @@ class Channel:
     """One state or input: its name, unit, whether it is an angle, and its limits.
 
     The limits are the machine's, in the channel's unit; a system never enforces them.
+    Raises `InputError` E141 for limits that are reversed or NaN.
     """
 
     name: str
@@ -47,6 +50,10 @@ class Channel:
     low: float = -math.inf
     high: float = math.inf
 
+    def __post_init__(self) -> None:
+        where = f"limits of {self.name}"
+        checks.bounds(where, self.low, self.high, unbounded=True, empty=True)
+
 
 class AbstractSystem(eqx.Module):
     """A machine: how it flows under a constant input, and its one-step map ``step``.
@@ -54,9 +61,15 @@ class AbstractSystem(eqx.Module):
     ``states`` name what `step` carries: the physical states that `flow` takes on, then,
     newest first, ``history`` past actions (none but for delayed inputs).
     All fields are static: a system is not data, its ``params`` are.
+
+    Constructing one traces what its author wrote, once: E140, E123 or E173 for a
+    function of another shape, of no real numbers, or that raises.
     """
 
     parameters: AbstractVar[Parameters]
+
+    def __check_init__(self) -> None:
+        self.check_functions()
 
     @property
     @abc.abstractmethod
@@ -113,6 +126,14 @@ class AbstractSystem(eqx.Module):
     def physical_states(self) -> tuple[Channel, ...]:
         """The states that `flow` takes on, without the carried past actions."""
         return self.states[: len(self.states) - self.history * len(self.actions)]
+
+    def check_functions(self) -> None:
+        """That `flow` moves a state (E140, E123, E173).
+
+        A system whose author wrote something else than `flow` checks that instead.
+        """
+        name = f"{type(self).__name__}.flow"
+        check_returns(self, "a next state", self.flow, 0.01, name=name)
 
     def nominal(self) -> Any:
         """The record of published constants; a prior median where there is none."""
@@ -171,6 +192,9 @@ class Bound(eqx.Module):
     params: Any
     dt: float = eqx.field(static=True)
 
+    def __check_init__(self) -> None:
+        checks.positive("a step of a system", dt=self.dt)
+
     def __call__(self, s: State, a: Action) -> State:
         return self.system.step(self.params, s, a, self.dt)
 
@@ -208,6 +232,11 @@ class AbstractODE(AbstractPlant):
     def ode(self, params: Any, s: State, a: Action) -> State:
         """Time derivative of the physical state under a constant input, per second."""
 
+    def check_functions(self) -> None:
+        """That `ode` has a derivative of each state: RK4 would broadcast a number."""
+        name = f"{type(self).__name__}.ode"
+        check_returns(self, "a derivative", self.ode, name=name)
+
     def flow(self, params: Any, s: State, a: Action, h: float | Scalar) -> State:
         return rk4(lambda x, u: self.ode(params, x, u), s, a, h)
 
@@ -220,6 +249,10 @@ class AbstractMechanism(AbstractODE):
     """
 
     locked: AbstractVar[tuple[bool, bool]]
+
+    def check_functions(self) -> None:
+        """That inertia and forces are those of two joints."""
+        check_mechanism(self)
 
     @abc.abstractmethod
     def inertia(self, params: Any, q: Float[Array, " 2"]) -> Inertia:
@@ -329,20 +362,6 @@ def table_of(parameters: Parameters | Sequence[Parameter]) -> Parameters:
     if isinstance(parameters, Parameters):
         return parameters
     return Parameters(tuple(parameters))
-
-
-def names_of(table: Parameters) -> tuple[str, ...]:
-    """Names of all constants, those that are learned and then those that are fixed."""
-    return *table.names, *(name for name, _ in table.fixed)
-
-
-def named_once(table: Parameters, *channels: Sequence[Channel]) -> None:
-    """Every constant, state and input has a name of its own (E145)."""
-    names = [*names_of(table), *(c.name for group in channels for c in group)]
-    for name in names:
-        if names.count(name) > 1:
-            fix = "give each constant, state and input a name of its own"
-            raise InputError("E145", "a name given twice", got=name, fix=fix)
 
 
 def index_of(name: str, channels: Sequence[Channel], *, where: str = "") -> int:

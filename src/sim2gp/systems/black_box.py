@@ -18,11 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sim2gp import checks
 from sim2gp.errors import InputError
 from sim2gp.parameters import Parameter, Parameters
 from sim2gp.systems.actuator import LONGEST_MEAN
-from sim2gp.systems.base import AbstractPlant, Channel, named_once, names_of, table_of
+from sim2gp.systems.base import AbstractPlant, Channel, table_of
 from sim2gp.systems.external import AbstractSimulator, Differences, flow, untouched
+from sim2gp.systems.written import named_once, names_of
 from sim2gp.types import Action, Scalar, State
 
 Step = Callable[[dict[str, Any], np.ndarray, np.ndarray, Any], Any]
@@ -71,25 +73,16 @@ class Called(AbstractSimulator):
             said = self.step(dict(zip(self.names, theta.T, strict=True)), s, a, h)
             found = np.asarray(said)
         except Exception as error:
-            raise InputError(
-                "E173",
-                "the step function raised",
-                where=name_of(self.step),
-                got=f"{type(error).__name__}: {error}",
-                fix="return NaN for states that the simulator cannot follow",
-            ) from error
+            fix = "return NaN for states that the simulator cannot follow"
+            name = checks.name_of(self.step)
+            raise checks.raised("the step function", name, error, fix) from error
+        name = checks.name_of(self.step)
         if found.dtype.kind not in "fiu":
-            got, expected = f"{type(said).__name__} of {found.dtype}", "real numbers"
-            where = name_of(self.step)
-            raise InputError("E123", "a step", where=where, got=got, expected=expected)
+            got = f"{type(said).__name__} of {found.dtype}"
+            raise checks.no_real_numbers("a step", name, got)
         if found.shape != shape:
-            raise InputError(
-                "E140",
-                "a step",
-                where=name_of(self.step),
-                got=f"shape {found.shape}",
-                expected=f"shape {shape}, the state's",
-            )
+            meaning = "the state's"
+            raise checks.another_shape("a step", name, found.shape, shape, meaning)
         return found
 
 
@@ -103,8 +96,9 @@ class BlackBox(AbstractPlant):
     of an integrator at each call. What computes in single precision is differenced
     coarsely; its slopes are good to a thousandth.
 
-    Raises `InputError` E145 for names that are there twice, and, from two calls at rest
-    with nominal constants, E140, E123 and E173, the last one too where the two differ.
+    Raises `InputError` E145 for names that are there twice, E148 for a substep that is
+    not positive, and, from two calls at rest with nominal constants, E140, E123 and
+    E173, the last one too where the two differ.
     """
 
     engine: Called = eqx.field(static=True)
@@ -127,6 +121,7 @@ class BlackBox(AbstractPlant):
         self.channels, self.inputs = tuple(states), tuple(actions)
         self.longest = max_substep
         named_once(table, self.channels, self.inputs)
+        checks.positive_or_infinite("BlackBox", max_substep=max_substep)
         self.engine = Called(step, table, batched)
         if self._first().dtype in (np.float16, np.float32):
             self.engine.differences = replace(
@@ -146,12 +141,15 @@ class BlackBox(AbstractPlant):
             raise InputError(
                 "E173",
                 "a simulator that answers differently each time",
-                where=name_of(self.engine.step),
+                where=checks.name_of(self.engine.step),
                 got=f"{one.tolist()}, then {two.tolist()}",
                 expected="a function of its arguments",
                 fix="fix its random seed, and reset what it remembers at each call",
             )
         return one
+
+    def check_functions(self) -> None:
+        """The function has been called, which says more than a trace."""
 
     @property
     def states(self) -> tuple[Channel, ...]:
@@ -179,8 +177,3 @@ class BlackBox(AbstractPlant):
         theta = params.astype(s.dtype)
         span = jnp.asarray(h, s.dtype)
         return flow(self.engine, theta, s, a.astype(s.dtype), span)
-
-
-def name_of(step: Step) -> str:
-    """What the user calls it."""
-    return getattr(step, "__qualname__", type(step).__name__)

@@ -22,6 +22,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sim2gp import checks
 from sim2gp.parameters import Parameters, bounded, log_bounded
 from sim2gp.systems.base import (
     AbstractMechanism,
@@ -98,6 +99,12 @@ class CartPole(AbstractMechanism):
         gravity: float = 9.81,
         locked: tuple[bool, bool] = (False, False),
     ) -> None:
+        sizes = {"pinion_radius": pinion_radius, "gear_ratio": gear_ratio}
+        checks.positive("CartPole", motor_resistance=motor_resistance, **sizes)
+        checks.not_negative("CartPole", motor_inertia=motor_inertia)
+        shares = {"motor_efficiency": motor_efficiency}
+        checks.positive_share("CartPole", **shares, gear_efficiency=gear_efficiency)
+        checks.finite("CartPole", gravity=gravity)
         self.parameters = table_for(CartPoleParams, parameters)
         self.motor_resistance = motor_resistance
         self.motor_inertia = motor_inertia

@@ -21,7 +21,8 @@ from sim2gp.configurations import AT, Configuration, index_of
 from sim2gp.errors import InputError
 from sim2gp.gaussian import Gaussian
 from sim2gp.parameters import Parameter, Parameters, unknown_parameter
-from sim2gp.systems.base import AbstractSystem, Channel, names_of
+from sim2gp.systems.base import AbstractSystem, Channel
+from sim2gp.systems.written import names_of
 from sim2gp.types import Action, Scalar, State, in_float64
 from sim2gp.weighed import Weighed
 
@@ -34,6 +35,9 @@ class Configured(AbstractSystem):
 
     def __init__(self, system: AbstractSystem, parameters: Parameters) -> None:
         self.system, self.parameters = system, parameters
+
+    def check_functions(self) -> None:
+        """The machine inside has checked its own."""
 
     @property
     def states(self) -> tuple[Channel, ...]:

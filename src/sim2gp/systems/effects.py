@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from equinox import AbstractClassVar, AbstractVar
 from jaxtyping import Array, Float
 
+from sim2gp import checks
 from sim2gp.errors import InputError
 from sim2gp.parameters import Parameter
 from sim2gp.systems.base import (
@@ -44,7 +45,8 @@ class AbstractEffect(eqx.Module):
     """One missing piece of physics, on the channel ``where``, of one ``magnitude``.
 
     ``what`` names the effect, ``unit`` its magnitude's unit (``{}`` stands for the
-    channel's own), ``max_substep`` the RK4 substep it needs in seconds.
+    channel's own), ``max_substep`` the RK4 substep it needs in seconds. Raises E148 for
+    a magnitude that is not finite, a width or so that is not positive.
     """
 
     where: AbstractVar[str]
@@ -52,6 +54,9 @@ class AbstractEffect(eqx.Module):
     what: AbstractClassVar[str]
     meaning: AbstractClassVar[str]
     max_substep: AbstractClassVar[float]
+
+    def __check_init__(self) -> None:
+        checks.finite(type(self).__name__, magnitude=self.magnitude)
 
     @abc.abstractmethod
     def unit(self, system: AbstractMechanism) -> str:
@@ -141,6 +146,9 @@ class Coulomb(AbstractForce):
     meaning: ClassVar[str] = "dry friction"
     max_substep: ClassVar[float] = COULOMB_SUBSTEP
 
+    def __check_init__(self) -> None:
+        checks.positive("Coulomb", width=self.width)
+
     def unit(self, system: AbstractMechanism) -> str:
         return _force_unit(system, self.where)
 
@@ -160,6 +168,9 @@ class RailFriction(AbstractForce):
     what: ClassVar[str] = "rail_friction"
     meaning: ClassVar[str] = "friction coefficient of the rail"
     max_substep: ClassVar[float] = COULOMB_SUBSTEP
+
+    def __check_init__(self) -> None:
+        checks.positive("RailFriction", width=self.width)
 
     def unit(self, system: AbstractMechanism) -> str:
         only_on(self, system, {CartPole: "x"})
@@ -186,6 +197,9 @@ class Stribeck(AbstractForce):
     what: ClassVar[str] = "stribeck"
     meaning: ClassVar[str] = "friction that falls from rest to motion"
     max_substep: ClassVar[float] = COULOMB_SUBSTEP
+
+    def __check_init__(self) -> None:
+        checks.positive("Stribeck", width=self.width, speed=self.speed)
 
     def unit(self, system: AbstractMechanism) -> str:
         return _force_unit(system, self.where)
@@ -362,6 +376,9 @@ class DeadZone(AbstractInputEffect):
     what: ClassVar[str] = "dead_zone"
     meaning: ClassVar[str] = "dead zone of the input"
     max_substep: ClassVar[float] = _SUBSTEP
+
+    def __check_init__(self) -> None:
+        checks.positive("DeadZone", smoothing=self.smoothing)
 
     def through(self, x: Scalar, u: Scalar) -> Scalar:
         return dead_zone(u, x, self.smoothing)

@@ -10,8 +10,10 @@ from typing import Any
 
 import equinox as eqx
 
+from sim2gp import checks
 from sim2gp.parameters import Parameter, Parameters
-from sim2gp.systems.base import AbstractODE, Channel, named_once, names_of, table_of
+from sim2gp.systems.base import AbstractODE, Channel, table_of
+from sim2gp.systems.written import check_returns, named_once, names_of
 from sim2gp.types import Action, Scalar, State
 
 Constants = dict[str, Scalar]
@@ -22,8 +24,11 @@ class ODE(AbstractODE):
 
     It is written for one point: ``params`` are the constants by name, ``s`` the states,
     ``a`` the inputs, and what comes back is the time derivative of ``s``, per second.
-    ``max_substep`` (s) is the longest step of RK4 within a period. Raises `InputError`
-    E145 for a name that is there twice.
+    ``max_substep`` (s) is the longest step of RK4 within a period.
+
+    Raises `InputError` E145 for a name that is there twice, E148 for a substep that is
+    not positive, and, from one trace of the function, E140 for a derivative of another
+    shape than the state's, E123 for one of no real numbers, E173 where it raises.
     """
 
     function: Callable[[Constants, State, Action], State] = eqx.field(static=True)
@@ -46,6 +51,12 @@ class ODE(AbstractODE):
         self.channels, self.inputs = tuple(states), tuple(actions)
         self.longest = max_substep
         named_once(self.parameters, self.channels, self.inputs)
+        checks.positive_or_infinite("ODE", max_substep=max_substep)
+
+    def check_functions(self) -> None:
+        """The user's function itself, under the user's name for it."""
+        name = checks.name_of(self.function)
+        check_returns(self, "a derivative", self.function, name=name)
 
     @property
     def states(self) -> tuple[Channel, ...]:

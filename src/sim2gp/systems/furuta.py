@@ -25,6 +25,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sim2gp import checks
 from sim2gp.parameters import Parameters, bounded, log_bounded
 from sim2gp.systems.base import (
     AbstractMechanism,
@@ -96,6 +97,7 @@ class Furuta(AbstractMechanism):
         locked: tuple[bool, bool] = (False, False),
     ) -> None:
         self.parameters = table_for(FurutaParams, parameters)
+        checks.finite("Furuta", gravity=gravity)
         self.gravity = gravity
         self.locked = locked
 

@@ -18,6 +18,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sim2gp import checks
 from sim2gp.errors import InputError
 from sim2gp.parameters import Parameter, Parameters
 from sim2gp.systems.actuator import AbstractInputPath
@@ -40,7 +41,8 @@ class Lagged(AbstractInputPath):
     ``lag`` is the time constant: a number of seconds, or a `Parameter`, of the constant
     ``<where>.lag``. Past actions of ``period`` seconds are carried in the state for
     five times the longest lag. Raises `InputError` E103 for an unknown input, E141 for
-    a lag that can be zero or unbounded, E145 for a machine with delays of its own.
+    a lag that can be zero or unbounded, E145 for a machine with delays of its own, E148
+    for a period that is not positive.
     """
 
     system: AbstractSystem
@@ -57,6 +59,7 @@ class Lagged(AbstractInputPath):
         period: float = 0.02,
     ) -> None:
         index_of(where, system.actions)
+        checks.positive("Lagged", period=period)
         if system.history or system.longest_delay:
             raise InputError("E145", "lag of an input that is delayed", where=where)
         free = isinstance(lag, Parameter)

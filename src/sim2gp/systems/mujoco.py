@@ -94,6 +94,9 @@ class MuJoCo(AbstractPlant):
         self.engine = Engine(model, groups, self.parameters)
         self.mjx = MJXEngine(model, groups) if engine == "mjx" else None
 
+    def check_functions(self) -> None:
+        """The engine is no function of the user's."""
+
     @property
     def states(self) -> tuple[Channel, ...]:
         return self.channels

@@ -11,8 +11,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 
+from sim2gp import checks
 from sim2gp.errors import InputError, nearest
 from sim2gp.parameters import Parameters
 from sim2gp.systems.actuator import Actuated
@@ -29,17 +31,21 @@ from sim2gp.systems.effects import (
     RodInertia,
     Spring,
 )
-from sim2gp.types import Action, Scalar
+from sim2gp.systems.written import check_returns
+from sim2gp.types import Action, Scalar, State
 
 STRENGTHS = ("mild", "middle", "strong")
 
 
 @dataclasses.dataclass(frozen=True)
 class InputDelay:
-    """A delay of an input by ``magnitude`` seconds, for `perturb`."""
+    """A delay of an input by ``magnitude`` seconds, for `perturb` (E148)."""
 
     where: str
     magnitude: float
+
+    def __post_init__(self) -> None:
+        checks.not_negative("InputDelay", magnitude=self.magnitude)
 
 
 class PerturbedParams(eqx.Module):
@@ -54,7 +60,8 @@ class Perturbed(AbstractMechanism):
 
     The magnitudes are fixed constants of the table; ``free=True`` makes them free, with
     no effect in the prior mean. Raises `InputError` E103 for an unknown channel, E145
-    for two effects of one name.
+    for two effects of one name, E140, E123 or E173 for an effect whose functions have
+    another shape, are no real numbers, or raise.
     """
 
     system: AbstractMechanism
@@ -92,6 +99,18 @@ class Perturbed(AbstractMechanism):
         self.parameters = table
         self.locked = bare.locked
 
+    def check_functions(self) -> None:
+        """Each effect's: a force on the wrong joints would pass for one on both."""
+        for effect in self.effects:
+            for what, f, size in (
+                ("input", _input, len(self.actions)),
+                ("inertia", _inertia, 3),
+                ("force", _force, 2),
+            ):
+                name = f"{type(effect).__name__}.{what}"
+                function = jax.tree_util.Partial(f, self.system, effect)
+                check_returns(self, what, function, name=name, size=size)
+
     @property
     def states(self) -> tuple[Channel, ...]:
         return self.system.states
@@ -128,6 +147,29 @@ class Perturbed(AbstractMechanism):
         for effect, x in pairs:
             f = f + effect.force(self.system, params.system, x, q, v)
         return f
+
+
+def _input(
+    system: AbstractMechanism, effect: AbstractEffect, params: Any, s: State, a: Action
+) -> Any:
+    """`AbstractEffect.input` of a whole state, at the effect's magnitude of one."""
+    return effect.input(system, jnp.ones((), s.dtype), a)
+
+
+def _inertia(
+    system: AbstractMechanism, effect: AbstractEffect, params: Any, s: State, a: Action
+) -> Any:
+    """`AbstractEffect.inertia`, likewise, as one array."""
+    one = jnp.ones((), s.dtype)
+    return jnp.stack(effect.inertia(system, params.system, one, s[:2]))
+
+
+def _force(
+    system: AbstractMechanism, effect: AbstractEffect, params: Any, s: State, a: Action
+) -> Any:
+    """`AbstractEffect.force`, likewise."""
+    one = jnp.ones((), s.dtype)
+    return effect.force(system, params.system, one, s[:2], s[2:4])
 
 
 def perturb(

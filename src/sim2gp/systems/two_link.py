@@ -23,6 +23,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sim2gp import checks
 from sim2gp.parameters import Parameters, bounded, log_bounded
 from sim2gp.systems.base import (
     AbstractMechanism,
@@ -121,6 +122,11 @@ class TwoLink(AbstractMechanism):
         coulomb_shape: Literal["tanh", "arctangent"] = "tanh",
         locked: tuple[bool, bool] = (False, False),
     ) -> None:
+        checks.finite("TwoLink", gravity=gravity)
+        sizes = {"length1": length1, "coulomb_width": coulomb_width}
+        checks.positive("TwoLink", **sizes, gear_ratio=gear_ratio)
+        shapes = "tanh", "arctangent"
+        checks.one_of("TwoLink", shapes, coulomb_shape=coulomb_shape)
         self.parameters = table_for(TwoLinkParams, parameters)
         self.gravity = gravity
         self.length1 = length1
