@@ -175,7 +175,9 @@ def _document(rng, pick, tricks: list[str], kind: str, value: str) -> Hostile:
     text = f"<mujoco>{_noise(rng, pick, tricks)}{compiler}{_element(kind, attributes)}"
     if rng.random() < 0.25 and kind != "include":
         tricks.append("in a part")
-        up = pick("sub/part.xml", "./sub/part.xml", "sub//part.xml", "sub&#x2f;part.xml")
+        up = pick(
+            "sub/part.xml", "./sub/part.xml", "sub//part.xml", "sub&#x2f;part.xml"
+        )
         main = f"<mujoco><{pick('include', 'INCLUDE')} file='{up}'/></mujoco>"
         return _written(rng, pick, tricks, main, text, ".xml")
     return _written(rng, pick, tricks, text, None, ".xml")

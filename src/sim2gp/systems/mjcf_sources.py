@@ -7,7 +7,8 @@ the names that it asks for; it opens no file itself (`sim2gp.systems.mjcf_child`
 
 Where the compiler looks: a part in the main file's folder, then in that of the part
 that includes it; meshes, heights and skins in the `compiler`'s `meshdir`, textures in
-its `texturedir`, without folders where `strippath` is true, as it is in a URDF.
+its `texturedir`, then in the folder of the part that names them; by the last part of
+the name where `strippath` is true, as it is in a URDF.
 """
 
 import os
@@ -53,7 +54,7 @@ def read_sources(path: Path, root: Path | None) -> Sources:
     reader = _Reader(path, root)
     main = reader.read(os.path.realpath(path), path, "")
     reader.sources.main = main
-    reader.model(_Document(path, main, "", ""))
+    reader.model(_Document(path, main, ""))
     return reader.sources
 
 
@@ -69,7 +70,7 @@ class _Document:
     path: Path
     data: bytes
     base: str  # of its model, from the main file's folder
-    prefix: str  # of this part, from its model's folder
+    prefix: str | None = None  # of a part, from its model's folder
     root: Any = None
 
     def __post_init__(self) -> None:
@@ -124,7 +125,7 @@ class _Reader:
                 scope.state(element)
             for name, value in element.attrib.items():
                 if bare(name) in _DIRECTORIES:
-                    self._check(document, element, kind, document.base, value)
+                    self._check(document, element, bare(name), value)
                 elif kind == "include" and bare(name) == "file":
                     self._include(document, element, value, scope, seen)
                 elif _is_path(kind, bare(name), value):
@@ -138,8 +139,8 @@ class _Reader:
         scope: _Scope,
         seen: set[str],
     ) -> None:
-        names = [_joined(prefix, name) for prefix in ("", document.prefix)]
-        found = self._found(document, element, "include", document.base, names)
+        names = [_joined(prefix or "", name) for prefix in ("", document.prefix)]
+        found = self._found(document, element, "include", names)
         if found is None:
             raise self._missing(document, element, name)
         part, data = found
@@ -150,7 +151,9 @@ class _Reader:
             prefix = os.path.dirname(part)
             self._walk(self._text(file, data, document.base, prefix), scope, seen)
 
-    def _text(self, file: str, data: bytes, base: str, prefix: str) -> _Document:
+    def _text(
+        self, file: str, data: bytes, base: str, prefix: str | None = None
+    ) -> _Document:
         self._parts += 1
         if self._parts > _PARTS:
             raise self._too_much(f"more than {_PARTS} files of text")
@@ -163,16 +166,12 @@ class _Reader:
         base, folder = document.base, scope.directories.get(_BY_KIND.get(kind, ""), "")
         if scope.urdf:
             name = name.removeprefix("package://")
-        prefixes = dict.fromkeys(("", document.prefix))
-        for prefix in prefixes:
-            stated = _joined(folder, _joined(prefix, name))
-            self._check(document, element, kind, base, stated)
-        if not name:
-            return
         strip = scope.strippath and kind in _BY_KIND
         asked = _last(name) if strip else name
-        names = [_joined(folder, _joined(prefix, asked)) for prefix in prefixes]
-        found = self._found(document, element, kind, base, names)
+        if not name:
+            return
+        ways = _ways(folder, document.prefix, asked)
+        found = self._found(document, element, kind, ways[:2])
         if found is None:
             if (scope.urdf and _unread(element)) or (kind == "config" and _plain(name)):
                 return
@@ -181,19 +180,18 @@ class _Reader:
         if kind in ("flexcomp", "model"):
             self._keep_text(document, element, first, data)
         if kind != "model":
-            self._keep_asset(document, element, base, names, data)
+            self._keep_asset(document, element, base, ways, data)
         if kind == "model":
             file = os.path.realpath(self._place(base, first))
-            self.model(self._text(file, data, _joined(base, os.path.dirname(first)), ""))
+            self.model(self._text(file, data, _joined(base, os.path.dirname(first))))
 
     def _found(
-        self, document: _Document, element: Any, kind: str, base: str, names: list[str]
+        self, document: _Document, element: Any, kind: str, names: list[str]
     ) -> tuple[str, bytes] | None:
-        """The first name that is a file's, and its bytes."""
+        """The first name that is a file's, and its bytes; none before it is outside."""
         for name in names:
-            self._check(document, element, kind, base, name)
-        for name in names:
-            file = os.path.realpath(self._place(base, name))
+            self._check(document, element, kind, name)
+            file = os.path.realpath(self._place(document.base, name))
             if os.path.isfile(file):
                 return name, self.read(file, Path(file), str(self.main))
         return None
@@ -202,16 +200,14 @@ class _Reader:
         # As MuJoCo does, `..` takes away a name before links are followed.
         return os.path.normpath(os.path.join(self.home, _joined(base, name)))
 
-    def _check(
-        self, document: _Document, element: Any, kind: str, base: str, name: str
-    ) -> None:
+    def _check(self, document: _Document, element: Any, kind: str, name: str) -> None:
         """A name leads below the root, links followed before `..` or after (E171)."""
-        path = _joined(base, name)
+        path = _joined(document.base, name)
         odd = _ODD.search(path) is not None
-        ways = [os.path.join(self.home, path), self._place(base, name)]
+        ways = [os.path.join(self.home, path), self._place(document.base, name)]
         root = self.home if self.root is None else str(self.root)
         anywhere = self.root is None and not odd
-        if anywhere or not odd and all(is_inside(way, root) for way in ways):
+        if anywhere or (not odd and all(is_inside(way, root) for way in ways)):
             return
         raise InputError(
             "E171",
@@ -234,18 +230,16 @@ class _Reader:
         document: _Document,
         element: Any,
         base: str,
-        names: list[str],
+        ways: list[str],
         data: bytes,
     ) -> None:
         """Under every name that MuJoCo may ask for: without one it takes another."""
-        for name in names:
+        for name in ways:
             key = os.path.normpath(_joined(base, name))
             self._keep(document, element, f"asset/{key}", data)
             self.sources.assets[key] = data
 
-    def _keep(
-        self, document: _Document, element: Any, name: str, data: bytes
-    ) -> None:
+    def _keep(self, document: _Document, element: Any, name: str, data: bytes) -> None:
         """One name is one file: MuJoCo would take either (E172)."""
         if self._names.setdefault(name.lower(), data) != data:
             raise InputError(
@@ -288,6 +282,14 @@ class _Reader:
 
     def _too_much(self, got: str) -> InputError:
         return InputError("E170", "a large model", where=str(self.main), got=got)
+
+
+def _ways(folder: str, prefix: str | None, name: str) -> list[str]:
+    """Where MuJoCo looks for an asset, in this order; the last if it has no disk."""
+    if prefix is None:
+        return [_joined(folder, name)]
+    local = _joined(prefix, name)
+    return [_joined(folder, name), local, _joined(folder, local)]
 
 
 def _is_path(kind: str, name: str, value: str) -> bool:

@@ -62,9 +62,9 @@ def parsed(data: bytes, where: str) -> Any:
         root = etree.fromstring(data, parser)
     except etree.XMLSyntaxError as error:
         raise _refused(where, str(error.msg)) from None
-    for error in parser.error_log:
-        if error.type_name not in _HARMLESS:
-            raise _refused(f"{where}:line {error.line}", error.message)
+    for entry in parser.error_log:
+        if entry.type_name not in _HARMLESS:
+            raise _refused(f"{where}:line {entry.line}", entry.message)
     if root is None or len(parser.error_log) >= _REPORTED:
         raise _refused(where, "too many errors")
     if root.getroottree().docinfo.internalDTD is not None:
@@ -96,6 +96,8 @@ def place(element: Any, data: bytes, where: str) -> str:
 
 def _check(root: Any, data: bytes, where: str, etree: Any) -> None:
     for each in root.getroottree().xpath("//processing-instruction()"):
+        if each.target == "xml":  # a declaration, after blank lines
+            continue
         got = f"the instruction <?{each.target} ...?>"
         raise _refused(f"{where}:line {each.sourceline}", got)
     for each in elements(root):
