@@ -181,7 +181,7 @@ class _Reader:
             self._keep_text(document, element, first, data)
         if kind != "model":
             self._keep_asset(document, element, base, ways, data)
-        if kind == "model":
+        else:
             file = os.path.realpath(self._place(base, first))
             self.model(self._text(file, data, _joined(base, os.path.dirname(first))))
 
