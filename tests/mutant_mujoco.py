@@ -285,7 +285,7 @@ ON_THE_HOST = (
         SOURCES,
         "return [_joined(folder, name), local, _joined(folder, local)]",
         "return [_joined(folder, name), local]",
-        ("test_mujoco_sources.py", "found_where"),
+        ("test_mujoco_sources.py", "every_name"),
     ),
     Mutant(
         "mjcf sources: files of one name are one",

@@ -113,7 +113,9 @@ def test_the_compiler_opens_nothing_outside(tmp_path: Path) -> None:
 
 
 @linux
-@pytest.mark.parametrize("planted", ["links", "dots"])
+@pytest.mark.parametrize(
+    "planted", ["links", pytest.param("dots", marks=pytest.mark.nightly)]
+)
 def test_a_planted_bypass_is_caught(tmp_path: Path, monkeypatch, planted: str) -> None:
     """A guard that lets one trick through: it is accepted, opened, and weighs."""
     model, outside = furnish(tmp_path)
