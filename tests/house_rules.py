@@ -73,7 +73,7 @@ SIBLINGS: frozenset[tuple[str, str]] = frozenset(
 #: Never loaded by importing sim2gp, so never imported at the top of a module.
 HEAVY = frozenset(
     "matplotlib mujoco gymnasium h5py pyarrow rosbags mcap minari ray wandb mlflow "
-    "tensorboardX blackjax imageio pandas torch".split()
+    "tensorboardX blackjax imageio lxml pandas torch".split()
 )
 #: Run code that a file brings along (X1), or reach for the network (X5).
 UNSAFE_MODULES = frozenset(

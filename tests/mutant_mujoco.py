@@ -4,7 +4,7 @@ from mutant_list import Mutant
 
 EXTERNAL, ENGINE = "systems/external.py", "systems/mujoco_engine.py"
 MJCF, FILE = "systems/mjcf.py", "systems/mjcf_file.py"
-SAY = "systems/mjcf_say.py"
+SAY, SOURCES = "systems/mjcf_say.py", "systems/mjcf_sources.py"
 
 ON_THE_HOST = (
     Mutant(
@@ -260,17 +260,80 @@ ON_THE_HOST = (
         ("test_project_model.py", "changed_in_place"),
     ),
     Mutant(
-        "mjcf load: parts may lie anywhere",
-        "systems/mjcf_load.py",
-        "if not place.is_relative_to(inside):",
-        "if False:",
+        "mjcf sources: files may lie anywhere",
+        SOURCES,
+        "if anywhere or (not odd and all(is_inside(way, root) for way in ways)):",
+        "if True:",
         ("test_mujoco_file.py", "stays_in_its_folder"),
     ),
     Mutant(
-        "mjcf load: parts of parts are not looked at",
-        "systems/mjcf_load.py",
-        "                todo.append(place)",
-        "                pass",
+        "mjcf sources: links are not followed",
+        SOURCES,
+        "Path(os.path.realpath(file)).is_relative_to(os.path.realpath(root))",
+        "Path(os.path.normpath(file)).is_relative_to(root)",
+        ("test_mujoco_sources.py", "spelling"),
+    ),
+    Mutant(
+        "mjcf sources: parts of parts are not read",
+        SOURCES,
+        "self._walk(self._text(file, data, document.base, prefix), scope, seen)",
+        "self._text(file, data, document.base, prefix)",
         ("test_mujoco_file.py", "stays_in_its_folder"),
+    ),
+    Mutant(
+        "mjcf sources: a folder's name is forgotten",
+        SOURCES,
+        "return [_joined(folder, name), local, _joined(folder, local)]",
+        "return [_joined(folder, name), local]",
+        ("test_mujoco_sources.py", "every_name"),
+    ),
+    Mutant(
+        "mjcf sources: files of one name are one",
+        SOURCES,
+        "if self._names.setdefault(name.lower(), data) != data:",
+        "if False:",
+        ("test_mujoco_sources.py", "confuse"),
+    ),
+    Mutant(
+        "mjcf xml: document types are read",
+        "systems/mjcf_xml.py",
+        "if root.getroottree().docinfo.internalDTD is not None:",
+        "if False:",
+        ("test_mujoco_sources.py", "though_they_are_not_xml"),
+    ),
+    Mutant(
+        "mjcf xml: numbers need not be finite",
+        "systems/mjcf_xml.py",
+        "if not text and any(_endless(word) for word in value.split()):",
+        "if False:",
+        ("test_mujoco_file.py", "is_not_finite"),
+    ),
+    Mutant(
+        "mjcf child: it opens files all the same",
+        "systems/mjcf_child.py",
+        'limit("RLIMIT_NOFILE", 0)',
+        "pass",
+        ("test_mujoco_sources.py", "opens_no_file"),
+    ),
+    Mutant(
+        "mjcf child: limits are raised",
+        "systems/mjcf_child.py",
+        "lowest = min(most, *now) if now else most",
+        "lowest = most",
+        ("test_mujoco_file.py", "never_raised"),
+    ),
+    Mutant(
+        "mjcf child: warnings of Python are lost",
+        "systems/mjcf_child.py",
+        'warnings.showwarning = lambda message, *_: say("WARNING:", message)',
+        "warnings.showwarning = lambda *_: None",
+        ("test_mujoco_file.py", "line_that_mujoco_names"),
+    ),
+    Mutant(
+        "mujoco: delays are left to the engine",
+        "systems/mujoco.py",
+        "    _check_delays(found)\n",
+        "",
+        ("test_mujoco_file.py", "own_delay"),
     ),
 )

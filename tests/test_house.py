@@ -220,7 +220,7 @@ print(json.dumps({
 def test_import_is_light() -> None:
     """No heavy module, nothing compiled, float64 left alone."""
     probe = json.loads(run_python(IMPORT_PROBE))
-    heavy = {"matplotlib", "mujoco", "gymnasium", "pandas", "torch", "IPython"}
+    heavy = {"matplotlib", "mujoco", "gymnasium", "pandas", "torch", "IPython", "lxml"}
     assert not heavy & set(probe["modules"])
     assert probe["compiled"] == []
     assert probe["x64"] is False
@@ -232,7 +232,7 @@ def test_every_module_imports_without_extras() -> None:
     """An extra that is not installed breaks its own feature, never an import."""
     names = [module_name(path) for path in MODULES if path.stem != "__main__"]
     extras = ["mujoco", "gymnasium", "h5py", "pyarrow", "beartype", "hypothesis"]
-    extras += ["tensorboardX", "wandb"]
+    extras += ["tensorboardX", "wandb", "lxml"]
     block = f"import sys\nfor name in {extras}: sys.modules[name] = None\n"
     run_python(block + "".join(f"import {name}\n" for name in names))
 

@@ -1,84 +1,123 @@
-"""A model's file becomes a compiled model: paths checked, parsed in a child process.
+"""A model's file becomes a compiled model: files checked, compiled in a child process.
 
-A parser that crashes or runs away on somebody's file ends the child and not whoever
-asked. Files that a model names must lie in its own folder or below, or in ``root``.
+A compiler that crashes or runs away on somebody's file ends the child and not whoever
+asked. Files that a model names must lie in its own folder or below, or in ``root``:
+they are read here (`sim2gp.systems.mjcf_sources`), and the child opens no others.
 A URDF has no actuators: every hinge and slide gets a motor, ``<joint>.motor``
 (`sim2gp.systems.mjcf_child`).
 """
 
+import json
 import os
 import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from sim2gp.errors import InputError, missing_extra
+from sim2gp.errors import InputError, missing_extra, warn
+from sim2gp.systems.mjcf_sources import Sources, read_sources
+from sim2gp.systems.mjcf_xml import UNREAD
 
 SECONDS = 60  # that a model may take to compile
-_BYTES = 50_000_000  # of one file of text
-_NAMED = re.compile(r'<\s*(\w+)[^>]*?\b(?:file|filename)\s*=\s*["\']([^"\']*)["\']')
 #: MuJoCo's words for masses and inertias; not for a mesh that encloses no volume.
 _IMPOSSIBLE = re.compile(r"mass and inertia|inertia must|mass, inertia or density")
-_FOLDER = re.compile(r'\b(meshdir|texturedir|assetdir)\s*=\s*["\']([^"\']*)["\']')
-_UNREAD = "a MuJoCo model cannot be read"
+_LINE = re.compile(r"\bline (\d+)\b")
 _CHILD = os.path.join(os.path.dirname(__file__), "mjcf_child.py")
 
 
 def compiled(path: Path, root: Path | None = None) -> Any:
-    """The model of an MJCF or URDF file.
+    """The model of an MJCF or URDF file; what MuJoCo warns of is W170.
 
-    Raises `InputError` E130 where there is no such file, E135 where MuJoCo is not
-    installed, E147 or E170 with MuJoCo's words where it is no possible body or no
-    model, E171 where it names files outside ``root`` (its own folder) or the parser
-    crashed or took more than a minute.
+    Raises `InputError` E130 where there is no such file, E135 where MuJoCo or lxml is
+    not installed, E147 or E170 with MuJoCo's words where it is no possible body or no
+    model, E170 for a number that is not finite, E171 where it names files outside
+    ``root`` (its own folder) or the compiler crashed or took more than a minute, E172
+    for two files that MuJoCo could not tell apart.
     """
-    check_paths(path, path.parent if root is None else root)
-    return compiled_all([path])[0]
+    home = Path(os.path.realpath(path)).parent
+    sources = read_sources(path, home if root is None else root)
+    (model,), warned = _models([path], [sources])
+    for text in dict.fromkeys(warned):
+        line = None if sources.texts else _LINE.search(text)
+        place = f"{path}:line {line.group(1)}" if line else f"{path}"
+        warn("W170", f"{place}: {text}")
+    return model
 
 
 def compiled_all(paths: Sequence[Path]) -> list[Any]:
-    """The models of several files whose paths were checked, in one child process."""
-    if find_spec("mujoco") is None:
-        missing = ModuleNotFoundError("No module named 'mujoco'", name="mujoco")
-        raise missing_extra(_UNREAD, missing, "mujoco")
-    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(1) as aside:
-        # Half a second, while the child has the other core.
-        mujoco = aside.submit(import_module, "mujoco")
-        made = _made(paths, folder, "mjb")
-        read = mujoco.result().MjModel.from_binary_path
-        return [read(str(each)) for each in made]
+    """The models of several files that were written here, in one child process.
+
+    They name the files of a model that was checked, from wherever they lie; what MuJoCo
+    warns of was said when that one was compiled.
+    """
+    return _models(paths, [read_sources(path, None) for path in paths])[0]
 
 
 def as_mjcf(path: Path) -> str:
     """A file whose paths were checked as MJCF, in MuJoCo's words and six digits."""
     with tempfile.TemporaryDirectory() as folder:
-        return _made([path], folder, "xml")[0].read_text(encoding="utf-8")
+        (made,), _ = _made([path], [read_sources(path, None)], folder, "xml")
+        return made.read_text(encoding="utf-8")
 
 
-def _made(paths: Sequence[Path], folder: str, form: str) -> list[Path]:
-    """What the child makes of each file."""
-    seconds = SECONDS * len(paths)
-    where = str(paths[0])
-    files = [str(path.resolve()) for path in paths]
+def _models(
+    paths: Sequence[Path], sources: Sequence[Sources]
+) -> tuple[list[Any], list[str]]:
+    if find_spec("mujoco") is None:
+        missing = ModuleNotFoundError("No module named 'mujoco'", name="mujoco")
+        raise missing_extra(UNREAD, missing, "mujoco")
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(1) as aside:
+        # Half a second, while the child has the other core.
+        mujoco = aside.submit(import_module, "mujoco")
+        made, warned = _made(paths, sources, folder, "mjb")
+        read = mujoco.result().MjModel.from_binary_path
+        return [read(str(each)) for each in made], warned
+
+
+def _made(
+    paths: Sequence[Path], sources: Sequence[Sources], folder: str, form: str
+) -> tuple[list[Path], list[str]]:
+    """What the child makes of each file, and what MuJoCo warns of."""
+    seconds, count = SECONDS * len(paths), str(len(paths))
+    for i, (path, each) in enumerate(zip(paths, sources, strict=True)):
+        _hand_over(Path(folder), i, path.suffix.lower(), each)
     # In that folder MuJoCo leaves its log.
-    done = in_child(_CHILD, [str(seconds), folder, form, *files], folder, 2 * seconds)
+    done = in_child(_CHILD, [str(seconds), folder, form, count], folder, 2 * seconds)
+    where = str(paths[0])
     if done is None:
         raise _died(where, f"no answer in {2 * seconds} s")
+    lines = done.stderr.splitlines()
     if done.returncode == 3:
-        said = " ".join(done.stderr.split("REFUSED ", 1)[-1].split())
-        raise _refused(where, said)
+        said = [x.removeprefix("REFUSED ") for x in lines if x.startswith("REFUSED ")]
+        reached = sum(x.startswith("MODEL ") for x in lines)
+        raise _refused(str(paths[reached - 1]), said[-1])
     if done.returncode != 0:
         last = (done.stderr.strip().splitlines() or ["no words"])[-1]
         if last.startswith(("ImportError", "ModuleNotFoundError")):
-            raise missing_extra(_UNREAD, ImportError(last, name="mujoco"), "mujoco")
+            raise missing_extra(UNREAD, ImportError(last, name="mujoco"), "mujoco")
         raise _died(where, f"exit {done.returncode}, {last}")
-    return [Path(folder, f"{i}.{form}") for i in range(len(paths))]
+    warned = [x.removeprefix("WARNING:").strip() for x in lines if "WARNING:" in x]
+    return [Path(folder, f"{i}.{form}") for i in range(len(paths))], warned
+
+
+def _hand_over(folder: Path, i: int, suffix: str, sources: Sources) -> None:
+    """Write a model's bytes where the child reads them."""
+    stored: dict[str, bytes] = {f"{i}.main": sources.main}
+    index: dict[str, Any] = {"suffix": suffix, "main": f"{i}.main"}
+    for kind, files in (("texts", sources.texts), ("assets", sources.assets)):
+        index[kind] = {}
+        for name, data in files.items():
+            index[kind][name] = f"{i}.{len(stored)}"
+            stored[index[kind][name]] = data
+    for name, data in stored.items():
+        (folder / name).write_bytes(data)
+    (folder / f"{i}.json").write_text(json.dumps(index), encoding="utf-8")
 
 
 def in_child(
@@ -121,55 +160,8 @@ def _refused(where: str, said: str) -> InputError:
         where=where,
         got=said,
         expected="a model that MuJoCo compiles",
-        fix="mend the file where MuJoCo says",
+        fix="correct the file where MuJoCo says",
     )
-
-
-def check_paths(path: Path, root: Path) -> None:
-    """Every file that a model includes or names lies below ``root`` (E130, E171)."""
-    inside = root.resolve()
-    todo, seen = [path], set()
-    while todo:
-        file = todo.pop()
-        if file.resolve() in seen:
-            continue
-        seen.add(file.resolve())
-        for kind, name in _files(_read(file, path)):
-            named = name.removeprefix("package://")
-            place = (path.parent / named).resolve()
-            if not place.is_relative_to(inside):
-                raise InputError(
-                    "E171",
-                    f"{kind} outside the model's folder",
-                    where=str(file),
-                    got=name,
-                    expected=f"a file below {inside}",
-                    fix="move it there, or give a folder that holds both as root",
-                )
-            if kind == "include":
-                todo.append(place)
-
-
-def _files(text: str) -> Iterator[tuple[str, str]]:
-    """What each element names, with the folder that its kind is looked for in."""
-    text = re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
-    folders: dict[str, str] = dict(_FOLDER.findall(text))
-    assets = folders.get("assetdir", "")
-    for kind, name in _NAMED.findall(text):
-        where = {"mesh": "meshdir", "texture": "texturedir"}.get(kind, "")
-        yield kind, os.path.join(folders.get(where, assets) if where else "", name)
-
-
-def _read(file: Path, model: Path) -> str:
-    try:
-        with open(file, "rb") as opened:
-            return opened.read(_BYTES).decode("utf-8", errors="replace")
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        where = "" if file == model else str(model)
-        raise InputError(
-            "E130", f"cannot read {file}", where=where, got=reason
-        ) from None
 
 
 def _died(where: str, got: str) -> InputError:

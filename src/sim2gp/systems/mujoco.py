@@ -148,10 +148,13 @@ class MuJoCo(AbstractPlant):
 def loaded(model: Any, root: Path | None = None) -> Any:
     """A compiled model, of a file or of one that is compiled already.
 
-    Raises `InputError` as `compiled` does, E172 where a joint has a quaternion.
+    Raises `InputError` as `compiled` does, E170 where a number is not finite, E172
+    where a joint has a quaternion, or an actuator or a sensor a delay of its own.
     """
     is_file = isinstance(model, str | os.PathLike)
     found = compiled(Path(model), root) if is_file else copy.copy(model)
+    _check_finite(found)
+    _check_delays(found)
     for j in range(found.njnt):
         if found.jnt_type[j] not in (2, 3):
             raise InputError(
@@ -162,6 +165,40 @@ def loaded(model: Any, root: Path | None = None) -> Any:
                 fix="fix the base, or replace a free joint by slides and hinges",
             )
     return found
+
+
+def _check_finite(model: Any) -> None:
+    """A file's own numbers are: this is for products of them, and models from code."""
+    arrays = ((n, getattr(model, n, None)) for n in dir(model) if n[0] != "_")
+    for name, value in arrays:
+        if isinstance(value, np.ndarray) and value.dtype.kind == "f":
+            wrong = value[~np.isfinite(value)]
+            if wrong.size:
+                raise InputError(
+                    "E170",
+                    "a number of the compiled model is not finite",
+                    got=f"{wrong[0]} in {name}",
+                    expected="finite numbers",
+                    fix="see what in the model is too large",
+                )
+
+
+def _check_delays(model: Any) -> None:
+    """Past inputs and readings would be part of the state (MuJoCo 3.5 or newer)."""
+    for kind, fix in (
+        ("actuator", "delete the two; in a project [actuators.NAME] has a delay"),
+        ("sensor", "delete the two; a sensor's delay moves nothing"),
+    ):
+        samples = getattr(model, f"{kind}_history", None)
+        for i in np.flatnonzero(() if samples is None else np.any(samples, axis=-1)):
+            name = name_of(model, kind, int(i))
+            raise InputError(
+                "E172",
+                f"{kind} with a delay of its own",
+                got=f"delay or nsample of {name}",
+                expected="a state of joints and activations",
+                fix=fix.replace("NAME", f'"{name}"'),
+            )
 
 
 def _groups(
