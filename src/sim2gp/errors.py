@@ -9,7 +9,10 @@ import re
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from itertools import islice
 
+#: A name is compared with so many others, of so many characters at most.
+LISTED, LONG = 2000, 120
 _OF_CALLBACK = re.compile(r"^(?:\S+\.)?InputError: (E\d{3}) (.*)$", re.MULTILINE)
 
 
@@ -99,7 +102,8 @@ def warn(code: str, text: str) -> None:
 
 def nearest(name: str, names: Iterable[str]) -> str | None:
     """The known name that a misspelt one most likely meant, or None."""
-    names = list(names)
-    lower = {n.lower(): n for n in names}
+    # The comparison takes the product of two lengths, for each of the names.
+    near = (n for n in islice(names, LISTED) if len(n) < LONG)
+    lower = {n.lower(): n for n in near} if len(name) < LONG else {}
     found = difflib.get_close_matches(name.lower(), list(lower), n=1, cutoff=0.5)
     return lower[found[0]] if found else None

@@ -8,12 +8,12 @@ import glob
 import importlib
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sim2gp.errors import InputError, nearest
-from sim2gp.logs import Column, Log, Resample, none_unused, read_log
+from sim2gp.logs import Budget, Column, Log, Resample, none_unused, read_log
 from sim2gp.logs.file import shown
 from sim2gp.project.schema import (
     ColumnSpec,
@@ -39,12 +39,13 @@ SYSTEMS = {
 
 @dataclass(frozen=True)
 class Project:
-    """A validated project file."""
+    """A validated project file; ``budget`` is what reading one of its logs may take."""
 
     path: Path
     source: Source
     spec: ProjectSpec
     system: "AbstractSystem"
+    budget: Budget = field(default_factory=Budget)
 
     @property
     def name(self) -> str:
@@ -181,6 +182,7 @@ class Project:
             fixed=spec.fixed,
             group=self.spec.configurations.index(self.spec.configuration(group)),
             longest_delay=self.system.longest_delay,
+            budget=self.budget,
         )
 
 
