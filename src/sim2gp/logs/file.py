@@ -136,13 +136,15 @@ def compressed(where: str, first: bytes) -> InputError:
     )
 
 
-def read_bytes(path: Path, limit: int | None = None, first: int = -1) -> bytes:
+def read_bytes(path: Path, limit: int | None = None, first: int | None = None) -> bytes:
     """The content of a regular file, or its first bytes (E126, E129, E130).
 
     Folders, devices and pipes are refused.
     """
     with steady(path, limit):
         try:
+            if first is None:
+                return path.read_bytes()
             with path.open("rb") as file:
                 return file.read(first)
         except OSError as error:

@@ -11,6 +11,7 @@ import struct
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 from jaxtyping import Shaped
@@ -92,7 +93,7 @@ def _entry(archive: zipfile.ZipFile, info: zipfile.ZipInfo, meter: Meter) -> Ent
     """The array's shape and dtype, and how to read it."""
     meter.tick()
     with archive.open(info) as member:
-        shape, in_columns, dtype, start = _header(member)
+        shape, in_columns, dtype, start = _header(member, meter)
     if dtype.hasobject or dtype.kind == "V":
         return Entry(shape, dtype, lambda: np.empty(0))
     count = math.prod(shape)
@@ -127,14 +128,16 @@ def _entry(archive: zipfile.ZipFile, info: zipfile.ZipInfo, meter: Meter) -> Ent
     return Entry(shape, dtype, values)
 
 
-def _header(member: zipfile.ZipExtFile) -> tuple[tuple[int, ...], bool, np.dtype, int]:
+def _header(member: Any, meter: Meter) -> tuple[tuple[int, ...], bool, np.dtype, int]:
     """Shape, order, dtype and length of an array's header; ValueError for any other."""
     version = np.lib.format.read_magic(member)
     form = "<H" if version == (1, 0) else "<I"
     size = struct.calcsize(form)
     (length,) = struct.unpack(form, member.read(size))
     if length > MAX_HEADER:
-        raise ValueError(f"array header of {length} bytes")
+        raise meter.over(
+            "array header too large", f"{length} bytes", f"at most {MAX_HEADER}"
+        )
     text = member.read(length).decode("utf-8" if version >= (3, 0) else "latin-1")
     found: dict[str, re.Match[str]] = {}
     body, rest = text.strip(), ""
