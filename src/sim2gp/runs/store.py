@@ -346,9 +346,13 @@ def _read_manifest(path: Path) -> dict[str, Any]:
             expected="a folder that a sim2gp command wrote",
             fix="name the --out folder of an earlier command",
         ) from error
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise _damaged(path, MANIFEST, "unreadable JSON") from error
-    if number > FORMAT or not isinstance(files, dict):
+    entries = files.values() if isinstance(files, dict) else [None]
+    sound = all(isinstance(e, dict) and isinstance(e.get("sha256"), str) for e in entries)
+    if not (isinstance(number, int) and sound):
+        raise _damaged(path, MANIFEST, "a manifest of another shape")
+    if number > FORMAT:
         raise InputError(
             "E185",
             "run of a newer format",
