@@ -37,7 +37,9 @@ def write_npz(path: Path, mebibytes: int = 3072) -> None:
     size = (0, len(content), mebibytes * MIB + len(first))
     about = struct.pack("<HHHHHIIIHH", 20, 0, 8, 0, 33, *size, len(name), 0)
     local = b"PK\x03\x04" + about + name + content
-    central = b"PK\x01\x02\x14\x00" + about + struct.pack("<HHHII", 0, 0, 0, 0, 0) + name
+    central = (
+        b"PK\x01\x02\x14\x00" + about + struct.pack("<HHHII", 0, 0, 0, 0, 0) + name
+    )
     end = struct.pack("<HHHHIIH", 0, 0, 1, 1, len(central), len(local), 0)
     path.write_bytes(local + central + b"PK\x05\x06" + end)
 
@@ -94,7 +96,12 @@ def write_mcap(path: Path, mebibytes: int = 2662, declared: int | None = None) -
     path.write_bytes(mcap(record(3, schema), channel("/arm", "json"), record(6, chunk)))
 
 
-def write_bag(path: Path, definition: str = "string[1000000000] word\nfloat64 q\n") -> None:
+def write_bag(
+    path: Path,
+    definition: str = "string[1000000000] word\nfloat64 q\n",
+    name: str = "robot/msg/Arm",
+    digest: str = "",
+) -> None:
     """A rosbag2 whose one topic has a definition of its own."""
     tables = (
         "CREATE TABLE schema(schema_version INTEGER PRIMARY KEY, ros_distro TEXT)",
@@ -106,12 +113,14 @@ def write_bag(path: Path, definition: str = "string[1000000000] word\nfloat64 q\
         "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, "
         "timestamp INTEGER, data BLOB)",
         "INSERT INTO schema VALUES (4, 'iron')",
-        "INSERT INTO topics VALUES (1, '/arm', 'robot/msg/Arm', 'cdr', '', '')",
     )
     with closing(sqlite3.connect(path)) as base:
+        base.execute("PRAGMA synchronous = OFF")
         for table in tables:
             base.execute(table)
-        row = ("robot/msg/Arm", "ros2msg", definition, "")
+        topic = (name, digest)
+        base.execute("INSERT INTO topics VALUES (1, '/arm', ?, 'cdr', '', ?)", topic)
+        row = (name, "ros2msg", definition, digest)
         base.execute("INSERT INTO message_definitions VALUES (1, ?, ?, ?, ?)", row)
         content = b"\x00\x01\x00\x00" + bytes(64)
         for i in range(3):

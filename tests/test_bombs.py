@@ -1,4 +1,4 @@
-"""What unpacks to gigabytes is refused before it does, in a process that is measured."""
+"""What unpacks to gigabytes is refused before it does, in a measured process."""
 
 import json
 import subprocess

@@ -37,14 +37,15 @@ _PACKAGE = r"[a-z](?:_?[a-z0-9]){0,127}"
 _MESSAGE = r"[A-Za-z](?:_?[A-Za-z0-9]){0,127}"
 _TYPE = re.compile(rf"({_PACKAGE})/(?:(msg|action)/)?({_MESSAGE})")
 _FIELD = re.compile(
-    rf"(?P<type>string<=\d{{1,9}}|(?:{_PACKAGE}/(?:msg/|action/)?)?{_MESSAGE})"
-    r"(?P<array>\[(?:<=)?\d{0,10}\])?[ \t]+"
+    rf"(?P<type>string<=[0-9]{{1,9}}|(?:{_PACKAGE}/(?:msg/|action/)?)?{_MESSAGE})"
+    r"(?P<array>\[(?:<=)?[0-9]{0,10}\])?[ \t]+"
     r"(?P<name>[A-Za-z][A-Za-z0-9_]{0,127})(?![A-Za-z0-9_/])"
 )
 _CONSTANT = re.compile(r"[A-Z](?:_?[A-Z0-9])*")
 _NUMBER = re.compile(
-    r"[+-]?(?:0[xX][0-9a-fA-F]{1,16}|0b[01]{1,64}|\d{1,40}(?:\.\d{0,40})?"
-    r"(?:[eE][+-]?\d{1,4})?|\.\d{1,40}(?:[eE][+-]?\d{1,4})?|inf|nan)|[tT]rue|[fF]alse"
+    r"[+-]?(?:0[xX][0-9a-fA-F]{1,16}|0b[01]{1,64}|[0-9]{1,40}(?:\.[0-9]{0,40})?"
+    r"(?:[eE][+-]?[0-9]{1,4})?|\.[0-9]{1,40}(?:[eE][+-]?[0-9]{1,4})?)"
+    r"|[tT]rue|[fF]alse"
 )
 _QUOTED = re.compile(r"\"[^\"\\]*\"|'[^'\\]*'")
 _PRINTED = re.compile(r"[ -!$-&(-\[\]-~]*")  # without quotes, backslash and comment

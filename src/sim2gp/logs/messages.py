@@ -60,7 +60,6 @@ def collected(
     for message in messages:
         topic = message.topic
         number = counts[topic] = counts.get(topic, -1) + 1
-        meter.place = f"{topic}, message {number}"
         fields = _fields(message.content, topic, f"{where} {topic}:message {number}")
         if asked is None or number == 0:
             seen |= dict.fromkeys(fields)

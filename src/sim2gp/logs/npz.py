@@ -29,13 +29,13 @@ _PLAIN = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # what numpy writes
 _ITEM = re.compile(
     r"""\s*(?P<q>['"])(?P<key>descr|fortran_order|shape)(?P=q)\s*:\s*(?:
         (?P<bool>True|False)
-        | (?P<s>['"])(?P<dtype>[<>|=]?[A-Za-z?]\d{0,9}(?:\[\w{1,9}\])?)(?P=s)
-        | \((?P<shape>[\d,\sL]*)\)
+        | (?P<s>['"])(?P<dtype>[<>|=]?[A-Za-z?][0-9]{0,9}(?:\[[0-9a-zA-Z]{1,9}\])?)(?P=s)
+        | \((?P<shape>[0-9,\ L]*)\)
         | (?P<record>\[[^{}:]*\])
     )\s*(?:,|(?=\}))""",
     re.VERBOSE,
 )
-_AXIS = re.compile(r"\s*(\d{1,19})L?\s*")
+_AXIS = re.compile(r" *([0-9]{1,19})L? *")
 
 
 def read_npz(

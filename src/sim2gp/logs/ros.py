@@ -104,6 +104,7 @@ def _opened(
             # None chosen means all to the library.
             for about, logged, raw in reader.messages(chosen) if chosen else ():
                 meter.tick()
+                meter.place = f"{about.topic[:80]}, logged at {logged} ns"
                 content = decoders.decoded(about, raw)
                 yield Message(about.topic, logged, content)
 
@@ -256,6 +257,7 @@ def _mcap(
                     repr(channel.message_encoding),
                     "'json', or 'cdr' in a file of ROS 2",
                 )
+            meter.place = f"{channel.topic[:80]}, logged at {message.log_time} ns"
             meter.piece(JSON * len(message.data), "message")
             content = json.loads(message.data)
             yield Message(channel.topic, int(message.log_time), content)

@@ -349,7 +349,9 @@ def _read_manifest(path: Path) -> dict[str, Any]:
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise _damaged(path, MANIFEST, "unreadable JSON") from error
     entries = files.values() if isinstance(files, dict) else [None]
-    sound = all(isinstance(e, dict) and isinstance(e.get("sha256"), str) for e in entries)
+    sound = all(
+        isinstance(e, dict) and isinstance(e.get("sha256"), str) for e in entries
+    )
     if not (isinstance(number, int) and sound):
         raise _damaged(path, MANIFEST, "a manifest of another shape")
     if number > FORMAT:
