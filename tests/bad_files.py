@@ -135,6 +135,15 @@ def newer(folder: Path) -> None:
     (folder / "manifest.json").write_text(json.dumps(manifest | {"format": 99}))
 
 
+def odd(*manifests: str) -> Sequence[Input]:
+    """The manifest is JSON, or nearly, but not the one of a run."""
+
+    def spoiling(text: str) -> Callable[[Path], object]:
+        return lambda folder: (folder / "manifest.json").write_text(text)
+
+    return [run(spoiling(m), "E183", "manifest.json") for m in manifests]
+
+
 def fixed_since(folder: Path) -> None:
     (folder / "project.toml").write_text(f"{PROJECT}[parameters]\ncart_mass = 0.4\n")
 
@@ -245,6 +254,16 @@ THIRD: tuple[Case, ...] = (
         "run that was changed",
         run(flipped, "E183", "arrays.npz", "another checksum"),
         run(newer, "E185", "got 99", "at most 2"),
+        *odd(
+            '{"format": "1", "files": {}}',
+            '{"format": null, "files": {}}',
+            '{"format": 1, "files": []}',
+            '{"format": 1, "files": {"summary.json": 3}}',
+            '{"format": 1, "files": {"summary.json": {}}}',
+            '{"format": 1, "files": {"summary.json": {"sha256": 5}}}',
+            "[" * 100_000,
+            "[1]",
+        ),
         run(fixed_since, "E184", "project.toml", "expected cart_mass"),
     ),
 )

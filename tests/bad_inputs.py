@@ -194,14 +194,13 @@ def damaged_page(path: Path) -> None:
 
 
 def many_rows(path: Path) -> None:
-    """Twenty million rows in some kilobytes: run lengths make it true."""
+    """A hundred million rows in some kilobytes: run lengths make it true."""
     pa = pytest.importorskip("pyarrow")
     import pyarrow.parquet as pq
 
-    zeros = pa.array(np.zeros(1_000_000))
-    pages = pa.table(dict.fromkeys(GOOD, zeros))
+    pages = pa.table(dict.fromkeys(GOOD, pa.nulls(1_000_000, pa.float64())))
     with pq.ParquetWriter(path, pages.schema, compression="zstd") as writer:
-        for _ in range(20):
+        for _ in range(100):
             writer.write_table(pages)
 
 

@@ -321,7 +321,7 @@ FIRST: tuple[Case, ...] = (
     case(
         38,
         "Parquet that declares too much",
-        stored("a.parquet", bad.many_rows, "E126", "bytes in a file of"),
+        stored("a.parquet", bad.many_rows, "E126", "too many numbers"),
     ),
     case(
         39,

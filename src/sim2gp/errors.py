@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
+COMPARED = 2_000_000  # pairs of characters that are looked at for a misspelt name
 _OF_CALLBACK = re.compile(r"^(?:\S+\.)?InputError: (E\d{3}) (.*)$", re.MULTILINE)
 
 
@@ -99,7 +100,12 @@ def warn(code: str, text: str) -> None:
 
 def nearest(name: str, names: Iterable[str]) -> str | None:
     """The known name that a misspelt one most likely meant, or None."""
-    names = list(names)
-    lower = {n.lower(): n for n in names}
+    lower: dict[str, str] = {}
+    cost = 0  # of a comparison: the product of the two lengths
+    for other in names:
+        cost += len(name) * len(other)
+        if cost > COMPARED:
+            break
+        lower[other.lower()] = other
     found = difflib.get_close_matches(name.lower(), list(lower), n=1, cutoff=0.5)
     return lower[found[0]] if found else None

@@ -4,7 +4,7 @@ A command imports its experiment when it runs: help and a mistyped option cost n
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from sim2gp.cli.arguments import numbers, pairs, usage_error
-from sim2gp.cli.options import Chosen, Common, Reads, Wide, Writes
+from sim2gp.cli.options import Budgeted, Chosen, Common, Reads, Wide, Writes
 from sim2gp.runs import Progress, load_run
 from sim2gp.runs.store import check_absent, check_target
 from sim2gp.runs.workers import cores
@@ -59,7 +59,7 @@ class Demo(Writes):
 
 
 @dataclass(kw_only=True)
-class Init(Common):
+class Init(Budgeted):
     """Draft a project file from a model and logs: columns, signs, units, zeros."""
 
     model: Annotated[Positional[str], arg(metavar="MODEL")]
@@ -86,6 +86,7 @@ class Init(Common):
             out,
             key=jax.random.key(self.seed),
             period=self.period,
+            budget=_budget(self.budget),
         )
         found: dict[str, Any] = drafts.told(draft, out)
         return found
@@ -110,7 +111,7 @@ class Identify(Reads):
 
     def run(self, progress: Progress) -> dict[str, Any]:
         out = _out(self.out, self.project.stem)
-        read = _read(self.project, strict=self.strict)
+        read = _read(self.project, self)
         return _experiment("identify")(
             *read,
             out=out,
@@ -147,13 +148,14 @@ class Evaluate(Reads, Chosen):
                     fix = f"leave --{option} out, or name a run"
                     expected = "a project file alone: its own logs are left out"
                     raise usage_error("too much", f"--{option}", expected, fix)
-            read = _read(self.run_or_project, strict=self.strict)
+            read = _read(self.run_or_project, self)
             return _experiment("evaluate", "leave_one_out")(*read, **how)
         load_run(self.run_or_project)  # a folder that is no run fails before the work
         if not self.logs:
             expected, fix = "--logs FILE...", "name the logs to predict"
             raise usage_error("no logs", "no --logs", expected, fix)
         fit = _experiment("identified", "restored")(self.run_or_project)
+        fit = fit.within(_budget(self.budget))
         tested = fit.read(self.logs, self.configuration, strict=self.strict)
         how |= {"configuration": self.configuration, "files": self.logs}
         return _experiment("evaluate")(fit, tested, **how)
@@ -172,7 +174,12 @@ class Explain(Reads):
         out = _out(self.out, f"explain-{self.path.name}")
         load_run(self.path)  # a folder that is no run fails before the work
         return _experiment("explain")(
-            self.path, add=self.add, out=out, strict=self.strict, progress=progress
+            self.path,
+            add=self.add,
+            out=out,
+            strict=self.strict,
+            budget=_budget(self.budget),
+            progress=progress,
         )
 
 
@@ -189,7 +196,7 @@ class Compare(Reads):
 
     def run(self, progress: Progress) -> dict[str, Any]:
         out = _out(self.out, f"compare-{self.project.stem}")
-        read = _read(self.project, strict=self.strict, alike=True)
+        read = _read(self.project, self, alike=True)
         return _experiment("compare")(
             *read,
             horizons=self.horizon,
@@ -404,10 +411,15 @@ def _out(out: Path | None, name: str) -> Path:
     return path
 
 
-def _read(path: Path, *, strict: bool, alike: bool = False) -> tuple[Any, Any]:
-    """A project and its logs; a fault of theirs is told before the fits are loaded."""
+def _read(path: Path, given: Reads, *, alike: bool = False) -> tuple[Any, Any]:
+    """A project and its logs; an error of theirs is told before the fits are loaded."""
     project = import_module("sim2gp.project").load_project(path)
-    return project, project.load_logs(strict=strict, alike=alike)
+    project = replace(project, budget=_budget(given.budget))
+    return project, project.load_logs(strict=given.strict, alike=alike)
+
+
+def _budget(factor: float) -> Any:
+    return import_module("sim2gp.logs").Budget().times(factor)
 
 
 def _experiment(module: str, name: str = "run") -> Callable[..., Any]:

@@ -44,7 +44,15 @@ class Wide(Chosen):
 
 
 @dataclass(kw_only=True)
-class Reads(Writes):
+class Budgeted(Common):
+    """The option of a command that reads recordings."""
+
+    budget: Annotated[float, arg(metavar="FACTOR")] = 1.0
+    """Times 2 GiB and 60 s: what a log may unpack to, and how long reading may take."""
+
+
+@dataclass(kw_only=True)
+class Reads(Writes, Budgeted):
     """Options of a command that reads logs."""
 
     strict: bool = False

@@ -19,6 +19,7 @@ from sim2gp.experiments.explain_words import candidate_rows, headline, table
 from sim2gp.experiments.identified import PROJECT, project_of, stood
 from sim2gp.experiments.prediction import cut_logs
 from sim2gp.experiments.record import command, provenance
+from sim2gp.logs import Budget
 from sim2gp.project import Project, load_project
 from sim2gp.project.amend import amend
 from sim2gp.runs import Progress, load_run, new_run
@@ -29,17 +30,24 @@ SHARED_SECOND = 1.0  # s of windows whose errors may be correlated
 
 
 def run(
-    run: Path, *, add: bool, out: Path, progress: Progress, strict: bool = False
+    run: Path,
+    *,
+    add: bool,
+    out: Path,
+    progress: Progress,
+    strict: bool = False,
+    budget: Budget | None = None,
 ) -> dict[str, Any]:
     """Search what the run's machine lacks, write and return the summary.
 
-    ``add`` writes the winner into the project file. Raises `InputError` E130 for a run
+    ``add`` writes the winner into the project file; ``budget`` is what reading one of
+    the run's logs may take. Raises `InputError` E130 for a run
     of another command, E160 where there is no project file to add to.
     """
     started = time.perf_counter()
     stored = load_run(run)
     file = _project_file(run, stored, add)
-    data = _data(run, stored, strict)
+    data = _data(run, stored, strict, budget)
     with new_run(out, "explain") as writer, progress.task("explain", 5) as task:
         found = explain(data, on_step=task.advance)
         candidates = candidate_rows(found)
@@ -81,11 +89,14 @@ def run(
     return summary
 
 
-def _data(run: Path, stored: Run, strict: bool = False) -> AbstractData:
+def _data(
+    run: Path, stored: Run, strict: bool = False, budget: Budget | None = None
+) -> AbstractData:
     """The rows of a run, with their likelihood."""
     if (run / PROJECT).exists():
         seed = int(stored.summary.get("seed", 0))
-        return window_data(_project(run, stored), seed, strict=strict)
+        project = dataclasses.replace(_project(run, stored), budget=budget or Budget())
+        return window_data(project, seed, strict=strict)
     if "animation/state" in stored.arrays and "machine" in stored.summary:
         return _flown(stored)
     raise InputError(

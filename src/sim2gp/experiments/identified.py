@@ -5,6 +5,7 @@ A command reads a run, and logs to hold it against, before it imports its experi
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -15,7 +16,7 @@ from jaxtyping import Array
 from sim2gp.configurations import index_of
 from sim2gp.errors import InputError
 from sim2gp.gaussian import Gaussian
-from sim2gp.logs import Log, none_unused
+from sim2gp.logs import Budget, Log, none_unused
 from sim2gp.models.forecast import Band
 from sim2gp.parameters import Parameters
 from sim2gp.project import Project, load_project
@@ -49,6 +50,10 @@ class Identified(NamedTuple):
     noise: list[float]
     period: float  # s, median of the logs
     band: Band
+
+    def within(self, budget: Budget) -> "Identified":
+        """The same, where reading a log may take another budget."""
+        return self._replace(project=replace(self.project, budget=budget))
 
     def read(
         self, logs: Sequence[Path], configuration: str | None, *, strict: bool

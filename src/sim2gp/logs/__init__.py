@@ -1,5 +1,6 @@
 """Robot logs: files on disk become typed recordings in the system's names and units."""
 
+from sim2gp.logs.budget import Budget as Budget
 from sim2gp.logs.checks import none_unused as none_unused
 from sim2gp.logs.checks import period_matches as period_matches
 from sim2gp.logs.checks import shared_rows as shared_rows

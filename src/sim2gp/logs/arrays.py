@@ -5,6 +5,8 @@ Shapes and dtypes are known before anything is read, so that what cannot be a co
 refused, and what does not fit in memory is never allocated.
 """
 
+import math
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -13,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Shaped
 
 from sim2gp.errors import InputError, nearest
-from sim2gp.logs.file import check_declared
+from sim2gp.logs.budget import Meter
 from sim2gp.logs.log import Note
 from sim2gp.logs.table import Rows, Table
 
@@ -57,11 +59,11 @@ def table_of(
     wanted: Sequence[str] | None,
     *,
     time: str | None,
-    size: int,
+    meter: Meter,
 ) -> Table:
     """Read the wanted columns (None: all that are numbers) as float64.
 
-    ``size`` is the file's, in bytes. Raises `InputError` E103, E115, E121, E123, E124,
+    Nothing is read of the others. Raises `InputError` E103, E115, E121, E123, E124,
     E126, E140, E180.
     """
     places = {
@@ -69,6 +71,7 @@ def table_of(
         for base, entry in entries.items()
         for k, name in enumerate(entry.names(base))
     }
+    meter.tick()
     header = tuple(places)
     if wanted is None:
         wanted = [n for n, (base, _) in places.items() if entries[base].is_numeric]
@@ -79,17 +82,21 @@ def table_of(
     bases = list(dict.fromkeys(places[name][0] for name in wanted))
     rows = _count(entries, bases, places[time][0] if time in places else None, source)
     used = [entries[base] for base in bases]
-    declared = sum(int(np.prod(e.shape)) * max(e.dtype.itemsize, 8) for e in used)
-    check_declared(declared, size, source)
+    meter.place = ""
+    meter.claim(sum(math.prod(e.shape) * max(e.dtype.itemsize, 8) for e in used))
+    of: dict[str, list[str]] = {base: [] for base in bases}
+    for name in wanted:
+        of[places[name][0]].append(name)
     columns: dict[str, Float[np.ndarray, " N"]] = {}
     notes: list[Note] = []
-    for base in bases:
+    for base, names in of.items():
+        meter.place = f"column {base[:60]}"
         read = entries[base].read()
-        for name in wanted:
-            if places[name][0] == base:
-                raw = read if read.ndim == 1 else read[:, places[name][1]]
-                columns[name], said = _numbers(raw, name, source, name == time)
-                notes += said
+        for name in names:
+            raw = read if read.ndim == 1 else read[:, places[name][1]]
+            columns[name], said = _numbers(raw, name, source, name == time)
+            notes += said
+    meter.place = ""
     table_rows = Rows(source, np.arange(rows), "row")
     return Table(table_rows, header, columns, notes=tuple(notes))
 
@@ -100,7 +107,7 @@ def missing(
     """E103 for a column, with the name that was probably meant."""
     entries = [n for n in header if n.startswith((f"{name}[", f"{name}/"))]
     close = entries[0] if entries else nearest(name, header)
-    listed = ", ".join(header)
+    listed = ", ".join(header[:60])
     fix = f"did you mean {close}" if close else "name a column of the file"
     return InputError(
         "E103",
@@ -114,7 +121,7 @@ def missing(
 
 def distinct(names: Sequence[str], source: str) -> None:
     """Each column is named once (E104)."""
-    twice = next((n for i, n in enumerate(names) if n in names[:i]), None)
+    twice = next((n for n, count in Counter(names).items() if count > 1), None)
     if twice is not None:
         raise InputError(
             "E104",

@@ -17,7 +17,8 @@ from jaxtyping import Shaped
 
 from sim2gp.errors import InputError
 from sim2gp.logs.arrays import Entry, split, table_of
-from sim2gp.logs.file import library, read_bytes, readable, shown, steady
+from sim2gp.logs.budget import Meter
+from sim2gp.logs.file import library, read_bytes, shown, steady
 from sim2gp.logs.hdf5 import entries_of
 from sim2gp.logs.log import Note
 from sim2gp.logs.parquet import read_parquet
@@ -29,14 +30,18 @@ _EPISODE = re.compile(r"episode_(\d+)/")
 
 
 def read_lerobot(
-    path: Path, wanted: Sequence[str] | None, time: str | None, stamped: bool
+    path: Path,
+    wanted: Sequence[str] | None,
+    time: str | None,
+    stamped: bool,
+    meter: Meter,
 ) -> list[tuple[str, Table]]:
     """The episodes of a LeRobot folder, by number (E103 to E136).
 
     ``stamped``: the time is the file's own, which is ``frame_index / fps`` where the
     stamps agree with it (they are float32).
     """
-    info = _json(path / "meta" / "info.json")
+    info = _json(path / "meta" / "info.json", meter)
     where = shown(path)
     version = str(info.get("codebase_version", ""))
     if info.get("storage_format", "parquet") != "parquet" or version[:2] not in (
@@ -66,7 +71,7 @@ def read_lerobot(
     if asked is not None and not stamped:
         asked += ["episode_index"]
     labels = _labels(info)
-    tables = [read_parquet(file, asked, time, labels) for file in files]
+    tables = [read_parquet(file, asked, time, meter, labels) for file in files]
     pieces = split(_joined(tables, where), "episode_index")
     notes = _announced(info.get("total_episodes"), [n for n, _ in pieces], where)
     pieces = [(n, _timed(t, info, stamped)) for n, t in sorted(pieces, key=_number)]
@@ -75,16 +80,18 @@ def read_lerobot(
     return [(str(n), table) for n, table in pieces]
 
 
-def _number(piece: tuple[int, Table]) -> int:
+def _number(piece: tuple[int, Any]) -> int:
     return piece[0]
 
 
-def _json(path: Path) -> dict[str, Any]:
-    where = shown(path)
+def _json(path: Path, meter: Meter) -> dict[str, Any]:
     content = read_bytes(path, MAX_JSON)
-    with readable(where):
-        values = json.loads(content.decode("utf-8"))
-        return dict(values)
+    meter.place = path.name
+    values = json.loads(content.decode("utf-8"))
+    if not isinstance(values, dict):
+        raise TypeError("no table of JSON")
+    meter.place = ""
+    return values
 
 
 def _labels(info: Mapping[str, Any]) -> dict[str, list[str]]:
@@ -135,7 +142,7 @@ def _announced(total: Any, found: Sequence[int], where: str) -> list[Note]:
 
 
 def read_minari(
-    path: Path, wanted: Sequence[str] | None, time: str | None
+    path: Path, wanted: Sequence[str] | None, time: str | None, meter: Meter
 ) -> list[tuple[str, Table]]:
     """The episodes of a Minari folder; the last action is held (E103 to E140).
 
@@ -143,7 +150,7 @@ def read_minari(
     """
     folder = path / "data" if (path / "data" / "metadata.json").is_file() else path
     where = shown(path)
-    info = _json(folder / "metadata.json")
+    info = _json(folder / "metadata.json", meter)
     kind = info.get("data_format", "hdf5")
     if kind != "hdf5" or not (folder / "main_data.hdf5").is_file():
         raise InputError(
@@ -156,22 +163,19 @@ def read_minari(
         )
     h5py = library("h5py", "hdf5", "a Minari dataset")
     main = folder / "main_data.hdf5"
-    with steady(main) as size, readable(where), h5py.File(main, "r") as file:
-        entries = entries_of(file, where, size)
-        numbers = {int(m[1]) for name in entries if (m := _EPISODE.match(name))}
+    with steady(main), h5py.File(main, "r") as file:
+        episodes: dict[int, dict[str, Entry]] = {}
+        for name, entry in entries_of(file, where, meter).items():
+            if found := _EPISODE.match(name):
+                inner = episodes.setdefault(int(found[1]), {})
+                inner[name[found.end() :]] = entry
         pieces = []
-        for number in sorted(numbers):
-            prefix = f"episode_{number}/"
-            inner = {
-                name.removeprefix(prefix): entry
-                for name, entry in entries.items()
-                if name.startswith(prefix)
-            }
+        for number, inner in sorted(episodes.items(), key=_number):
             source = f"{where} episode {number}"
             aligned = _aligned(inner, source)
-            found = table_of(aligned, source, wanted, time=time, size=size)
-            pieces.append((str(number), found))
-    notes = _announced(info.get("total_episodes"), sorted(numbers), where)
+            table = table_of(aligned, source, wanted, time=time, meter=meter)
+            pieces.append((str(number), table))
+    notes = _announced(info.get("total_episodes"), [*episodes], where)
     if not pieces:
         raise InputError(
             "E115",

@@ -1,25 +1,17 @@
-"""Files of robot data before they are parsed: what kind, whole, unchanged, not a bomb.
+"""Files of robot data before they are parsed: what kind, whole and unchanged.
 
-The suffix names the format and the first bytes must agree. Readers of other projects
-raise many kinds of errors on damaged files; `readable` makes one line of them.
+The suffix names the format and the first bytes must agree.
 """
 
 import importlib
 import os
 import stat
-import struct
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from sim2gp.errors import InputError, nearest
-
-MAX_BYTES = 2 * 1024**3  # of one text file; the numbers need about as much again
-#: Above this much memory, a file that claims to hold RATIO times its size is refused.
-LARGE = 64 * 1024**2
-RATIO = 200
 
 SUFFIXES = {
     ".npz": "npz",
@@ -47,21 +39,6 @@ MAGIC = {
 COMPRESSED = (b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"PK\x03\x04", b"\x28\xb5\x2f\xfd")
 _PICKLES = (".pkl", ".pickle", ".pt", ".pth", ".ckpt", ".joblib")
 PICKLED = tuple(bytes([0x80, protocol]) for protocol in range(2, 6))
-#: What parsers of other projects raise on bytes that they did not expect.
-FAULTS = (
-    ArithmeticError,
-    AssertionError,
-    AttributeError,
-    EOFError,
-    LookupError,
-    MemoryError,
-    OSError,
-    RuntimeError,
-    TypeError,
-    ValueError,
-    struct.error,
-    zlib.error,
-)
 
 
 def shown(path: Path) -> str:
@@ -87,12 +64,10 @@ def kind_of(path: Path) -> str:
     if path.suffix.lower() in _PICKLES:
         raise pickled(shown(path), path.suffix)
     if path.suffix.lower() == ".safetensors":
-        with steady(path), path.open("rb") as file:
-            raise _tensors(file.read(16), shown(path))
+        raise _tensors(read_bytes(path, first=16), shown(path))
     kind = SUFFIXES.get(path.suffix.lower(), "csv")
     if kind != "csv":
-        with steady(path), path.open("rb") as file:
-            _check_magic(file.read(16), kind, shown(path))
+        _check_magic(read_bytes(path, first=16), kind, shown(path))
     return kind
 
 
@@ -161,10 +136,19 @@ def compressed(where: str, first: bytes) -> InputError:
     )
 
 
-def read_bytes(path: Path, limit: int = MAX_BYTES) -> bytes:
-    """The content of a regular file; folders, devices and pipes are refused (E130)."""
+def read_bytes(path: Path, limit: int | None = None, first: int | None = None) -> bytes:
+    """The content of a regular file, or its first bytes (E126, E129, E130).
+
+    Folders, devices and pipes are refused.
+    """
     with steady(path, limit):
-        return path.read_bytes()
+        try:
+            if first is None:
+                return path.read_bytes()
+            with path.open("rb") as file:
+                return file.read(first)
+        except OSError as error:
+            raise _unreadable(path, error) from error
 
 
 @contextmanager
@@ -172,23 +156,20 @@ def steady(path: Path, limit: int | None = None) -> Iterator[int]:
     """The size of a regular file that is the same afterwards (E126, E129 to E131)."""
     where = shown(path)
     _check_nul(path)
-    try:
-        before = os.stat(path)
-        if not stat.S_ISREG(before.st_mode):
-            raise _not_a_file(where, before.st_mode)
-        if limit is not None and before.st_size > limit:
-            raise InputError(
-                "E126",
-                "file too large",
-                where=where,
-                got=f"{before.st_size} bytes",
-                expected=f"at most {limit} bytes",
-                fix="split the file",
-            )
-        yield before.st_size
-        after = os.stat(path)
-    except OSError as error:
-        raise _unreadable(path, error) from error
+    before = _status(path)
+    if not stat.S_ISREG(before.st_mode):
+        raise _not_a_file(where, before.st_mode)
+    if limit is not None and before.st_size > limit:
+        raise InputError(
+            "E126",
+            "file too large",
+            where=where,
+            got=f"{before.st_size} bytes",
+            expected=f"at most {limit} bytes",
+            fix="split the file",
+        )
+    yield before.st_size
+    after = _status(path)
     if (before.st_size, before.st_mtime_ns) != (after.st_size, after.st_mtime_ns):
         raise InputError(
             "E129",
@@ -200,36 +181,11 @@ def steady(path: Path, limit: int | None = None) -> Iterator[int]:
         )
 
 
-@contextmanager
-def readable(where: str, *others: type[Exception]) -> Iterator[None]:
-    """Whatever a parser raises inside becomes E125: the file is cut off or damaged."""
-    faults: tuple[type[Exception], ...] = (*FAULTS, *others)
+def _status(path: Path) -> os.stat_result:
     try:
-        yield
-    except faults as error:
-        text = " ".join(str(error).split())
-        raise InputError(
-            "E125",
-            "file incomplete or damaged",
-            where=where,
-            got=(text or type(error).__name__)[:120].rstrip("."),
-            expected="a whole file",
-            fix="copy or record it again, once the recorder has closed it",
-        ) from error
-
-
-def check_declared(declared: int, size: int, where: str, what: str = "numbers") -> None:
-    """What a file claims to unpack to is in proportion to its size (E126)."""
-    bomb = declared > LARGE and declared > RATIO * size
-    if declared > MAX_BYTES or bomb:
-        raise InputError(
-            "E126",
-            f"declares more {what} than it can hold" if bomb else f"too many {what}",
-            where=where,
-            got=f"{declared} bytes in a file of {size}",
-            expected=f"at most {MAX_BYTES} bytes, and {RATIO} times its size",
-            fix="split the file, or name fewer columns",
-        )
+        return os.stat(path)
+    except OSError as error:
+        raise _unreadable(path, error) from error
 
 
 def library(module: str, extra: str, what: str) -> Any:

@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from sim2gp.errors import InputError
 from sim2gp.logs.arrays import split
+from sim2gp.logs.budget import Budget, Meter, readable
 from sim2gp.logs.episodes import read_lerobot, read_minari
 from sim2gp.logs.file import kind_of, shown
 from sim2gp.logs.hdf5 import read_hdf5
@@ -43,33 +44,48 @@ def recordings(
     time: str | None = None,
     period: float | None = None,
     episode: str | None = None,
+    budget: Budget | None = None,
 ) -> tuple[Recording, ...]:
     """The wanted columns of a file or folder, episode by episode (None: all numbers).
 
     ``time`` names the column of time, or in a bag the stamps ("header", "log");
-    ``episode`` a column of episode numbers. Raises `InputError` E101 to E140, E180,
-    E182.
+    ``episode`` a column of episode numbers; ``budget`` is what reading may take, 2 GiB
+    and 60 s if None. Raises `InputError` E101 to E140, E180, E182.
     """
     kind = kind_of(path)
+    meter = Meter(shown(path), budget or Budget())
+    with readable(meter):
+        return _recordings(path, kind, wanted, time, period, episode, meter)
+
+
+def _recordings(
+    path: Path,
+    kind: str,
+    wanted: Sequence[str] | None,
+    time: str | None,
+    period: float | None,
+    episode: str | None,
+    meter: Meter,
+) -> tuple[Recording, ...]:
     if kind in BAGS:
         _check_bag(path, time, period, episode)
-        return (Recording("", tuple(read_bag(path, kind, wanted, time))),)
+        return (Recording("", tuple(read_bag(path, kind, wanted, time, meter))),)
     if kind == "lerobot":
         _check_no_episode(path, episode, kind)
         stamped = time is None and period is None
         asked = _with(wanted, time)
-        found = read_lerobot(path, asked, time, stamped)
+        found = read_lerobot(path, asked, time, stamped, meter)
         return tuple(Recording(name, (table,)) for name, table in found)
     clock = None if period is not None else (time or TIME)
     asked = _with(wanted, clock, episode)
     if kind == "minari":
         _check_no_episode(path, episode, kind)
-        pieces = read_minari(path, asked, clock)
+        pieces = read_minari(path, asked, clock, meter)
     elif kind == "hdf5":
-        pieces = read_hdf5(path, asked, clock)
+        pieces = read_hdf5(path, asked, clock, meter)
     else:
         read = {"npz": read_npz, "parquet": read_parquet}.get(kind, read_table)
-        pieces = [("", read(path, asked, clock))]
+        pieces = [("", read(path, asked, clock, meter))]
     if episode is not None:
         pieces = [
             (f"{name} {number}".strip(), part)
@@ -79,12 +95,15 @@ def recordings(
     return tuple(Recording(name, (table,)) for name, table in pieces)
 
 
-def columns_of(path: Path | str) -> dict[str, Float[np.ndarray, " _"]]:
+def columns_of(
+    path: Path | str, budget: Budget | None = None
+) -> dict[str, Float[np.ndarray, " _"]]:
     """Every numeric column of a file or folder by name, of its first episode.
 
-    Columns of streams with clocks of their own have lengths of their own.
+    Columns of streams with clocks of their own have lengths of their own. Raises
+    `InputError`, E126 for a file beyond the ``budget``, 2 GiB and 60 s if None.
     """
-    tables = recordings(Path(path), None)[0].tables
+    tables = recordings(Path(path), None, budget=budget)[0].tables
     return {name: v for table in tables for name, v in table.columns.items()}
 
 

@@ -1,7 +1,8 @@
 """HDF5 files: datasets by their path, groups of alike datasets as episodes (h5py).
 
 Only what lies in the file itself is read: links to other files, and data that a file
-says to lie elsewhere, are refused.
+says to lie elsewhere, are refused. The library unpacks a chunk as a whole, as far as
+its bytes go, whatever the file declares: each chunk is measured before.
 """
 
 import math
@@ -15,8 +16,10 @@ from jaxtyping import Shaped
 
 from sim2gp.errors import InputError
 from sim2gp.logs.arrays import Entry, table_of
-from sim2gp.logs.file import check_declared, library, readable, shown, steady
+from sim2gp.logs.budget import Meter
+from sim2gp.logs.file import library, shown, steady
 from sim2gp.logs.table import Table
+from sim2gp.logs.unpack import inflated, lzf_pieces
 
 #: Groups whose names are one of these words and a number hold an episode each.
 _EPISODE = re.compile(
@@ -24,8 +27,16 @@ _EPISODE = re.compile(
 )
 
 
+#: Filters of HDF5 that its own library has, and that lose nothing, by their numbers.
+_GZIP, _LZF = 1, 32000
+_CHECKSUM = 3
+_FILTERS = {_GZIP: "gzip", 2: "shuffle", _CHECKSUM: "fletcher32", _LZF: "lzf"}
+_LZF_RATIO = 88  # three bytes copy at most 264
+STEP = 2**22  # bytes that are read at once
+
+
 def read_hdf5(
-    path: Path, wanted: Sequence[str] | None, time: str | None
+    path: Path, wanted: Sequence[str] | None, time: str | None, meter: Meter
 ) -> list[tuple[str, Table]]:
     """The wanted datasets, one table for each episode, with the episode's name.
 
@@ -34,35 +45,36 @@ def read_hdf5(
     """
     where = shown(path)
     h5py = library("h5py", "hdf5", "an HDF5 file")
-    with steady(path) as size, readable(where), h5py.File(path, "r") as file:
-        entries = entries_of(file, where, size)
+    with steady(path), h5py.File(path, "r") as file:
+        entries = entries_of(file, where, meter)
         bases = {re.sub(r"\[\d+\]$", "", name) for name in wanted or ()}
         groups = {} if bases & {*entries} else episodes_of(entries, bases)
         if not groups:
-            return [("", table_of(entries, where, wanted, time=time, size=size))]
+            return [("", table_of(entries, where, wanted, time=time, meter=meter))]
         return [
             (
                 name.rsplit("/", 1)[-1],
-                table_of(inner, f"{where} {name}", wanted, time=time, size=size),
+                table_of(inner, f"{where} {name}", wanted, time=time, meter=meter),
             )
             for name, inner in groups.items()
         ]
 
 
-def entries_of(file: Any, where: str, size: int) -> dict[str, Entry]:
+def entries_of(file: Any, where: str, meter: Meter) -> dict[str, Entry]:
     """Every dataset with rows, by its path; hard links alone are followed."""
     h5py = library("h5py", "hdf5", "an HDF5 file")
     found: dict[str, Entry] = {}
 
     def visit(name: str, item: Any) -> None:
+        meter.tick()
         if isinstance(item, h5py.Dataset) and item.shape:
-            found[name] = _entry(item, f"{where}:dataset {name}", size)
+            found[name] = _entry(item, f"{where}:dataset {name}", meter)
 
     file.visititems(visit)
     return found
 
 
-def _entry(dataset: Any, where: str, size: int) -> Entry:
+def _entry(dataset: Any, where: str, meter: Meter) -> Entry:
     def values() -> Shaped[np.ndarray, "..."]:
         if dataset.external or dataset.is_virtual:
             raise InputError(
@@ -73,9 +85,18 @@ def _entry(dataset: Any, where: str, size: int) -> Entry:
                 expected="data inside the file",
                 fix="copy the data into the file (h5repack)",
             )
-        declared = math.prod(dataset.shape) * dataset.dtype.itemsize
-        check_declared(declared, size, where)
-        read: np.ndarray = dataset[()]
+        size = math.prod(dataset.shape) * dataset.dtype.itemsize
+        meter.claim(size)
+        _check_chunks(dataset, where, meter)
+        read = np.empty(dataset.shape, dataset.dtype)
+        rows = len(dataset)
+        step = max(1, STEP * rows // max(size, 1))
+        if dataset.chunks:  # whole chunks: each is unpacked once
+            step = max(step - step % dataset.chunks[0], dataset.chunks[0])
+        for row in range(0, rows, step):
+            part = dataset[row : row + step]
+            meter.spend(part.nbytes)
+            read[row : row + step] = part
         return read
 
     dtype = dataset.dtype
@@ -83,6 +104,44 @@ def _entry(dataset: Any, where: str, size: int) -> Entry:
         is_text = library("h5py", "hdf5", where).check_string_dtype(dtype)
         dtype = np.dtype(str) if is_text else np.dtype([("field", "f8")])
     return Entry(dataset.shape, dtype, values)
+
+
+def _check_chunks(dataset: Any, where: str, meter: Meter) -> None:
+    """Compressed chunks unpack to what their shape says, no more (E126, E136)."""
+    if not dataset.chunks:
+        return
+    declared = math.prod(dataset.chunks) * dataset.dtype.itemsize
+    meter.piece(declared, "chunk")
+    plist = dataset.id.get_create_plist()
+    used = [plist.get_filter(i)[0] for i in range(plist.get_nfilters())]
+    other = next((number for number in used if number not in _FILTERS), None)
+    if other is not None:
+        raise InputError(
+            "E136",
+            "data compressed in a way that is not read",
+            where=where,
+            got=f"HDF5 filter {other}",
+            expected=", ".join(_FILTERS.values()) + ", or none",
+            fix="h5repack -f GZIP=4",
+        )
+    packed = [number for number in used if number in (_GZIP, _LZF)]
+    if len(packed) > 1:
+        raise ValueError("chunks that are compressed twice")
+    chunks: list[Any] = []
+    if packed:
+        dataset.id.chunk_iter(chunks.append)
+    for chunk in chunks:
+        meter.piece(chunk.size, "chunk")
+        if chunk.filter_mask & (1 << used.index(packed[0])):
+            continue  # this chunk was stored as it is
+        if packed == [_LZF] and _LZF_RATIO * chunk.size <= meter.limit:
+            continue
+        _, content = dataset.id.read_direct_chunk(chunk.chunk_offset)
+        if used[-1] == _CHECKSUM:
+            content = content[:-4]
+        unpacked = inflated(content) if packed == [_GZIP] else lzf_pieces(content)
+        # A checksum may lie inside. What is read is counted when it is read.
+        meter.again().measure(unpacked, declared + 64, "chunk")
 
 
 def episodes_of(
@@ -93,24 +152,23 @@ def episodes_of(
     Without wanted names, groups that are called episodes. One that lacks a dataset of
     the others is named when it is read.
     """
-    groups: dict[str, dict[str, Entry]] = {}
+    groups: dict[str, None] = {}
     for name in entries:
         parts = name.split("/")
         for depth in range(1, len(parts)):
             group, inner = "/".join(parts[:depth]), "/".join(parts[depth:])
             called = _EPISODE.match(parts[depth - 1].lower())
             if inner in bases if bases else called:
-                groups.setdefault(group, {})
-    for group, inside in groups.items():
-        prefix = f"{group}/"
-        inside |= {
-            name.removeprefix(prefix): entry
-            for name, entry in entries.items()
-            if name.startswith(prefix)
-        }
+                groups[group] = None
     top = min((name.count("/") for name in groups), default=0)
     names = sorted((n for n in groups if n.count("/") == top), key=_natural)
-    return {name: groups[name] for name in names}
+    found: dict[str, dict[str, Entry]] = {name: {} for name in names}
+    for name, entry in entries.items():
+        parts = name.split("/")
+        group, inner = "/".join(parts[: top + 1]), "/".join(parts[top + 1 :])
+        if inner and group in found:
+            found[group][inner] = entry
+    return found
 
 
 def _natural(name: str) -> list[tuple[int, str]]:

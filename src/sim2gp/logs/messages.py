@@ -13,11 +13,13 @@ from jaxtyping import Int
 
 from sim2gp.errors import InputError
 from sim2gp.logs.arrays import MAX_WIDTH
-from sim2gp.logs.file import MAX_BYTES, check_declared
+from sim2gp.logs.budget import Meter
 from sim2gp.logs.log import Note
 from sim2gp.logs.table import Rows, Table
 
 NEAR = 1_000_000_000  # ns: clocks further apart than this are not one clock
+#: Bytes of a message while it is collected, and of each of its numbers.
+ROW, NUMBER = 160, 32
 _JOINT = ("position", "velocity", "effort")
 Fields = dict[str, float]
 
@@ -44,18 +46,17 @@ class Stream:
 
 
 def collected(
-    messages: Iterator[Message], wanted: Sequence[str] | None, where: str
+    messages: Iterator[Message], wanted: Sequence[str] | None, meter: Meter
 ) -> tuple[list[Stream], tuple[str, ...]]:
     """The streams, and the names of all fields that were seen.
 
     A topic that several nodes publish with other fields each (joint states of two
     arms) is several streams; a field that comes and goes is refused (E140).
     """
-    asked = None if wanted is None else frozenset(wanted)
+    asked, where = None if wanted is None else frozenset(wanted), meter.where
     streams: dict[tuple[str, tuple[str, ...]], Stream] = {}
     counts: dict[str, int] = {}
     seen: dict[str, None] = {}
-    size = 0
     for message in messages:
         topic = message.topic
         number = counts[topic] = counts.get(topic, -1) + 1
@@ -71,9 +72,8 @@ def collected(
         stream.logged.append(message.logged)
         stream.stamped.append(_stamp(message.content))
         stream.values.append(tuple(fields[name] for name in names))
-        size += 8 * len(names)
-        if size > MAX_BYTES // 4:  # Python's numbers take four times as much
-            check_declared(4 * size, 4 * size, where)
+        meter.spend(ROW + NUMBER * len(names))
+    meter.place = ""
     if asked is not None:
         _check_steady_fields([*streams.values()], where)
     found = sorted(streams.values(), key=lambda stream: stream.topic)

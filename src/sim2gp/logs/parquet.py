@@ -1,6 +1,7 @@
 """Parquet files: scalar columns, and list columns entry by entry, through pyarrow.
 
-The footer says how many rows and bytes there are before a page is decoded.
+The footer says how many rows and bytes there are before a page is decoded. Columns that
+nobody asks for are not touched.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,16 +13,19 @@ from jaxtyping import Shaped
 
 from sim2gp.errors import InputError
 from sim2gp.logs.arrays import Entry, distinct, table_of
-from sim2gp.logs.file import MAGIC, check_declared, library, readable, shown, steady
+from sim2gp.logs.budget import Meter
+from sim2gp.logs.file import MAGIC, library, shown, steady
 from sim2gp.logs.table import Table
 
 Labels = Mapping[str, Sequence[str]]
+BATCH = 2**20  # numbers that are decoded at once
 
 
 def read_parquet(
     path: Path,
     wanted: Sequence[str] | None,
     time: str | None,
+    meter: Meter,
     labels: Labels | None = None,
 ) -> Table:
     """The wanted columns of a file (E103 to E126, E140); ``labels`` names list entries.
@@ -29,19 +33,24 @@ def read_parquet(
     A footer that is not there is a recording that was cut off (E125).
     """
     where = shown(path)
-    pa = library("pyarrow", "parquet", "a Parquet file")
+    library("pyarrow", "parquet", "a Parquet file")
     parquet = library("pyarrow.parquet", "parquet", "a Parquet file")
-    with steady(path) as size, readable(where, pa.ArrowException):
+    with steady(path) as size:
         _check_end(path, size, where)
         with parquet.ParquetFile(path, page_checksum_verification=True) as file:
-            rows = file.metadata.num_rows
-            check_declared(8 * rows, size, where, "rows")
+            meter.claim(8 * file.metadata.num_rows, "rows")
             distinct(file.schema_arrow.names, where)
-            entries = {
-                field.name: _entry(file, field, where, (labels or {}).get(field.name))
-                for field in file.schema_arrow
-            }
-            return table_of(entries, where, wanted, time=time, size=size)
+            entries, leaf = {}, 0
+            for field in file.schema_arrow:
+                leaves = range(leaf, leaf + _leaves(field.type))
+                found = (labels or {}).get(field.name)
+                entries[field.name] = _entry(file, field, leaves, meter, found)
+                leaf = leaves.stop
+            if leaf != file.metadata.num_columns:
+                raise ValueError(
+                    f"{file.metadata.num_columns} columns, {leaf} in types"
+                )
+            return table_of(entries, where, wanted, time=time, meter=meter)
 
 
 def _check_end(path: Path, size: int, where: str) -> None:
@@ -59,25 +68,44 @@ def _check_end(path: Path, size: int, where: str) -> None:
         )
 
 
-def _entry(file: Any, field: Any, where: str, labels: Sequence[str] | None) -> Entry:
-    """A column's shape and dtype: of a list, the width of its first row."""
+def _leaves(kind: Any) -> int:
+    """How many columns of the file hold a field: those of a record count each."""
     types = library("pyarrow.types", "parquet", "a Parquet file")
+    kind = getattr(kind, "storage_type", kind)
+    if not types.is_nested(kind):
+        return 1
+    return sum(_leaves(kind.field(i).type) for i in range(kind.num_fields))
+
+
+def _entry(
+    file: Any, field: Any, leaves: range, meter: Meter, labels: Sequence[str] | None
+) -> Entry:
+    """A column's shape and dtype; the width of a list is what the footer counts."""
+    types = library("pyarrow.types", "parquet", "a Parquet file")
+    meter.tick()
     rows, kind = file.metadata.num_rows, field.type
     lists = (types.is_list, types.is_large_list, types.is_fixed_size_list)
-    name = field.name
+    is_list = any(test(kind) for test in lists)
+    width = _width(file.metadata, leaves.start) if is_list else 1
 
     def values() -> Shaped[np.ndarray, "..."]:
-        return _column(file, name, where)
+        return _column(file, field.name, leaves, width, meter)
 
-    if not any(test(kind) for test in lists):
+    if not is_list:
         return Entry((rows,), _dtype(kind), values)
-    first = next(file.iter_batches(1, columns=[name]), None)
-    lead = first.column(name)[0].as_py() if first is not None and len(first) else None
-    shape = (rows, len(lead or ()))
     names = tuple(labels or ())
-    if len(names) != shape[1]:
+    if len(names) != width:
         names = ()
-    return Entry(shape, _dtype(kind.value_type), values, names)
+    return Entry((rows, width), _dtype(kind.value_type), values, names)
+
+
+def _width(metadata: Any, leaf: int) -> int:
+    """Entries in the longest row, if they are all alike: ragged ones are seen later."""
+    for g in range(metadata.num_row_groups):
+        group = metadata.row_group(g)
+        if group.num_rows > 0:
+            return int(-(-group.column(leaf).num_values // group.num_rows))
+    return 0
 
 
 def _dtype(kind: Any) -> np.dtype:
@@ -98,26 +126,26 @@ def _dtype(kind: Any) -> np.dtype:
     return np.dtype(kind.to_pandas_dtype())
 
 
-def _column(file: Any, name: str, where: str) -> Shaped[np.ndarray, "..."]:
-    """All values of a column; a page that cannot be decoded is named (E125)."""
-    pa = library("pyarrow", "parquet", "a Parquet file")
+def _column(
+    file: Any, name: str, leaves: range, width: int, meter: Meter
+) -> Shaped[np.ndarray, "..."]:
+    """All values of a column, and of no other that its name is a part of."""
     parts = []
     for group in range(file.metadata.num_row_groups):
-        try:
-            table = file.read_row_group(group, columns=[name])
-        except (pa.ArrowException, OSError) as error:
-            text = " ".join(str(error).split())
-            raise InputError(
-                "E125",
-                "damaged page",
-                where=f"{where}:column {name}, row group {group}",
-                got=text[:120].rstrip("."),
-                expected="pages as they were written",
-                fix="copy the file again, or record it again",
-            ) from error
-        parts.append(table.column(name))  # dotted names may bring others
-    chunks = [chunk for part in parts for chunk in part.chunks if len(chunk)]
-    return np.concatenate([_array(chunk, name, where) for chunk in chunks])
+        meter.place = f"column {name[:60]}, row group {group}"
+        columns = [file.metadata.row_group(group).column(leaf) for leaf in leaves]
+        meter.claim(sum(column.total_uncompressed_size for column in columns))
+        batches = file.reader.iter_batches(
+            max(1, BATCH // max(1, width)),
+            row_groups=[group],
+            column_indices=list(leaves),
+            use_threads=False,
+        )
+        for batch in batches:
+            meter.spend(batch.nbytes)
+            if len(batch):
+                parts.append(_array(batch.column(0), name, meter.where))
+    return np.concatenate(parts)
 
 
 def _array(chunk: Any, name: str, where: str) -> Shaped[np.ndarray, "..."]:

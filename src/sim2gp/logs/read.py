@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float
 from sim2gp.errors import InputError, nearest
 from sim2gp.logs import checks
 from sim2gp.logs.alignment import misaligned
+from sim2gp.logs.budget import Budget
 from sim2gp.logs.file import shown
 from sim2gp.logs.formats import BOOKKEEPING, TIME, Recording, recordings
 from sim2gp.logs.log import ChannelLike, Column, Log, Note
@@ -71,6 +72,7 @@ def read_log(
     fixed: Mapping[str, float] | None = None,
     group: int = 0,
     longest_delay: float = 0.0,
+    budget: Budget | None = None,
 ) -> tuple[Log, ...]:
     """Read one file or folder into logs without gaps, episode by episode.
 
@@ -79,6 +81,7 @@ def read_log(
     numbers. ``exclude`` lists intervals of the file's time in s; a log is cut around
     them. ``limits`` are end stops of states, in their units: samples there are masked.
     ``keep_first`` drops further rows of a stamp; a ``longest_delay`` is the model's.
+    Reading may take the ``budget``: 2 GiB unpacked and 60 s, if None (E126).
     Raises `InputError` with the codes of bad recordings (E101 to E141, E180, E182).
     """
     path = Path(path)
@@ -99,7 +102,9 @@ def read_log(
     )
     specs = [spec for spec in columns.values() if isinstance(spec, Column)]
     wanted = list(dict.fromkeys(spec.column for spec in specs))
-    found = recordings(path, wanted, time=named, period=period, episode=episode)
+    found = recordings(
+        path, wanted, time=named, period=period, episode=episode, budget=budget
+    )
     name = path.name if path.is_dir() else path.stem
     logs: list[Log] = []
     about = checks.unused(_left(found[0].tables), shown(path))
@@ -159,8 +164,9 @@ def _left(tables: Sequence[Table]) -> list[str]:
     return [
         name
         for table in tables
+        if not table.stream
         for name in table.header
-        if name and not table.stream and name not in {*table.columns, *BOOKKEEPING}
+        if name and name not in table.columns and name not in BOOKKEEPING
     ]
 
 

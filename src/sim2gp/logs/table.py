@@ -8,7 +8,7 @@ Lines are counted as an editor counts them: the header is line 1.
 
 import csv
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sim2gp.errors import InputError, nearest
+from sim2gp.logs.budget import Meter
 from sim2gp.logs.file import (
     COMPRESSED,
     MAGIC,
@@ -28,6 +29,7 @@ from sim2gp.logs.file import (
 from sim2gp.logs.log import Note
 
 _BINARY = (*(m for k, m in MAGIC.items() if k != "npz"), b"\x93NUMPY")
+BLOCK = 20_000  # rows that are parsed at once
 _DATE = re.compile(
     r"\d{4}-\d\d-\d\d|\d{1,2}:\d\d(:\d\d)?|\d{1,2}[/.]\d{1,2}[/.]\d{2,4}"
 )
@@ -98,14 +100,14 @@ def decode(content: bytes, where: str) -> str:
 
 
 def read_table(
-    path: Path, wanted: Sequence[str] | None, time: str | None = None
+    path: Path, wanted: Sequence[str] | None, time: str | None, meter: Meter
 ) -> Table:
     """Read the wanted columns of a CSV file as float64; empty cells become NaN.
 
     None wants every named column whose first cell is a number.
     """
     where = shown(path)
-    text = decode(read_bytes(path), where)
+    text = decode(read_bytes(path, meter.budget.bytes), where)
     lines = text.splitlines()
     filled = [i for i, line in enumerate(lines) if line and not line.isspace()]
     if not filled:
@@ -117,7 +119,8 @@ def read_table(
             expected="a header and at least two rows",
             fix="record the log again",
         )
-    header = _header(lines[filled[0]], f"{where}:line {filled[0] + 1}")
+    numbers = np.asarray(filled, dtype=np.int64) + 1
+    header = _header(lines[filled[0]], Rows(where, numbers[:1]))
     if len(filled) == 1:
         raise InputError(
             "E115",
@@ -127,19 +130,49 @@ def read_table(
             expected="at least two rows",
             fix="record the log again",
         )
-    numbers = np.asarray(filled[1:], dtype=np.int64) + 1
+    table = Rows(where, numbers[1:])
     rows = [lines[i] for i in filled[1:]]
-    wanted = _numeric(header, rows[0]) if wanted is None else wanted
-    columns = [_position(name, header, where) for name in wanted]
+    if wanted is None:
+        wanted = _numeric(header, rows[0], table)
+    places = {name: i for i, name in enumerate(header)}
+    for name in wanted:
+        if name not in places:
+            raise _missing(name, header, where)
     quoted = '"' in text
-    _check_widths(rows, header, numbers, where, quoted)
-    values = _parse(rows, columns, header, numbers, where, quoted, time)
+    meter.spend(8 * len(rows) * len(wanted))
+    values = np.empty((len(rows), len(wanted)))
+    _check_widths(rows, header, table, quoted, meter)
+    columns = [places[name] for name in wanted]
+    for i in range(0, len(rows), BLOCK):
+        meter.tick()
+        part = slice(i, i + BLOCK)
+        kept = table.kept(part)
+        values[part] = _parse(rows[part], columns, header, kept, quoted, time)
     found = {name: values[:, i] for i, name in enumerate(wanted)}
-    return Table(Rows(where, numbers), header, found)
+    return Table(table, header, found)
 
 
-def _header(line: str, where: str) -> tuple[str, ...]:
-    names = [name.strip() for name in next(csv.reader([line], skipinitialspace=True))]
+def _fields(lines: Sequence[str], table: Rows) -> Iterator[list[str]]:
+    """The fields of each line; one that Python's parser does not take is E121."""
+    reader = csv.reader(lines, skipinitialspace=True)
+    try:
+        yield from reader
+    except csv.Error as error:
+        i = min(max(reader.line_num, 1), len(lines)) - 1
+        raise InputError(
+            "E121",
+            "line that cannot be split into fields",
+            where=table.at(i),
+            got=f"{error}, in a line of {len(lines[i])} characters",
+            expected=f"fields of at most {csv.field_size_limit()} characters",
+            fix="remove the line, or the quotes in it",
+        ) from error
+
+
+def _header(line: str, table: Rows) -> tuple[str, ...]:
+    where = table.at(0)
+    (found,) = _fields([line], table)
+    names = [name.strip() for name in found]
     if len(names) == 1:
         for mark, word in ((";", "semicolons"), ("\t", "tabs"), ("|", "bars")):
             if mark in line:
@@ -153,21 +186,23 @@ def _header(line: str, where: str) -> tuple[str, ...]:
             expected="a first line with the names of the columns",
             fix="add the names as the first line",
         )
+    first: dict[str, int] = {}
     for i, name in enumerate(names):
-        if name and name in names[:i]:
+        if name and first.setdefault(name, i) != i:
             raise InputError(
                 "E104",
                 f"column {name} stands twice",
                 where=where,
-                got=f"columns {names.index(name) + 1} and {i + 1}",
+                got=f"columns {first[name] + 1} and {i + 1}",
                 expected="each name once",
                 fix="rename one of them",
             )
     return tuple(names)
 
 
-def _numeric(header: tuple[str, ...], row: str) -> list[str]:
-    cells = [cell.strip() for cell in next(csv.reader([row], skipinitialspace=True))]
+def _numeric(header: tuple[str, ...], row: str, table: Rows) -> list[str]:
+    (found,) = _fields([row], table)
+    cells = [cell.strip() for cell in found]
     pairs = zip(header, cells, strict=False)
     return [name for name, cell in pairs if name and (not cell or _is_number(cell))]
 
@@ -183,15 +218,13 @@ def _delimiter(line: str, where: str, word: str) -> InputError:
     )
 
 
-def _position(name: str, header: tuple[str, ...], where: str) -> int:
-    if name in header:
-        return header.index(name)
+def _missing(name: str, header: tuple[str, ...], where: str) -> InputError:
     close = nearest(name, header)
-    raise InputError(
+    return InputError(
         "E103",
         f"missing column {name}",
         where=f"{where}:line 1",
-        got=_cut(", ".join(header), 120),
+        got=_cut(", ".join(header[:60]), 120),
         expected=f"a column named {name}",
         fix=f"did you mean {close}" if close else "name a column of the file",
     )
@@ -200,18 +233,21 @@ def _position(name: str, header: tuple[str, ...], where: str) -> int:
 def _check_widths(
     rows: list[str],
     header: tuple[str, ...],
-    numbers: np.ndarray,
-    where: str,
+    table: Rows,
     quoted: bool,
+    meter: Meter,
 ) -> None:
     """Every row has as many fields as the header (E121), and commas between them."""
     if quoted:
-        widths = [len(fields) for fields in csv.reader(rows, skipinitialspace=True)]
+        widths = []
+        for fields in _fields(rows, table):
+            meter.tick()
+            widths.append(len(fields))
         if len(widths) != len(rows):
             raise InputError(
                 "E121",
                 "quote that never closes",
-                where=where,
+                where=table.source,
                 got=f"{len(widths)} records on {len(rows)} lines",
                 expected="one record per line",
                 fix="remove the quotes",
@@ -223,7 +259,7 @@ def _check_widths(
     if wrong.size == 0:
         return
     i = int(wrong[0])
-    place, line = f"{where}:line {numbers[i]}", rows[i]
+    place, line = table.at(i), rows[i]
     if wrong.size == len(rows) and not quoted:
         if widths[i] == 1 and any(mark in line for mark in ";\t"):
             raise _delimiter(line, place, "semicolons or tabs")
@@ -243,8 +279,7 @@ def _parse(
     rows: list[str],
     columns: list[int],
     header: tuple[str, ...],
-    numbers: np.ndarray,
-    where: str,
+    table: Rows,
     quoted: bool,
     time: str | None,
 ) -> Float[np.ndarray, "N k"]:
@@ -261,7 +296,8 @@ def _parse(
         except ValueError:
             pass  # some cell is not a number: the search below says which
     out = np.empty((len(rows), len(columns)))
-    for r, fields in enumerate(csv.reader(rows, skipinitialspace=True)):
+    lines = _fields(rows, table)
+    for r, fields in enumerate(lines):
         for c, column in enumerate(columns):
             cell = fields[column].strip()
             if not cell:
@@ -270,7 +306,7 @@ def _parse(
                 out[r, c] = float(cell)
             else:
                 name = header[column]
-                place = f"{where}:line {numbers[r]}, column {name}"
+                place = f"{table.at(r)}, column {name}"
                 raise _not_a_number(cell, place, name == time)
     return out
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from sim2gp.errors import InputError
-from sim2gp.logs import Column, read_log
+from sim2gp.logs import Budget, Column, read_log
 from sim2gp.logs.formats import recordings
 from sim2gp.logs.units import UNITS
 from sim2gp.project.columns import Match, match, time_column
@@ -52,21 +52,24 @@ def draft_project(
     *,
     key: Key,
     period: float | None = None,
+    budget: Budget | None = None,
 ) -> Draft:
     """Write the project file ``out`` for a bundled machine or a model's file.
 
-    ``period`` in s stands for a column of time. Raises `InputError` E103 where a joint
+    ``period`` in s stands for a column of time; reading one file may take the
+    ``budget``. Raises `InputError` E103 where a joint
     or an input finds no column, E160 for an unknown machine, and the codes of models
     and logs.
     """
     system = _machine(model)
-    time, columns = _columns(files[0], system, period)
+    budget = budget or Budget()
+    time, columns = _columns(files[0], system, period, budget)
     stated = {name: m.column for name, m in columns.items()}
-    versions = _versions(system, files, stated, time, period)
+    versions = _versions(system, files, stated, time, period, budget)
     found = find_readings(system, versions, key=key)
     said = {name: _as_read(name, m, found) for name, m in columns.items()}
     text = _text(model, files, out, system, time, period, said, found)
-    replace_project(out, text, lambda project: project.load_logs())
+    replace_project(out, text, lambda p: replace(p, budget=budget).load_logs())
     return Draft(system, text, said, found)
 
 
@@ -84,10 +87,10 @@ def _machine(model: str) -> AbstractSystem:
 
 
 def _columns(
-    file: Path, system: AbstractSystem, period: float | None
+    file: Path, system: AbstractSystem, period: float | None, budget: Budget
 ) -> tuple[Match | None, dict[str, Match]]:
     """The column of time, where the format needs one, and those of the channels."""
-    tables = recordings(file, None, period=period)[0].tables
+    tables = recordings(file, None, period=period, budget=budget)[0].tables
     main = max(tables, key=lambda t: len(t.rows.numbers) * len(t.columns))
     columns, clock, time = dict(main.columns), main.clock, None
     where = main.rows.source
@@ -114,6 +117,7 @@ def _versions(
     stated: Mapping[str, Column],
     time: Match | None,
     period: float | None,
+    budget: Budget,
 ) -> list[Version]:
     """The logs in the units that names tell, and in others that may be meant."""
     versions: list[Version] = []
@@ -132,6 +136,7 @@ def _versions(
                     actions=system.actions,
                     time=None if time is None else time.column,
                     period=period,
+                    budget=budget,
                 )
             ]
             versions.append(Version(columns, logs))

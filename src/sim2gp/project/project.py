@@ -10,12 +10,12 @@ import json
 import os
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sim2gp.errors import InputError, nearest
-from sim2gp.logs import Column, Log, Resample, none_unused, read_log
+from sim2gp.logs import Budget, Column, Log, Resample, none_unused, read_log
 from sim2gp.logs.file import shown
 from sim2gp.project.schema import (
     ColumnSpec,
@@ -44,12 +44,13 @@ _PREFIX = re.compile(r"(?i)^(mujoco|mjcf|mjx|urdf|xml)\s*:\s*")
 
 @dataclass(frozen=True)
 class Project:
-    """A validated project file."""
+    """A validated project file; ``budget`` is what reading one of its logs may take."""
 
     path: Path
     source: Source
     spec: ProjectSpec
     system: "AbstractSystem"
+    budget: Budget = field(default_factory=Budget)
 
     @property
     def name(self) -> str:
@@ -186,6 +187,7 @@ class Project:
             fixed=spec.fixed,
             group=self.spec.configurations.index(self.spec.configuration(group)),
             longest_delay=self.system.longest_delay,
+            budget=self.budget,
         )
 
 

@@ -23,9 +23,16 @@ Path_ = tuple[str | int, ...]
 
 _KEY = r"""(?:[A-Za-z0-9_-]+|"(?:[^"\\]|\\.)*"|'[^']*')"""
 _DOTTED = re.compile(rf"\s*({_KEY}(?:\s*\.\s*{_KEY})*)\s*")
+#: Strings and comments. A string that never closes is one to the end of its line, or of
+#: the file: from each of many such the rest would be looked through again.
 _TOKEN = re.compile(
-    r'"""(?:[^\\]|\\.)*?"""|\'\'\'.*?\'\'\'|"(?:[^"\\\n]|\\.)*"|\'[^\'\n]*\'|#[^\n]*',
+    r'"""(?:[^\\]|\\.?)*?(?:"""|\Z)|\'\'\'.*?(?:\'\'\'|\Z)'
+    r'|"(?:[^"\\\n]|\\.?+)*+(?:"|(?=\n)|\Z)|\'[^\'\n]*\'|#[^\n]*',
     re.DOTALL,
+)
+#: Keys, dots, brackets and what lies between them, each character looked at once.
+_PIECE = re.compile(
+    r"""(?P<key>[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')|(?P<space>\s++)|.""", re.DOTALL
 )
 #: A line that TOML has not, as a file of YAML begins.
 _YAML = re.compile(r"^(---|%YAML|-\s|[\w\"'-]+\s*:(\s|$))")
@@ -116,12 +123,21 @@ def _blank(match: re.Match[str]) -> str:
 
 def _depth(bare: str) -> int:
     """Deepest nesting of brackets, or longest dotted key."""
-    depth = deepest = 0
-    for mark in re.findall(r"[\[\]{}]", re.sub(r'"[^"]*"|\'[^\']*\'', "", bare)):
-        depth = depth + 1 if mark in "[{" else max(0, depth - 1)
-        deepest = max(deepest, depth)
-    dotted = re.findall(rf"{_KEY}(?:\s*\.\s*{_KEY})+", bare)
-    return max([deepest, *(key.count(".") + 1 for key in dotted)])
+    depth = deepest = keys = 0
+    dotted = False
+    for piece in _PIECE.finditer(bare):
+        if piece["space"]:
+            continue
+        mark = piece.group()
+        if piece["key"]:
+            keys = keys + 1 if dotted else 1
+        elif mark in "[{":
+            depth += 1
+        elif mark in "]}":
+            depth = max(0, depth - 1)
+        dotted = mark == "." and keys > 0
+        deepest = max(deepest, depth, keys)
+    return deepest
 
 
 def _syntax(name: str, text: str, message: str) -> InputError:

@@ -37,11 +37,8 @@ def validated(source: Source) -> ProjectSpec:
     except ValidationError as failure:
         errors: list[dict[str, Any]] = [{**error} for error in failure.errors()]
     faults = [(_present(error["loc"], source.values), error) for error in errors]
-    deep = [
-        (path, error)
-        for path, error in faults
-        if not any(len(p) > len(path) and p[: len(path)] == path for p, _ in faults)
-    ]
+    above = {path[:end] for path, _ in faults for end in range(len(path))}
+    deep = [(path, error) for path, error in faults if path not in above]
     path, error = min(deep, key=lambda fault: _order(source, fault[0]))
     if error["type"] == "missing":
         raise _missing(source, path, error)
