@@ -6,11 +6,11 @@ with other arguments counts as missing.
 """
 
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from sim2gp.cleanup import replace_file
 from sim2gp.runs.plain import to_json
 from sim2gp.runs.store import disk_error
 
@@ -24,7 +24,7 @@ class Cells:
     def load(self, name: str, arguments: Mapping[str, Any]) -> dict[str, Any] | None:
         """What the cell holds; None where it was not finished with these arguments."""
         try:
-            text = (self.folder / f"{name}.json").read_text()
+            text = (self.folder / f"{name}.json").read_text(encoding="utf-8")
         except FileNotFoundError:
             return None
         except OSError as error:
@@ -43,16 +43,10 @@ class Cells:
     ) -> dict[str, Any]:
         """Put a finished cell on the disk; returns what `load` will."""
         content = {"arguments": _plain(arguments), "values": _plain(values)}
-        aside = self.folder / f".{name}.{os.getpid()}"
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            with open(aside, "w") as file:
-                file.write(to_json(content))
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(aside, self.folder / f"{name}.json")
+            replace_file(self.folder / f"{name}.json", to_json(content).encode())
         except OSError as error:
-            aside.unlink(missing_ok=True)
             raise disk_error(self.folder, error) from error
         plain: dict[str, Any] = content["values"]
         return plain
