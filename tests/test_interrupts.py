@@ -12,6 +12,9 @@ from pathlib import Path
 
 import pytest
 
+from sim2gp.cli.interrupts import Terminated, interruptible
+from sim2gp.runs import load_run
+
 SECONDS = 5.0  # from the signal to the end of the process
 CODES = {"SIGINT": 130, "SIGTERM": 143}
 #: A demo that has begun to write its run, and then does one thing for a long time.
@@ -26,7 +29,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 def endless():
     return jax.jit(lambda x: jax.lax.while_loop(lambda y: y < 2.0, jnp.sin, x))
 def unrolled(x):
-    for k in range(3000):  # a minute of XLA
+    for k in range(2000):  # half a minute of XLA
         x = jnp.sin(x + k) @ jnp.cos(x.T)
     return x
 def ready():
@@ -79,7 +82,9 @@ def work():
         except KeyboardInterrupt:
             pass
 """
-WORKERS = """
+EVERYTHING = """
+import subprocess
+from sim2gp import cleanup
 def job(number):
     if number:
         endless()(1.0).block_until_ready()
@@ -87,10 +92,20 @@ def job(number):
 def work():
     from sim2gp.runs.workers import spread
     program = endless().lower(1.0).compile()
-    for _ in spread(job, [[0, 1], [2]], 2):
-        ready()
-        program(1.0).block_until_ready()
+    asleep = [sys.executable, "-c", "import time; time.sleep(600)"]
+    with cleanup.temporary_folder(), subprocess.Popen(asleep) as other:
+        with cleanup.registered(other.kill):
+            for _ in spread(job, [[0, 1], [2]], 2):
+                ready()
+                program(1.0).block_until_ready()
 """
+PATIENT = (
+    """
+from sim2gp.cli import interrupts
+interrupts.GRACE = 600.0
+"""
+    + SWALLOWS
+)
 BUSY = {
     "runs": RUNS,
     "compiles": COMPILES,
@@ -184,14 +199,14 @@ def until_ready(child: subprocess.Popen[str]) -> None:
     pytest.fail("the child ended by itself")
 
 
-@pytest.mark.parametrize("sign", CODES)
-@pytest.mark.parametrize("busy", BUSY)
+CASES = [(busy, "SIGTERM") for busy in BUSY] + [("runs", "SIGINT")]
+
+
+@pytest.mark.parametrize(("busy", "sign"), CASES)
 def test_a_signal_ends_a_busy_command_in_seconds(
     busy: str, sign: str, tmp_path: Path
 ) -> None:
     """While XLA runs or compiles, Python's own handlers wait; this must not."""
-    if sign == "SIGINT" and busy in ("compiles ahead", "in a thread"):
-        pytest.skip("as with SIGTERM")
     with started(tmp_path, ["-c", CHILD.format(work=BUSY[busy])]) as child:
         until_ready(child)
         assert everything_in(tmp_path / "work")
@@ -201,3 +216,112 @@ def test_a_signal_ends_a_busy_command_in_seconds(
     assert seconds < SECONDS
     assert everything_in(tmp_path) == ["temporary", "work"]
     assert said.splitlines() == ["interrupted; nothing half-written is left"]
+
+
+def test_a_second_signal_ends_it_at_once(tmp_path: Path) -> None:
+    with started(tmp_path, ["-c", CHILD.format(work=PATIENT)]) as child:
+        until_ready(child)
+        seconds, _, _ = stopped(child, "SIGTERM", again=0.5)
+        assert child.returncode == 143
+    assert 0.5 < seconds < 2.5
+    assert everything_in(tmp_path) == ["temporary", "work"]
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="no list of processes")
+def test_workers_children_and_temporary_folders_go_too(tmp_path: Path) -> None:
+    """Workers in compiled code, a child process, and a main thread that cannot act."""
+    script = tmp_path / "study.py"  # what workers are to import has a file
+    script.write_text(CHILD.format(work=EVERYTHING))
+    with started(tmp_path, [str(script)]) as child:
+        until_ready(child)
+        assert everything_in(tmp_path / "temporary")
+        seconds, below, _ = stopped(child, "SIGTERM")
+        assert child.returncode == 143
+        assert len(below) >= 3
+        assert none_is_left(below)
+    assert seconds < SECONDS
+    assert everything_in(tmp_path) == ["study.py", "temporary", "work"]
+
+
+@pytest.mark.skipif(not hasattr(os, "openpty"), reason="no terminals")
+def test_the_terminal_gets_its_cursor_back(tmp_path: Path) -> None:
+    ours, theirs = os.openpty()
+    in_a_bar = RUNS.replace("def work", "def within") + (
+        "def work():\n"
+        "    from sim2gp.runs import Progress\n"
+        "    with Progress().task('demo', 2):\n"
+        "        within()\n"
+    )
+    shown = b""
+    command = ["-c", CHILD.format(work=in_a_bar)]
+    environment = os.environ | {"TERM": "xterm"}
+    with subprocess.Popen(
+        [sys.executable, *command], cwd=tmp_path, env=environment, stderr=theirs
+    ) as child:
+        os.close(theirs)
+        with contextlib.suppress(OSError):  # the end of a terminal is an error
+            while more := os.read(ours, 1000):
+                if b"ready" in more:
+                    child.send_signal(signal.SIGTERM)
+                shown += more
+        assert child.wait(30.0) == 143
+    os.close(ours)
+    assert b"\x1b[?25l" in shown  # hidden
+    assert b"\x1b[?25h" in shown.split(b"\x1b[?25l")[-1]  # and back
+
+
+def test_a_caller_keeps_its_own_handlers() -> None:
+    """Who calls `main` with arguments owns the process and its signals."""
+
+    def mine(number: int, frame: object) -> None:
+        raise AssertionError
+
+    before = signal.getsignal(signal.SIGINT), signal.signal(signal.SIGTERM, mine)
+    try:
+        with interruptible(entry=False):
+            assert signal.getsignal(signal.SIGINT) is before[0]
+            assert signal.getsignal(signal.SIGTERM) is mine
+            assert signal.set_wakeup_fd(-1) == -1
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        with interruptible(entry=True):
+            assert signal.getsignal(signal.SIGTERM) is signal.SIG_IGN
+        assert signal.set_wakeup_fd(-1) == -1
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        with pytest.raises(Terminated), interruptible(entry=False):
+            os.kill(os.getpid(), signal.SIGTERM)
+        assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    finally:
+        signal.signal(signal.SIGTERM, before[1])
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_an_end_within_a_commit_leaves_all_or_nothing(
+    late: bool, tmp_path: Path
+) -> None:
+    """Before the rename everything goes; once it has begun, the run stays whole."""
+    code = (
+        "import os, sys, threading, time\n"
+        "from sim2gp import cleanup\n"
+        "from sim2gp.runs import new_run, store\n"
+        "def end():\n"
+        "    cleanup.run(20.0)\n"
+        "    os._exit(9)\n"
+        "def begin_to_end():\n"
+        "    threading.Thread(target=end).start()\n"
+        "    time.sleep(0.3)\n"
+        "rename = os.rename\n"
+        "def slow(*names):\n"
+        "    begin_to_end()\n"
+        "    rename(*names)\n"
+        f"late = {late}\n"
+        "os.rename = slow if late else rename\n"
+        "with new_run(sys.argv[1], 'test') as run:\n"
+        "    run.write_summary({'value': 1})\n"
+        "    late or begin_to_end()\n"
+        "time.sleep(60.0)\n"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path / "b" / "a")]
+    assert subprocess.run(command, check=False).returncode == 9
+    assert everything_in(tmp_path)[:2] == (["b", "b/a"] if late else [])
+    if late:
+        assert load_run(tmp_path / "b" / "a").summary == {"value": 1}
