@@ -250,6 +250,26 @@ def test_at_most_one_writer_however_often_the_lock_changes_hands(
     assert os.listdir(tmp_path) == []
 
 
+def test_the_lock_is_held_until_its_file_is_gone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Given back before, it could be another's file that is removed."""
+    remove, entered = os.unlink, []
+
+    def late(*args: Any, **kwargs: Any) -> None:
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "unlink", remove)
+            with contextlib.suppress(RunOwned), store._locked(tmp_path / "a"):
+                entered.append(True)
+        remove(*args, **kwargs)
+
+    monkeypatch.setattr(os, "unlink", late)
+    with store._locked(tmp_path / "a"):
+        pass
+    assert os.listdir(tmp_path) == []
+    assert not entered
+
+
 def test_a_link_in_the_place_of_what_was_left_is_not_followed(tmp_path: Path) -> None:
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "one.tex").write_text("mine")
