@@ -10,8 +10,9 @@ from collections.abc import Iterator
 #: Imports point down; rooms of one layer do not see each other, but for SIBLINGS.
 LAYERS: tuple[frozenset[str], ...] = (
     frozenset(
-        "types errors checks linalg gaussian least_squares arrowhead laplace em "
-        "bijections configurations weighed parameters transitions ahead descent".split()
+        "types errors checks cleanup linalg gaussian least_squares arrowhead laplace "
+        "em bijections configurations weighed parameters transitions ahead "
+        "descent".split()
     ),
     frozenset({"systems", "logs"}),
     frozenset({"models", "tasks", "planning"}),

@@ -9,11 +9,10 @@ import contextlib
 import io
 import os
 import re
-import signal
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Union
 
@@ -22,46 +21,55 @@ from tyro.conf import subcommand
 
 from sim2gp.cli.arguments import check_arguments, usage_error
 from sim2gp.cli.commands import COMMANDS, Common
+from sim2gp.cli.interrupts import DONE, interruptible
 from sim2gp.errors import InputError, Sim2GPError, Sim2GPWarning
 from sim2gp.runs import DiskError, Progress, RunOwned
 from sim2gp.runs.plain import to_json
 from sim2gp.runs.show import print_summary
 from sim2gp.runs.store import disk_error
 
-OK, BUG, INPUT, DISK, OWNED, INTERRUPTED, TERMINATED = 0, 1, 2, 74, 75, 130, 143
-
-
-class Terminated(KeyboardInterrupt):
-    """SIGTERM arrived; cleaned up after like an interrupt."""
+OK, BUG, INPUT, DISK, OWNED = 0, 1, 2, 74, 75
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit code."""
+    """Run one command and return its exit code.
+
+    Without ``argv`` the command is the process's own: a signal then ends the process
+    within seconds, even where compiled code runs (`sim2gp.cli.interrupts`).
+    """
     args = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in args
-    try:
-        with _terminable():
+    with interruptible(entry=argv is None) as signals:
+        try:
             code = _run(args)
             sys.stdout.flush()  # here a reader that has gone is no fault, at exit it is
             return code
-    except KeyboardInterrupt as error:
-        print("interrupted; nothing half-written is left", file=sys.stderr)
-        return TERMINATED if isinstance(error, Terminated) else INTERRUPTED
-    except BrokenPipeError:
+        except BaseException as error:
+            # What a signal raises may arrive as an error of a library on its way.
+            if signals.number is None and not isinstance(error, KeyboardInterrupt):
+                return _failed(error, debug)
+            print(DONE, file=sys.stderr)
+            return signals.exit_code
+
+
+def _failed(error: BaseException, debug: bool) -> int:
+    """Say in one line what went wrong; returns the exit code."""
+    if isinstance(error, BrokenPipeError):
         # Whoever read our output has gone; the interpreter must not flush into it.
         with open(os.devnull, "w") as nowhere:
             os.dup2(nowhere.fileno(), sys.stdout.fileno())
         return OK
-    except Sim2GPError as error:
+    if isinstance(error, Sim2GPError):
         return _told(error, _code(error), debug)
-    except OSError as error:
+    if isinstance(error, OSError):
         typed = disk_error(Path(error.filename or "."), error)
         return _told(typed, _code(typed), debug)
-    except Exception as error:
+    if isinstance(error, Exception):
         what = f"{type(error).__name__}: {error}".split("\n")[0][:200]
         fix = "run the command again with --debug and report what it prints"
         bug = Sim2GPError("E001", "fault of sim2gp", got=what, fix=fix)
         return _told(bug, BUG, debug)
+    raise error
 
 
 def _run(args: list[str]) -> int:
@@ -129,24 +137,6 @@ def _warner(progress: Progress, other: Callable[..., None]) -> Callable[..., Non
             other(message, category, *place, **more)
 
     return show
-
-
-@contextlib.contextmanager
-def _terminable() -> Iterator[None]:
-    """SIGTERM ends a command like Ctrl-C does, so that it cleans up after itself."""
-
-    def stop(number: int, frame: Any) -> None:
-        raise Terminated
-
-    try:
-        before = signal.signal(signal.SIGTERM, stop)
-    except ValueError:  # not in the main thread: signals are somebody else's
-        yield
-        return
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _code(error: Sim2GPError) -> int:

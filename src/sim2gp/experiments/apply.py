@@ -7,10 +7,10 @@ of the plain one.
 """
 
 import difflib
-import tempfile
 from pathlib import Path
 from typing import Any
 
+from sim2gp.cleanup import replace_file, temporary_folder
 from sim2gp.errors import InputError
 from sim2gp.experiments.identified import (
     Width,
@@ -21,7 +21,6 @@ from sim2gp.experiments.identified import (
 )
 from sim2gp.project import Project
 from sim2gp.project.project import is_model
-from sim2gp.project.replace import replace_file
 from sim2gp.runs import Progress, load_run
 from sim2gp.runs.store import Run, check_absent
 from sim2gp.systems import MuJoCo
@@ -65,7 +64,7 @@ def run(
     progress.say(f"editing {system.source}")
     file = system.file()
     edited = file.edited(system.by_path(values))
-    with tempfile.TemporaryDirectory() as folder:
+    with temporary_folder() as folder:
         _written(file, edited, Path(folder, f"model{file.suffix}"))
     written = _keep(file, edited, out, in_place)
     return {

@@ -5,7 +5,6 @@ differences, singular values, conservation laws.
 """
 
 import math
-import tempfile
 from collections.abc import Callable, Mapping
 from fractions import Fraction
 from pathlib import Path
@@ -18,6 +17,7 @@ import scipy.linalg
 import scipy.stats
 from jaxtyping import Array, Float
 
+from sim2gp.cleanup import temporary_folder
 from sim2gp.errors import InputError, NotConverged
 from sim2gp.experiments.two_link_study import DT, LEVELS, covered, record
 from sim2gp.gaussian import Gaussian
@@ -341,7 +341,7 @@ def _surprise(squares: float, count: int) -> float:
 def store(rng: Rng) -> float:
     """Runs lost by a failed write, and damage that reading did not find."""
     faults = 0
-    with tempfile.TemporaryDirectory() as folder:
+    with temporary_folder() as folder:
         path = Path(folder) / "run"
         with new_run(path, "selftest") as writer:
             writer.write_summary({"kept": 1})

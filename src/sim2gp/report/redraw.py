@@ -1,12 +1,11 @@
 """A run directory back into its report, from summary.json and arrays.npz alone."""
 
-import os
-import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sim2gp.cleanup import replace_file
 from sim2gp.report.document import write_report
 from sim2gp.runs import store
 
@@ -28,22 +27,7 @@ def redraw(run_dir: str | Path) -> Path:
     summary, arrays = load_run(run_dir)
     path = Path(run_dir) / REPORT
     try:
-        _write(path, write_report(summary, arrays))
+        replace_file(path, write_report(summary, arrays).encode())
     except OSError as error:
         raise store.disk_error(path, error) from error
     return path
-
-
-def _write(path: Path, text: str) -> None:
-    """Write aside and rename: a reader sees the old report or the new, never half."""
-    handle, aside = tempfile.mkstemp(dir=path.parent, prefix=".report-")
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8", newline="\n") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(aside, 0o644)
-        os.replace(aside, path)
-    except BaseException:
-        os.unlink(aside)
-        raise

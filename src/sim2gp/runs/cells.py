@@ -9,7 +9,6 @@ what to do with it.
 """
 
 import json
-import os
 from argparse import ArgumentParser
 from collections import Counter
 from collections.abc import Iterable, Mapping
@@ -17,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from sim2gp.cleanup import replace_file
 from sim2gp.errors import InputError
 from sim2gp.runs.plain import to_json
 from sim2gp.runs.sealed import is_sealed, parse, seal, unseal
@@ -204,17 +204,11 @@ def _unlike(mine: Mapping[str, str], other: Mapping[str, str]) -> set[str]:
 
 
 def _write(path: Path, content: bytes) -> None:
-    """Write aside, flush, rename: the file is there whole or not at all."""
-    aside = path.with_name(f".{path.stem}.{os.getpid()}")
+    """The file is there whole or not at all."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with open(aside, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(aside, path)
+        replace_file(path, content)
     except OSError as error:
-        aside.unlink(missing_ok=True)
         raise disk_error(path.parent, error) from error
 
 

@@ -10,6 +10,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TypeVar
 
+from sim2gp import cleanup
+
 T = TypeVar("T")
 
 
@@ -97,7 +99,8 @@ def _bar(label: str, total: int) -> Iterator[Task]:
         TimeElapsedColumn(),
         TextColumn("{task.fields[note]}"),
     )
-    with Bars(*columns, console=Console(stderr=True)) as bars:
+    bars = Bars(*columns, console=Console(stderr=True))
+    with bars, cleanup.registered(bars.stop):  # or the cursor stays hidden
         number = bars.add_task(label, total=total, note="")
 
         def show(task: Task, note: str) -> None:

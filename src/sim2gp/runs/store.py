@@ -5,24 +5,25 @@ Files are written into a hidden sibling of the target, each flushed to the disk,
 the target. An earlier run there is renamed to ``.NAME.previous`` first, read from there
 should the machine stop just then, and removed when the new one stands (files that the
 run did not write are carried over). A failed command removes the sibling and the
-folders it made. The sibling is locked: a second process on the same target is told so.
-A lock dies with its process, and what a killed one left behind is cleared.
+folders it made. ``.NAME.lock`` is locked meanwhile: a second process on the same target
+gets an error. The lock ends with its process, and what a killed one left is removed.
 """
 
 import errno
-import fcntl
 import hashlib
 import io
 import os
 import shutil
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from filelock import FileLock, Timeout
 
+from sim2gp import cleanup
 from sim2gp.errors import InputError, Sim2GPError
 from sim2gp.runs.archive import load_arrays
 from sim2gp.runs.manifest import FORMAT, MANIFEST, damaged, not_a_run, read_manifest
@@ -105,7 +106,7 @@ def new_run(path: Path | str, command: str) -> Iterator[Writer]:
         check_target(path)
         made = _make_parents(path.parent)
         try:
-            with _staging(path) as folder:
+            with _locked(path), _staging(path, made) as folder:
                 _settle(path)
                 writer = Writer(folder)
                 yield writer
@@ -258,45 +259,55 @@ def _remove_if_empty(folder: Path) -> None:
 
 
 @contextmanager
-def _staging(path: Path) -> Iterator[Path]:
-    """The locked hidden sibling that the run is written into."""
-    folder = path.with_name(f".{path.name}.partial")
-    lock = _locked(folder, path)
+def _locked(path: Path) -> Iterator[None]:
+    """Nobody else writes this run while the block runs (E191 where somebody does)."""
+    file = _lock_file(path)
+    lock = FileLock(file, timeout=0)
     try:
-        yield folder
+        lock.acquire()
+    except Timeout as error:
+        raise RunOwned(
+            "E191",
+            "another process writes this run",
+            where=str(path),
+            fix="wait for it, or choose another --out",
+        ) from error
+    try:
+        yield
     finally:
-        if folder.exists() and os.fstat(lock).st_ino == folder.stat().st_ino:
+        # Before it is released: who locks a file that is gone by then tries again.
+        # Windows removes no open file; there the library does it.
+        with suppress(OSError):
+            file.unlink()
+        lock.release()
+
+
+@contextmanager
+def _staging(path: Path, made: Sequence[Path]) -> Iterator[Path]:
+    """The hidden sibling that the run is written into, made new, gone afterwards.
+
+    ``made`` are the folders that go with it if the process is ended meanwhile.
+    """
+    folder = path.with_name(f".{path.name}.partial")
+    if os.path.lexists(folder):  # left by a process that was killed
+        shutil.rmtree(folder)
+
+    def abandon() -> None:
+        shutil.rmtree(folder, ignore_errors=True)
+        _lock_file(path).unlink(missing_ok=True)
+        for parent in made:
+            _remove_if_empty(parent)
+
+    with cleanup.registered(abandon):
+        try:
+            folder.mkdir()
+            yield folder
+        finally:
             shutil.rmtree(folder, ignore_errors=True)
-        os.close(lock)
 
 
-def _locked(folder: Path, path: Path) -> int:
-    """Make and lock the folder; an unlocked one was left by a killed process."""
-    while True:
-        folder.mkdir(exist_ok=True)
-        try:
-            lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-        except FileNotFoundError:
-            continue  # committed by another process just now
-        except OSError:
-            _remove_if_empty(folder)
-            raise
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            os.close(lock)
-            raise RunOwned(
-                "E191",
-                "another process writes this run",
-                where=str(path),
-                fix="wait for it, or choose another --out",
-            ) from error
-        if folder.exists() and folder.stat().st_ino == os.fstat(lock).st_ino:
-            break
-        os.close(lock)
-    for stale in folder.iterdir():
-        shutil.rmtree(stale) if stale.is_dir() else stale.unlink()
-    return lock
+def _lock_file(path: Path) -> Path:
+    return path.with_name(f".{path.name}.lock")
 
 
 def _commit(writer: Writer, path: Path, command: str) -> None:
@@ -311,11 +322,12 @@ def _commit(writer: Writer, path: Path, command: str) -> None:
     for folder in sorted({(writer.folder / n).parent for n in writer.files}):
         _sync(folder)
     check_target(path)
-    if path.exists() and any(path.iterdir()):
-        _swap(writer.folder, path)
-    else:
-        os.rename(writer.folder, path)
-        _sync(path.parent)
+    with cleanup.undisturbed():
+        if path.exists():
+            _swap(writer.folder, path)
+        else:
+            os.rename(writer.folder, path)
+            _sync(path.parent)
 
 
 def _swap(folder: Path, path: Path) -> None:
@@ -356,6 +368,8 @@ def _settle(path: Path) -> None:
 
 
 def _sync(folder: Path) -> None:
+    if not hasattr(os, "O_DIRECTORY"):
+        return  # Windows opens no folder, and keeps renames by itself
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from itertools import chain, cycle
 from typing import Any, TypeVar
 
-from sim2gp import errors
+from sim2gp import cleanup, errors
 from sim2gp.errors import Sim2GPError
 
 Job = TypeVar("Job")
@@ -56,18 +56,24 @@ def spread(
         context.Process(target=_serve, args=(work, jobs, results), daemon=True)
         for _ in range(workers)
     ]
-    try:
-        for process, core in zip(processes, cycle(_allowed()), strict=False):
-            _start(process, core)
-        for _ in numbered:
-            number, result = _next(results, processes)
-            yield numbered[number], result
-    finally:
-        started = [process for process in processes if process.pid is not None]
-        for process in started:
-            process.terminate()
-        for process in started:
-            process.join()
+    with cleanup.registered(lambda: _kill(processes)):
+        try:
+            for process, core in zip(processes, cycle(_allowed()), strict=False):
+                _start(process, core)
+            for _ in numbered:
+                number, result = _next(results, processes)
+                yield numbered[number], result
+        finally:
+            for process in _kill(processes):
+                process.join()
+
+
+def _kill(processes: Sequence[Any]) -> list[Any]:
+    """End those that were started; nothing of theirs is half-written."""
+    started = [process for process in processes if process.pid is not None]
+    for process in started:
+        process.kill()
+    return started
 
 
 def _allowed() -> Sequence[int | None]:
@@ -119,6 +125,8 @@ def _next(results: Any, processes: Sequence[Any]) -> Any:
 
 def _serve(work: Callable[[Any], Any], jobs: Any, results: Any) -> None:
     """One process: take groups until there are none, or nobody is left to take them."""
+    # Ctrl-C reaches every process of a terminal; the one that started this ends it.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_follow, daemon=True).start()
     for first, group in iter(jobs.get, None):
         for number, job in enumerate(group, first):
@@ -138,4 +146,4 @@ def _follow() -> None:
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
-        os.kill(os.getpid(), signal.SIGTERM)  # as `spread` ends them itself
+        os.kill(os.getpid(), signal.SIGTERM)

@@ -12,7 +12,6 @@ import os
 import re
 import subprocess
 import sys
-import tempfile
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from importlib import import_module
@@ -20,6 +19,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from sim2gp import cleanup
 from sim2gp.errors import InputError, missing_extra, warn
 from sim2gp.systems.mjcf_sources import Sources, read_sources
 from sim2gp.systems.mjcf_xml import UNREAD
@@ -61,7 +61,7 @@ def compiled_all(paths: Sequence[Path]) -> list[Any]:
 
 def as_mjcf(path: Path) -> str:
     """A file whose paths were checked as MJCF, in MuJoCo's words and six digits."""
-    with tempfile.TemporaryDirectory() as folder:
+    with cleanup.temporary_folder() as folder:
         (made,), _ = _made([path], [read_sources(path, None)], folder, "xml")
         return made.read_text(encoding="utf-8")
 
@@ -72,7 +72,7 @@ def _models(
     if find_spec("mujoco") is None:
         missing = ModuleNotFoundError("No module named 'mujoco'", name="mujoco")
         raise missing_extra(UNREAD, missing, "mujoco")
-    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(1) as aside:
+    with cleanup.temporary_folder() as folder, ThreadPoolExecutor(1) as aside:
         # Half a second, while the child has the other core.
         mujoco = aside.submit(import_module, "mujoco")
         made, warned = _made(paths, sources, folder, "mjb")
@@ -128,19 +128,25 @@ def in_child(
     environment: Mapping[str, str] | None = None,
 ) -> subprocess.CompletedProcess[str] | None:
     """Run a script of this room apart, in a folder; None where it took too long."""
-    try:
-        return subprocess.run(
+    with (
+        subprocess.Popen(
             [sys.executable, "-I", script, *arguments],
             cwd=folder,
             env=environment,
-            capture_output=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
             text=True,
             errors="replace",
-            timeout=seconds,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
-        return None
+        ) as child,
+        cleanup.registered(child.kill),
+    ):
+        try:
+            out, err = child.communicate(timeout=seconds)
+        except subprocess.TimeoutExpired:
+            return None
+        finally:
+            child.kill()  # one that has ended is not killed
+        return subprocess.CompletedProcess(child.args, child.returncode, out, err)
 
 
 def _refused(where: str, said: str) -> InputError:

@@ -7,7 +7,6 @@ MuJoCo itself; ``MUJOCO_GL=disable`` draws nothing.
 
 import os
 import sys
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from sim2gp.cleanup import temporary_folder
 from sim2gp.systems.mjcf_load import in_child
 
 MOST = 125  # frames
@@ -51,7 +51,7 @@ def rendered(
     import mujoco
 
     for backend in backends(os.environ, sys.platform):
-        with tempfile.TemporaryDirectory() as folder:
+        with temporary_folder() as folder:
             place = Path(folder)
             mujoco.mj_saveModel(model, str(place / "model.mjb"))
             np.savez(
