@@ -29,7 +29,7 @@ _PLAIN = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # what numpy writes
 _ITEM = re.compile(
     r"""\s*(?P<q>['"])(?P<key>descr|fortran_order|shape)(?P=q)\s*:\s*(?:
         (?P<bool>True|False)
-        | (?P<s>['"])(?P<dtype>[<>|=]?[A-Za-z?][0-9]{0,9}(?:\[[0-9a-zA-Z]{1,9}\])?)(?P=s)
+        | (?P<s>['"])(?P<dtype>[<>|=]?[A-Za-z?][0-9]{0,9}(?:\[[0-9a-z]{1,9}\])?)(?P=s)
         | \((?P<shape>[0-9,\ L]*)\)
         | (?P<record>\[[^{}:]*\])
     )\s*(?:,|(?=\}))""",
