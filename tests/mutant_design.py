@@ -156,7 +156,7 @@ DESIGN = (
         VERDICT,
         "if wide[n] > max(asked.within, share[n])",
         "if wide[n] < 0.0",
-        ("test_design_run.py", "when_to_stop"),
+        ("test_design_run.py", None),
     ),
     Mutant(
         "search: limits hold for machines of the plain posterior",

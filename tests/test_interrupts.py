@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import random
 import signal
 import subprocess
 import sys
@@ -14,6 +15,8 @@ import pytest
 
 from sim2gp.cli.interrupts import Terminated, interruptible
 from sim2gp.runs import load_run
+from simulated_logs import simulated
+from test_identify import project_in, write
 
 SECONDS = 5.0  # from the signal to the end of the process
 CODES = {"SIGINT": 130, "SIGTERM": 143}
@@ -325,3 +328,51 @@ def test_an_end_within_a_commit_leaves_all_or_nothing(
     assert everything_in(tmp_path)[:2] == (["b", "b/a"] if late else [])
     if late:
         assert load_run(tmp_path / "b" / "a").summary == {"value": 1}
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("command", ["identify", "demo"])
+def test_random_times_of_real_commands(command: str, tmp_path: Path) -> None:
+    """Twenty moments of one whole command: imports, compilations, fits, the report."""
+    words = ["demo", "--episodes", "1"]
+    if command == "identify":
+        words = ["identify", str(tmp_path / "machine.toml"), "--quick"]
+        for seed in (1, 2):
+            log = simulated(seconds=1.3, seed=seed, noise=5e-4)
+            write(log, tmp_path / "logs" / f"{seed}.csv")
+        project_in(tmp_path)
+    call = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from sim2gp.cli import main; raise SystemExit(main())"
+    )
+    arguments = ["-c", call, *words]
+    (tmp_path / "whole").mkdir()
+    begun = time.monotonic()
+    with started(tmp_path / "whole", arguments) as child:
+        child.communicate()
+        assert child.returncode == 0
+    whole = time.monotonic() - begun
+    took = []
+    rng = random.Random(0)
+    for k in range(20):
+        folder = tmp_path / str(k)
+        folder.mkdir()
+        sign = ("SIGTERM", "SIGINT")[k % 2]
+        with started(folder, arguments) as child:
+            try:
+                child.wait(rng.uniform(0.0, 0.95) * whole)
+            except subprocess.TimeoutExpired:
+                seconds, below, said = stopped(child, sign)
+                took.append(seconds)
+                # Before the command has begun, Python ends by the signal itself.
+                codes = {CODES[sign]}
+                if "interrupted" not in said:
+                    codes.add(-getattr(signal, sign))
+                assert child.returncode in codes, said
+                assert none_is_left(below)
+                assert everything_in(folder) == ["temporary", "work"]
+    words_of_all = " ".join(f"{seconds:.2f}" for seconds in sorted(took))
+    print(f"{command}: {len(took)} of 20 stopped within a whole of {whole:.0f} s")
+    print(f"seconds to the end: {words_of_all}")
+    assert len(took) >= 15
+    assert max(took) < SECONDS
