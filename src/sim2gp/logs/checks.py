@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from sim2gp.errors import InputError
-from sim2gp.logs.log import ChannelLike, Log, Note
+from sim2gp.logs.log import ChannelLike, Column, Log, Note
 from sim2gp.logs.table import Rows
 
 Values = Float[np.ndarray, " N"]
@@ -98,6 +98,20 @@ def stamps(time: Values, rows: Rows) -> None:
         got=f"{got} ({bad.size} such rows)",
         expected="increasing time",
         fix="set keep_first = true" if same else "sort or split the file",
+    )
+
+
+def plain_clock(column: Column, source: str) -> None:
+    """A recording with stamps of its own needs no unit or sign of them (E160)."""
+    if column in (Column(column.column), Column(column.column, "s")):
+        return
+    raise InputError(
+        "E160",
+        "unit of a recording's own clock",
+        where=source,
+        got=f"time as a column, {column.column}, with its unit",
+        expected="seconds, as the recording has them",
+        fix='write time = "header" or "log", or leave it out',
     )
 
 

@@ -271,18 +271,7 @@ def _time(table: Table, plan: _Plan) -> Values:
     if plan.period is not None:
         return plan.period * np.arange(len(table.rows.numbers))
     if table.clock is not None:
-        if plan.clock not in (
-            Column(plan.clock.column),
-            Column(plan.clock.column, "s"),
-        ):
-            raise InputError(
-                "E160",
-                "unit of a recording's own clock",
-                where=table.rows.source,
-                got=f"time as a column, {plan.clock.column}, with its unit",
-                expected="seconds, as the recording has them",
-                fix='write time = "header" or "log", or leave it out',
-            )
+        checks.plain_clock(plan.clock, table.rows.source)
         return table.clock
     raw = table.columns[plan.clock.column]
     return _converted(raw, plan.clock, "s", table.rows.source)

@@ -10,7 +10,6 @@ system of a machine and its effects and holds their registered strengths.
 
 import abc
 import math
-from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -19,7 +18,6 @@ from equinox import AbstractClassVar, AbstractVar
 from jaxtyping import Array, Float
 
 from sim2gp import checks
-from sim2gp.errors import InputError
 from sim2gp.parameters import Parameter
 from sim2gp.systems.base import (
     AbstractMechanism,
@@ -34,6 +32,7 @@ from sim2gp.systems.friction import (
     quadratic_drag,
 )
 from sim2gp.systems.furuta import Furuta
+from sim2gp.systems.homes import force_unit, gravity_of, only_on, unit_per
 from sim2gp.types import Action, Scalar
 
 _SUBSTEP = 0.005  # s; a true, perturbed machine is integrated twice as finely
@@ -150,7 +149,7 @@ class Coulomb(AbstractForce):
         checks.positive("Coulomb", width=self.width)
 
     def unit(self, system: AbstractMechanism) -> str:
-        return _force_unit(system, self.where)
+        return force_unit(system, self.where)
 
     def force(
         self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
@@ -173,7 +172,7 @@ class RailFriction(AbstractForce):
         checks.positive("RailFriction", width=self.width)
 
     def unit(self, system: AbstractMechanism) -> str:
-        only_on(self, system, {CartPole: "x"})
+        only_on(self.name, system, {CartPole: "x"})
         return "1"
 
     def force(
@@ -202,7 +201,7 @@ class Stribeck(AbstractForce):
         checks.positive("Stribeck", width=self.width, speed=self.speed)
 
     def unit(self, system: AbstractMechanism) -> str:
-        return _force_unit(system, self.where)
+        return force_unit(system, self.where)
 
     def force(
         self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
@@ -222,7 +221,7 @@ class BackEmf(AbstractForce):
     max_substep: ClassVar[float] = _SUBSTEP
 
     def unit(self, system: AbstractMechanism) -> str:
-        return _per(system, self.where, " s")
+        return unit_per(system, self.where, " s")
 
     def force(
         self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
@@ -241,7 +240,7 @@ class Spring(AbstractForce):
     max_substep: ClassVar[float] = _SUBSTEP
 
     def unit(self, system: AbstractMechanism) -> str:
-        return _per(system, self.where, "")
+        return unit_per(system, self.where, "")
 
     def force(
         self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
@@ -260,7 +259,7 @@ class Drag(AbstractForce):
     max_substep: ClassVar[float] = _SUBSTEP
 
     def unit(self, system: AbstractMechanism) -> str:
-        return _per(system, self.where, " s^2", square=True)
+        return unit_per(system, self.where, " s^2", square=True)
 
     def force(
         self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
@@ -284,7 +283,7 @@ class RailTilt(AbstractForce):
     max_substep: ClassVar[float] = _SUBSTEP
 
     def unit(self, system: AbstractMechanism) -> str:
-        only_on(self, system, {CartPole: "x"})
+        only_on(self.name, system, {CartPole: "x"})
         return "rad"
 
     def force(
@@ -315,7 +314,7 @@ class RodInertia(AbstractGeometry):
     max_substep: ClassVar[float] = _SUBSTEP
 
     def unit(self, system: AbstractMechanism) -> str:
-        only_on(self, system, {Furuta: "alpha"})
+        only_on(self.name, system, {Furuta: "alpha"})
         return "1"
 
     def inertia(
@@ -350,7 +349,7 @@ class PoleGeometry(AbstractGeometry):
     max_substep: ClassVar[float] = _SUBSTEP
 
     def unit(self, system: AbstractMechanism) -> str:
-        only_on(self, system, {CartPole: "theta"})
+        only_on(self.name, system, {CartPole: "theta"})
         return "m"
 
     def inertia(
@@ -384,40 +383,6 @@ class DeadZone(AbstractInputEffect):
         return dead_zone(u, x, self.smoothing)
 
 
-def only_on(
-    effect: AbstractEffect, system: AbstractMechanism, homes: Mapping[type, str]
-) -> None:
-    """Refuse an effect on a machine or a channel that cannot have it (E145)."""
-    for kind, channel in homes.items():
-        if isinstance(system, kind) and effect.where == channel:
-            return
-    raise InputError(
-        "E145",
-        f"{effect.what} of this machine",
-        got=f"{effect.where} of {type(system).__name__}",
-        expected=" or ".join(f"{c} of {k.__name__}" for k, c in homes.items()),
-    )
-
-
 def _on_joint(i: int, f: Scalar) -> Pair:
     none = jnp.zeros_like(f)
     return jnp.stack([f, none] if i == 0 else [none, f])
-
-
-def gravity_of(system: AbstractMechanism) -> float:
-    """Acceleration of gravity, m/s^2, of a machine that has any."""
-    return float(system.gravity)  # type: ignore[attr-defined]
-
-
-def _force_unit(system: AbstractMechanism, name: str) -> str:
-    """N on a slide, N m on a hinge."""
-    return "N" if system.states[system.joint(name)].unit == "m" else "N m"
-
-
-def _per(
-    system: AbstractMechanism, name: str, seconds: str, square: bool = False
-) -> str:
-    """Unit of a force per position, or per squared velocity."""
-    position = system.states[system.joint(name)].unit
-    power = "^2" if square else ""
-    return f"{_force_unit(system, name)}{seconds}/{position}{power}"

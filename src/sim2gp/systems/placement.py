@@ -17,10 +17,9 @@ from sim2gp.systems.effects import (
     AbstractForce,
     AbstractGeometry,
     Pair,
-    gravity_of,
-    only_on,
 )
 from sim2gp.systems.furuta import Furuta
+from sim2gp.systems.homes import gravity_of, only_on
 from sim2gp.types import Scalar
 
 _SUBSTEP = 0.005  # s, as for every effect without dry friction
@@ -74,7 +73,7 @@ class AbstractBaseTilt(AbstractForce):
     max_substep: ClassVar[float] = _SUBSTEP
 
     def unit(self, system: AbstractMechanism) -> str:
-        only_on(self, system, {Furuta: "theta"})
+        only_on(self.name, system, {Furuta: "theta"})
         return "rad"
 
     def force(
@@ -120,7 +119,7 @@ class Payload(AbstractGeometry):
     max_substep: ClassVar[float] = _SUBSTEP
 
     def unit(self, system: AbstractMechanism) -> str:
-        only_on(self, system, {Furuta: "alpha", CartPole: "theta"})
+        only_on(self.name, system, {Furuta: "alpha", CartPole: "theta"})
         return "kg"
 
     def inertia(
