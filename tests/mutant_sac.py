@@ -4,6 +4,7 @@ from mutant_list import Mutant
 
 SAC, NETWORKS = "planning/sac.py", "planning/networks.py"
 RANDOMISED, POLICY, EXPORT = "randomised.py", "robot/policy.py", "robot/export.py"
+FLIGHT = "flight.py"
 
 OFF_POLICY = (
     Mutant(
@@ -120,7 +121,7 @@ OFF_POLICY = (
     ),
     Mutant(
         "randomised: every episode has the mean machine",
-        RANDOMISED,
+        FLIGHT,
         "self.constants.sample(which)",
         "self.constants.mean",
         ("test_randomised.py", "each_reset"),

@@ -18,7 +18,7 @@ from sim2gp.models.windows import WindowsBelief, linearise
 from sim2gp.parameters import Parameter, Parameters
 from sim2gp.planning import AbstractPlanner
 from sim2gp.robot.export import export_model
-from sim2gp.systems import ODE, BlackBox, Channel
+from sim2gp.systems import ODE, BlackBox, Channel, Furuta
 from sim2gp.tasks import furuta_swingup
 from sim2gp.transitions import Transitions
 from sim2gp.types import in_float64
@@ -279,7 +279,7 @@ class Broken(AbstractPlanner):
 def test_a_fault_amid_an_episode_is_one_line_too() -> None:
     """Of a draw that is planned in, or trained in; what is not ours passes."""
     task = furuta_swingup()
-    world, model = oracle_world(task), Sim2GP(EXACT, dt=DT)
+    world, model = oracle_world(task), Sim2GP(Furuta())
     ours = Broken("A traceback:\n  a line\nInputError: E173 told.")
     with pytest.raises(InputError, match=r"^E173 told\.$"):
         episode(task, ours, (), world, key=KEY)

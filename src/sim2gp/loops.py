@@ -79,6 +79,12 @@ def expected(belief: AbstractBelief, key: Key) -> Dynamics:
     return belief.point()
 
 
+def _check_counts(episodes: int, history: int, update_every: int | None) -> None:
+    """E148 for numbers that no run can have."""
+    checks.count("a run", episodes=episodes, update_every=update_every)
+    checks.whole("a run", history=history)
+
+
 @of_callbacks()
 def posterior_sampling(
     task: Task,
@@ -104,8 +110,7 @@ def posterior_sampling(
     learned from: where returns are all that is asked. ``on_episode`` is called after
     each fit. Raises what the fit raises, `NotFinite`, and E148 for an impossible count.
     """
-    checks.count("a run", episodes=episodes, update_every=update_every)
-    checks.whole("a run", history=history)
+    _check_counts(episodes, history, update_every)
     m = task.actions.low.size
     data = Transitions.empty(episodes * task.horizon, task.size + history * m, m)
     belief = model.init(key_for(key, 0, Purpose.INIT))
