@@ -3,8 +3,7 @@
 A command imports its experiment when it runs: help and a mistyped option cost nothing.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,9 +11,10 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from sim2gp.cli.arguments import numbers, pairs, usage_error
+from sim2gp.cli.late import budget, experiment, read_project, run_directory
 from sim2gp.cli.options import Budgeted, Chosen, Common, Reads, Wide, Writes
 from sim2gp.runs import Progress, load_run
-from sim2gp.runs.store import check_absent, check_target
+from sim2gp.runs.store import check_absent
 from sim2gp.runs.workers import cores
 
 #: Figure, and the module of `sim2gp.experiments` that makes it.
@@ -46,8 +46,8 @@ class Demo(Writes):
     """Write each episode's numbers, as they come, beside the run directory."""
 
     def run(self, progress: Progress) -> dict[str, Any]:
-        return _experiment("demo")(
-            out=_out(self.out, "demo"),
+        return experiment("demo")(
+            out=run_directory(self.out, "demo"),
             machine=self.machine,
             seed=self.seed,
             seeds=self.seeds,
@@ -86,7 +86,7 @@ class Init(Budgeted):
             out,
             key=jax.random.key(self.seed),
             period=self.period,
-            budget=_budget(self.budget),
+            budget=budget(self.budget),
         )
         found: dict[str, Any] = drafts.told(draft, out)
         return found
@@ -110,9 +110,9 @@ class Identify(Reads):
     """No second fit, which forecasts data that it has not seen."""
 
     def run(self, progress: Progress) -> dict[str, Any]:
-        out = _out(self.out, self.project.stem)
-        read = _read(self.project, self)
-        return _experiment("identify")(
+        out = run_directory(self.out, self.project.stem)
+        read = read_project(self.project, self)
+        return experiment("identify")(
             *read,
             out=out,
             seed=self.seed,
@@ -139,7 +139,7 @@ class Evaluate(Reads, Chosen):
         name = self.run_or_project.stem
         how: dict[str, Any] = {
             "horizon": self.horizon,
-            "out": _out(self.out, f"evaluate-{name}"),
+            "out": run_directory(self.out, f"evaluate-{name}"),
             "progress": progress,
         }
         if self.run_or_project.suffix == ".toml":
@@ -148,17 +148,17 @@ class Evaluate(Reads, Chosen):
                     fix = f"leave --{option} out, or name a run"
                     expected = "a project file alone: its own logs are left out"
                     raise usage_error("too much", f"--{option}", expected, fix)
-            read = _read(self.run_or_project, self)
-            return _experiment("evaluate", "leave_one_out")(*read, **how)
+            read = read_project(self.run_or_project, self)
+            return experiment("evaluate", "leave_one_out")(*read, **how)
         load_run(self.run_or_project)  # a folder that is no run fails before the work
         if not self.logs:
             expected, fix = "--logs FILE...", "name the logs to predict"
             raise usage_error("no logs", "no --logs", expected, fix)
-        fit = _experiment("identified", "restored")(self.run_or_project)
-        fit = fit.within(_budget(self.budget))
+        fit = experiment("identified", "restored")(self.run_or_project)
+        fit = fit.within(budget(self.budget))
         tested = fit.read(self.logs, self.configuration, strict=self.strict)
         how |= {"configuration": self.configuration, "files": self.logs}
-        return _experiment("evaluate")(fit, tested, **how)
+        return experiment("evaluate")(fit, tested, **how)
 
 
 @dataclass(kw_only=True)
@@ -171,14 +171,14 @@ class Explain(Reads):
     """Write the winner into the project file, so that identify fits it."""
 
     def run(self, progress: Progress) -> dict[str, Any]:
-        out = _out(self.out, f"explain-{self.path.name}")
+        out = run_directory(self.out, f"explain-{self.path.name}")
         load_run(self.path)  # a folder that is no run fails before the work
-        return _experiment("explain")(
+        return experiment("explain")(
             self.path,
             add=self.add,
             out=out,
             strict=self.strict,
-            budget=_budget(self.budget),
+            budget=budget(self.budget),
             progress=progress,
         )
 
@@ -195,9 +195,9 @@ class Compare(Reads):
     """Open-loop horizons in s."""
 
     def run(self, progress: Progress) -> dict[str, Any]:
-        out = _out(self.out, f"compare-{self.project.stem}")
-        read = _read(self.project, self, alike=True)
-        return _experiment("compare")(
+        out = run_directory(self.out, f"compare-{self.project.stem}")
+        read = read_project(self.project, self, alike=True)
+        return experiment("compare")(
             *read,
             horizons=self.horizon,
             out=out,
@@ -236,13 +236,13 @@ class Design(Writes, Chosen):
     """Draws machines and motions."""
 
     def run(self, progress: Progress) -> dict[str, Any]:
-        out = _out(self.out, f"design-{self.run_or_project.stem}")
+        out = run_directory(self.out, f"design-{self.run_or_project.stem}")
         source: Any = self.run_or_project
         if source.suffix == ".toml":
             source = import_module("sim2gp.project").load_project(source)
         else:
             load_run(source)  # a folder that is no run fails early
-            source = _experiment("identified", "restored")(source)
+            source = experiment("identified", "restored")(source)
         asked = import_module("sim2gp.experiments.design_verdict").Asked(
             seconds=self.seconds,
             kind=self.kind,
@@ -256,7 +256,7 @@ class Design(Writes, Chosen):
             starts=self.starts,
             configuration=self.configuration,
         )
-        return _experiment("design")(
+        return experiment("design")(
             source, asked, out=out, seed=self.seed, progress=progress
         )
 
@@ -275,7 +275,7 @@ class Apply(Wide):
     """Change the model's file itself."""
 
     def run(self, progress: Progress) -> dict[str, Any]:
-        return _experiment("apply")(
+        return experiment("apply")(
             self.path,
             out=self.out,
             model=self.model,
@@ -298,10 +298,10 @@ class Export(Writes, Wide):
     """Draws them."""
 
     def run(self, progress: Progress) -> dict[str, Any]:
-        out = _out(self.out, f"export-{self.path.name}")
+        out = run_directory(self.out, f"export-{self.path.name}")
         load_run(self.path)  # a folder that is no run fails before the work
-        fit = _experiment("identified", "restored")(self.path)
-        return _experiment("export")(
+        fit = experiment("identified", "restored")(self.path)
+        return experiment("export")(
             fit,
             draws=self.draws,
             out=out,
@@ -334,7 +334,7 @@ class Selftest(Common):
     """Draws the problems."""
 
     def run(self, progress: Progress) -> dict[str, Any]:
-        return _experiment("selftest")(seed=self.seed, progress=progress)
+        return experiment("selftest")(seed=self.seed, progress=progress)
 
 
 @dataclass(kw_only=True)
@@ -379,8 +379,8 @@ class Reproduce(Writes):
             more["workers"] = self.workers or cores()
         if FIGURES[self.figure] in ("figure2", "figure3"):  # of two figures each
             more["figure"] = self.figure
-        return _experiment(FIGURES[self.figure])(
-            out=_out(self.out, self.figure),
+        return experiment(FIGURES[self.figure])(
+            out=run_directory(self.out, self.figure),
             seed=self.seed,
             quick=self.quick,
             progress=progress,
@@ -402,28 +402,3 @@ COMMANDS: dict[str, type[Common]] = {
     "selftest": Selftest,
     "reproduce": Reproduce,
 }
-
-
-def _out(out: Path | None, name: str) -> Path:
-    """The run directory; refused before the work if it is somebody else's."""
-    path = Path("runs") / name if out is None else out
-    check_target(path)
-    return path
-
-
-def _read(path: Path, given: Reads, *, alike: bool = False) -> tuple[Any, Any]:
-    """A project and its logs; an error of theirs is told before the fits are loaded."""
-    project = import_module("sim2gp.project").load_project(path)
-    project = replace(project, budget=_budget(given.budget))
-    return project, project.load_logs(strict=given.strict, alike=alike)
-
-
-def _budget(factor: float) -> Any:
-    return import_module("sim2gp.logs").Budget().times(factor)
-
-
-def _experiment(module: str, name: str = "run") -> Callable[..., Any]:
-    found: Callable[..., Any] = getattr(
-        import_module(f"sim2gp.experiments.{module}"), name
-    )
-    return found
