@@ -176,11 +176,11 @@ LOGS = (
         ("test_formats.py", "by_columns"),
     ),
     Mutant(
-        "files: what is declared is allocated",
-        FILE,
-        "if declared > MAX_BYTES or bomb:",
+        "budget: a chunk may be larger than it declares",
+        "logs/budget.py",
+        "if count > declared:",
         "if False:",
-        ("test_bad_formats.py", "unpacked"),
+        ("test_budget.py", None),
     ),
     Mutant(
         "files: a file may change while it is read",
@@ -188,13 +188,6 @@ LOGS = (
         "(before.st_size, before.st_mtime_ns) != (after.st_size, after.st_mtime_ns)",
         "before.st_size != after.st_size",
         ("test_bad_formats.py", "grows"),
-    ),
-    Mutant(
-        "parquet: the first column that pyarrow brings is the one",
-        PARQUET,
-        "table.column(name)",
-        "table.column(0)",
-        ("test_formats.py", "with_dots"),
     ),
     Mutant(
         "parquet: checksums are not looked at",

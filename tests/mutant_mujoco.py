@@ -255,7 +255,7 @@ ON_THE_HOST = (
     Mutant(
         "apply: the file may be another one",
         "experiments/identified.py",
-        "    _check_fitted(project, x)\n",
+        "    _check_fitted(project.spec.system, project.system.parameters, x)\n",
         "",
         ("test_project_model.py", "changed_in_place"),
     ),
