@@ -148,6 +148,13 @@ SECOND: tuple[Case, ...] = (
             "low = 1, high = 0.5",
         ),
         project("[limits]\nx = [1.0, -1.0]", "E141", "line 3", "limits of x reversed"),
+        project(
+            'logs = [{files = ["a.csv"], columns = {x = {column = "a", saturation = '
+            "[1.0, -1.0]}, voltage = 0.0}}]",
+            "E141",
+            "line 2",
+            "saturation of x reversed",
+        ),
     ),
     case(
         51,
@@ -188,12 +195,19 @@ SECOND: tuple[Case, ...] = (
         project("[likelihood]\nnoise_floor = 0.0", "E144", "line 3"),
         project("[likelihood]\nnoise_floor = nan", "E144", "line 3", "nan"),
         project("[likelihood]\nstart_sd = {x = -1.0}", "E144", "line 3", "-1"),
+        project(
+            "[parameters.cart_mass]\nmean = 0.4\nrelative_sd = 0.0", "E144", "line 4"
+        ),
+        project(
+            '[[weighed]]\nof = ["cart_mass"]\nvalue = 0.4\nsd = 0.0', "E144", "line 5"
+        ),
     ),
     case(
         56,
         "duplicate or unknown parameter",
         project("[parameters]\ncart_mass = 1.0\ncart_mass = 2.0", "E145", "line 4"),
         project("[parameters]\ncart_mas = 1.0", "E145", "line 3", "mean cart_mass"),
+        project("[effects.theta]\ntilt = 0.1", "E145", "line 3", "effects.x.tilt"),
     ),
     # One such constant keeps its prior and its verdict is `dead`; all are an error.
     case(
@@ -227,6 +241,10 @@ SECOND: tuple[Case, ...] = (
         61,
         "unknown config key",
         project("[likelyhood]\n", "E160", "line 2", "did you mean likelihood"),
+        project(
+            "[options]\nlength1 = 0.2", "E160", "line 3", "one of motor_resistance"
+        ),
+        written('sytem = "cartpole"', "E160", "line 1", "did you mean system"),
         project("[task]", "E160", "line 2", "not used by any command yet"),
         project("[model]", "E160", "line 2", "not used by any command yet"),
         project("[planner]\nelites = 3", "E160", "line 2", "not used by any command"),
@@ -237,6 +255,9 @@ SECOND: tuple[Case, ...] = (
         project("[likelihood]\nrobust = yes", "E160", "line 3"),
         project('[likelihood]\nrobust = "yes"', "E160", "line 3", "true or false"),
         project('[likelihood]\nwindow = "1e-3"', "E160", "line 3", "without quotes"),
+        project('[likelihood]\nwindow = "0.2 s"', "E160", "line 3", "write 0.2"),
+        project("[logs]\nfiles = ['a.csv']", "E160", "line 2", "write [[logs]]"),
+        written('system = "mujoco:a.xml"', "E160", "line 1", "the file's name"),
     ),
     case(
         63,
@@ -256,6 +277,7 @@ SECOND: tuple[Case, ...] = (
         "nested or large",
         project("a = " + "[" * 65 + "]" * 65, "E161", "nesting of 65"),
         project("a = " + "[" * 100_000, "E161", "nesting of 100000"),
+        project(".".join("a" * 65) + " = 1", "E161", "nesting of 65"),
         project("# " + "x" * 1_000_000, "E161", "1000022 characters"),
     ),
     case(

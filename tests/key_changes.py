@@ -175,18 +175,18 @@ CHANGES: dict[str, Change] = {
     ),
     "effects.*.*": ("", "[effects.x]\nspring = 1.0\n", machine),
     "effects.*.*.width": (
-        "[effects.x.coulomb]\nsd = 1.0\n",
-        "[effects.x.coulomb]\nsd = 1.0\nwidth = 0.2\n",
+        "[effects.x.coulomb]\nmean = 0.0\nsd = 1.0\n",
+        "[effects.x.coulomb]\nmean = 0.0\nsd = 1.0\nwidth = 0.2\n",
         machine,
     ),
     "effects.*.*.speed": (
-        "[effects.x.stribeck]\nsd = 1.0\n",
-        "[effects.x.stribeck]\nsd = 1.0\nspeed = 0.2\n",
+        "[effects.x.stribeck]\nmean = 0.0\nsd = 1.0\n",
+        "[effects.x.stribeck]\nmean = 0.0\nsd = 1.0\nspeed = 0.2\n",
         machine,
     ),
     "effects.*.*.smoothing": (
-        "[effects.voltage.dead_zone]\nsd = 1.0\n",
-        "[effects.voltage.dead_zone]\nsd = 1.0\nsmoothing = 0.2\n",
+        "[effects.voltage.dead_zone]\nmean = 0.0\nsd = 1.0\n",
+        "[effects.voltage.dead_zone]\nmean = 0.0\nsd = 1.0\nsmoothing = 0.2\n",
         machine,
     ),
     "weighed.of": (

@@ -142,6 +142,35 @@ def test_an_encoder_of_a_model_may_be_off(tmp_path: Path) -> None:
     assert dict(table.fixed)["shoulder.encoder"] == 0.1
 
 
+def test_an_sd_alone_is_about_the_machines_own_number(tmp_path: Path) -> None:
+    """The same priors as with that number written as the mean; else a mean is due."""
+    pairs = {
+        '[parameters."joint/elbow/damping"]': 0.02,
+        '[parameters."body/lower/com_x"]': 0.0,
+        '[parameters."body/lower/com_z"]': -0.15,
+        "[effects.elbow.encoder]": 0.0,
+        "[actuators.push.gain]": 1.0,
+        "[actuators.push.offset]": 0.0,
+    }
+    tables = []
+    for mean in ("", "mean = {}\n"):
+        rows = [f"{head}\nsd = 0.005\n{mean.format(x)}" for head, x in pairs.items()]
+        tables.append(load_project(project(tmp_path, "".join(rows))).system.parameters)
+    bare, stated = tables
+    assert len(bare.free) == len(pairs)
+    for one, other in zip(bare.free, stated.free, strict=True):
+        assert (one.name, one.map) == (other.name, other.map)
+        np.testing.assert_allclose(
+            (one.mean, one.sd), (other.mean, other.sd), atol=1e-12
+        )
+    for text in (
+        '[parameters."joint/elbow/frictionloss"]\nsd = 0.1\n',  # zero in the file
+        "[actuators.push]\ndelay = {sd = 0.01}\n",
+    ):
+        with pytest.raises(InputError, match="E160 incomplete prior: mean and sd"):
+            load_project(project(tmp_path, text))
+
+
 def test_a_tie_is_for_files(tmp_path: Path) -> None:
     path = tmp_path / "p.toml"
     path.write_text('system = "furuta"\n[parameters.arm_mass]\ntie = true\n' + LOGS)

@@ -137,7 +137,7 @@ def _effect(
 def effect_options(
     what: str, said: EffectSpec | float, known: Collection[str], line: str
 ) -> dict[str, float]:
-    """What an effect has beside its magnitude, each one that it knows (E160)."""
+    """What an effect has besides its magnitude, each one that it knows (E160)."""
     stated = () if isinstance(said, float) else EFFECT_OPTIONS
     given = {name: getattr(said, name) for name in stated}
     options = {name: value for name, value in given.items() if value is not None}

@@ -8,7 +8,7 @@ LISTS = ("logs", "weighed")
 #: The last part of a channel's name that has two, which needs quotes.
 PARTS = ("velocity", "control")
 
-#: What Python's parser says, what stands where it stopped, and the fix.
+#: What Python's parser says, the text where it stopped, and the fix.
 _SYNTAX: Sequence[tuple[str, str, str]] = (
     ("Invalid value", r"[+-]?\.\d", "write a digit before the point, as in 0.5"),
     ("Expected newline", r"\.(?!\d)", "write a digit after the point, as in 5.0"),

@@ -107,7 +107,7 @@ def _wrong(
     code = "E160"
     if kind == "finite_number" and path[-1] in ("low", "high"):
         code = "E141"
-    elif {"sd", "start_sd", "noise_floor"} & set(path):
+    elif {"sd", "relative_sd", "start_sd", "noise_floor"} & set(path):
         code = "E144" if kind in ("greater_than", "finite_number") else "E160"
     fix = slips.of_value(path, value, expected)
     choices = [e["ctx"]["expected"] for e in same if e["type"] == "literal_error"]
