@@ -11,21 +11,11 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from sim2gp.cli.arguments import numbers, pairs, usage_error
-from sim2gp.cli.late import budget, experiment, read_project, run_directory
+from sim2gp.cli.late import FIGURES, budget, experiment, read_project, run_directory
 from sim2gp.cli.options import Budgeted, Chosen, Common, Reads, Wide, Writes
 from sim2gp.runs import Progress, load_run
 from sim2gp.runs.store import check_absent
 from sim2gp.runs.workers import cores
-
-#: Figure, and the module of `sim2gp.experiments` that makes it.
-FIGURES = {
-    "fig1": "two_link",
-    "fig2": "figure2",
-    "fig3": "figure3",
-    "fig4": "figure2",
-    "fig5": "figure3",
-    "mismatch": "mismatch",
-}
 
 
 @dataclass(kw_only=True)

@@ -12,6 +12,16 @@ from typing import Any
 from sim2gp.cli.options import Reads
 from sim2gp.runs.store import check_target
 
+#: Figure, and the module of `sim2gp.experiments` that makes it.
+FIGURES = {
+    "fig1": "two_link",
+    "fig2": "figure2",
+    "fig3": "figure3",
+    "fig4": "figure2",
+    "fig5": "figure3",
+    "mismatch": "mismatch",
+}
+
 
 def run_directory(out: Path | None, name: str) -> Path:
     """The run directory; refused before the work if it is somebody else's."""

@@ -105,20 +105,33 @@ def read_log(
     found = recordings(
         path, wanted, time=named, period=period, episode=episode, budget=budget
     )
+    about = checks.unused(_left(found[0].tables), shown(path))
+    logs = _episodes(found, plan, path, dict(fixed or {}), group, about)
+    if not logs:
+        raise _too_short(shown(path), 1)
+    about += misaligned(max(logs, key=len), states, longest_delay)
+    return (replace(logs[0], notes=(*logs[0].notes, *about)), *logs[1:])
+
+
+def _episodes(
+    found: Sequence[Recording],
+    plan: _Plan,
+    path: Path,
+    fixed: dict[str, float],
+    group: int,
+    about: list[Note],
+) -> list[Log]:
+    """The logs of all recordings of a file; ``about`` gets those of one row."""
     name = path.name if path.is_dir() else path.stem
     logs: list[Log] = []
-    about = checks.unused(_left(found[0].tables), shown(path))
     for recording in found:
         if len(found) > 1 and min(len(t.rows.numbers) for t in recording.tables) < 2:
             text = f"episode {recording.episode} of {shown(path)} has one row"
             about.append(Note("W116", f"{text}: it is left out"))
             continue
         called = f"{name}[{recording.episode}]" if recording.episode else name
-        logs += _assembled(recording, plan, called, dict(fixed or {}), group)
-    if not logs:
-        raise _too_short(shown(path), 1)
-    about += misaligned(max(logs, key=len), states, longest_delay)
-    return (replace(logs[0], notes=(*logs[0].notes, *about)), *logs[1:])
+        logs += _assembled(recording, plan, called, fixed, group)
+    return logs
 
 
 def _assembled(
