@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sim2gp.errors import InputError
+from sim2gp.errors import InputError, nearest
 from sim2gp.logs.log import ChannelLike, Column, Log, Note
 from sim2gp.logs.table import Rows
 
@@ -342,3 +342,44 @@ def shared_rows(train: Sequence[Log], test: Sequence[Log]) -> list[Note]:
             text = f"{count} rows of {log.source} were also fitted to"
             notes.append(Note("W128", text))
     return notes
+
+
+def check_names(
+    columns: Mapping[str, object],
+    states: Sequence[ChannelLike],
+    actions: Sequence[ChannelLike],
+    where: str,
+) -> None:
+    """E160 for a channel of another system, an input without column, no state."""
+    measurable = [c.name for c in states]
+    commands = [c.name for c in actions]
+    for name in columns:
+        if name not in (*measurable, *commands):
+            close = nearest(name, [*measurable, *commands])
+            raise InputError(
+                "E160",
+                f"unknown channel {name}",
+                where=f"columns for {where}",
+                got=name,
+                expected="one of " + ", ".join([*measurable, *commands]),
+                fix=f"did you mean {close}" if close else "use a name of the system",
+            )
+    for name in commands:
+        if name not in columns:
+            raise InputError(
+                "E160",
+                f"no column for input {name}",
+                where=f"columns for {where}",
+                got=", ".join(columns) or "no columns",
+                expected=f"{name} = a column, or a constant number",
+                fix=f"add {name} to the columns",
+            )
+    if not any(name in columns for name in measurable):
+        raise InputError(
+            "E160",
+            "nothing measured",
+            where=f"columns for {where}",
+            got=", ".join(columns),
+            expected="at least one of " + ", ".join(measurable),
+            fix="add a measured channel to the columns",
+        )

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sim2gp.errors import InputError, nearest
+from sim2gp.errors import InputError
 from sim2gp.logs import checks
 from sim2gp.logs.alignment import misaligned
 from sim2gp.logs.budget import Budget
@@ -85,7 +85,7 @@ def read_log(
     Raises `InputError` with the codes of bad recordings (E101 to E141, E180, E182).
     """
     path = Path(path)
-    _check_names(columns, states, actions, shown(path))
+    checks.check_names(columns, states, actions, shown(path))
     named = time.column if isinstance(time, Column) else time
     clock = time if isinstance(time, Column) else Column(time or TIME, "s")
     plan = _Plan(
@@ -194,46 +194,6 @@ def _track(table: Table, plan: _Plan) -> Track:
     inputs, clipped = _inputs(table, plan)
     said = (*table.notes, *notes, *masked, *clipped)
     return Track(table.stream, rows, time, cuts, channels, mask, inputs, said)
-
-
-def _check_names(
-    columns: Mapping[str, object],
-    states: Sequence[ChannelLike],
-    actions: Sequence[ChannelLike],
-    where: str,
-) -> None:
-    measurable = [c.name for c in states]
-    commands = [c.name for c in actions]
-    for name in columns:
-        if name not in (*measurable, *commands):
-            close = nearest(name, [*measurable, *commands])
-            raise InputError(
-                "E160",
-                f"unknown channel {name}",
-                where=f"columns for {where}",
-                got=name,
-                expected="one of " + ", ".join([*measurable, *commands]),
-                fix=f"did you mean {close}" if close else "use a name of the system",
-            )
-    for name in commands:
-        if name not in columns:
-            raise InputError(
-                "E160",
-                f"no column for input {name}",
-                where=f"columns for {where}",
-                got=", ".join(columns) or "no columns",
-                expected=f"{name} = a column, or a constant number",
-                fix=f"add {name} to the columns",
-            )
-    if not any(name in columns for name in measurable):
-        raise InputError(
-            "E160",
-            "nothing measured",
-            where=f"columns for {where}",
-            got=", ".join(columns),
-            expected="at least one of " + ", ".join(measurable),
-            fix="add a measured channel to the columns",
-        )
 
 
 def _usable(table: Table, plan: _Plan) -> tuple[Table, Values, Mask, list[Note]]:
