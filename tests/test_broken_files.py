@@ -1,5 +1,10 @@
 """Recordings cut off or with bytes changed: columns, or one line that says so."""
 
+import contextlib
+import json
+import struct
+import time
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,9 +15,16 @@ import pytest
 import recordings as rec
 from sim2gp.errors import InputError
 from sim2gp.logs import columns_of
+from sim2gp.logs.arrays import Entry, distinct
+from sim2gp.logs.file import MAGIC, SUFFIXES
+from sim2gp.logs.hdf5 import episodes_of
+from sim2gp.project.project import read_spec
+from sim2gp.project.source import read_source
+from sim2gp.runs import load_run
 
 TABLE = rec.motion(rows=120)
 WRITTEN: dict[str, Callable[[Path], Any]] = {
+    "a.csv": lambda path: rec.write_csv(path, TABLE),
     "a.npz": lambda path: rec.write_npz(path, TABLE),
     "a.parquet": lambda path: rec.write_parquet(path, TABLE),
     "a.h5": lambda path: rec.write_hdf5(path, [TABLE, TABLE]),
@@ -40,6 +52,12 @@ def test_no_bytes_break_a_reader(name: str, rounds: int, tmp_path: Path) -> None
         for place in rng.integers(16, len(whole), 4):
             changed[place] ^= int(rng.integers(1, 256))
         spoilt.append(bytes(changed))
+        # Garbage behind the first bytes, and in the middle.
+        magic = MAGIC.get(SUFFIXES.get(path.suffix, ""), b"")
+        noise = rng.integers(0, 256, int(rng.integers(1, 2000))).astype(np.uint8)
+        spoilt.append(magic + noise.tobytes())
+        place = int(rng.integers(len(magic), len(whole)))
+        spoilt.append(whole[:place] + noise.tobytes() + whole[place:])
     lines = []
     for content in spoilt:
         path.write_bytes(content)
@@ -49,3 +67,134 @@ def test_no_bytes_break_a_reader(name: str, rounds: int, tmp_path: Path) -> None
             lines.append(str(error))
     assert len(lines) >= 3
     assert not any("\n" in line for line in lines)
+
+
+def npz_of(header: bytes) -> Callable[[Path], None]:
+    """An archive of one array with a header of these bytes."""
+
+    def write(path: Path) -> None:
+        start = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header
+        with zipfile.ZipFile(path, "w") as file:
+            file.writestr("q.npy", start + bytes(24))
+
+    return write
+
+
+#: What evaluates an array's header, or counts on another form, stumbles here.
+HEADERS = (
+    b"{'descr': '<f8', 'fortran_order': False, 'shape': (3,",
+    b"{'descr': '<f8', 'fortran_order': False, 'shape': (3,)",
+    b"{'descr': '<f8', 'fortran_order': False, 'shape': (3,), }}",
+    b"{'descr': '<f8', 'fortran_order': 0, 'shape': (3,), }",
+    b"{'descr': '<f8', 'fortran_order': False, 'shape': (-3,), }",
+    b"{'descr': '<f8', 'fortran_order': False, 'shape': (3.0,), }",
+    b"{'descr': '<f8', 'fortran_order': False, 'shape': (3 * 1,), }",
+    b"{'descr': '<f8', 'fortran_order': False, 'shape': 3, }",
+    b"{'descr': '<f8', 'shape': (3,), 'shape': (3,), }",
+    b"{'descr': '<z8', 'fortran_order': False, 'shape': (3,), }",
+    b"{'descr': __import__('os'), 'fortran_order': False, 'shape': (3,), }",
+    b"{'descr': '<f8', 'fortran_order': False, 'shape': (" + b"1," * 40 + b"), }",
+    b"\xff\xfe'",
+    b"''" + b"'",
+    b"(" * 900,
+    b"",
+)
+
+
+@pytest.mark.parametrize("header", HEADERS)
+def test_a_malformed_header_of_an_array(header: bytes, tmp_path: Path) -> None:
+    npz_of(header)(tmp_path / "a.npz")
+    with pytest.raises(InputError, match=r"^E12[56] .*a\.npz:array q") as caught:
+        columns_of(tmp_path / "a.npz")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_field_beyond_the_parsers_limit(tmp_path: Path) -> None:
+    """Python's CSV parser takes 128 KiB for a field: in a header, in a row, quoted."""
+    path, long = tmp_path / "a.csv", "9" * 200_000
+    for text, line in (
+        (f"time,{long}\n0,1\n1,2\n", 1),
+        (f"time,q\n0,1\n1,{long}x\n", 3),
+        (f'time,q\n0,1\n1,2\n2,"{long}"\n', 4),
+    ):
+        path.write_text(text)
+        with pytest.raises(InputError, match=rf"^E121 .*a\.csv:line {line}: got field"):
+            columns_of(path)
+
+
+@pytest.mark.parametrize(
+    "manifest",
+    [
+        {"format": "1", "files": {}},
+        {"format": [], "files": {}},
+        {"format": 1, "files": []},
+        {"format": 1, "files": {"summary.json": None}},
+        {"format": 1, "files": {"summary.json": {"sha256": 1}}},
+        {"format": 1, "files": {"arrays.npz": {}}},
+        [1],
+        "format",
+    ],
+)
+def test_an_odd_manifest(manifest: Any, tmp_path: Path) -> None:
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    (tmp_path / "summary.json").write_text("{}")
+    with pytest.raises(InputError, match=r"^E18[35] .*manifest\.json"):
+        load_run(tmp_path)
+
+
+def project(text: str, read: Callable[[Path], Any]) -> Callable[[Path], Any]:
+    def run(folder: Path) -> None:
+        (folder / "p.toml").write_text(text)
+        read(folder / "p.toml")
+
+    return run
+
+
+def wide(columns: int) -> Callable[[Path], Any]:
+    """A table of so many columns, of which one is read."""
+    names = ",".join(f"c{i}" for i in range(columns))
+    rows = "\n".join(",".join(["1"] * columns) for _ in range(2))
+
+    def run(folder: Path) -> None:
+        (folder / "a.csv").write_text(f"{names}\n{rows}\n")
+        columns_of(folder / "a.csv")
+
+    return run
+
+
+def grouped(episodes: int) -> Callable[[Path], Any]:
+    entry = Entry((1,), np.dtype(float), lambda: np.zeros(1))
+    entries = {f"demo_{i}/q": entry for i in range(episodes)}
+    return lambda folder: episodes_of(entries, {"q"})
+
+
+#: Work whose time must grow as its size does: a size, and what is done at it.
+WORK: dict[str, tuple[int, Callable[[int], Callable[[Path], Any]]]] = {
+    "one word": (3000, lambda n: project("a" * n, read_source)),
+    "open strings": (3000, lambda n: project('"""' + '\\"""' * n, read_source)),
+    "unknown keys": (
+        700,
+        lambda n: project("".join(f"k{i} = 1\n" for i in range(n)), read_spec),
+    ),
+    "wide CSV": (8000, wide),
+    "names": (8000, lambda n: lambda _: distinct([f"c{i}" for i in range(n)], "a")),
+    "episodes": (1000, grouped),
+}
+
+
+@pytest.mark.parametrize("name", WORK)
+def test_time_grows_as_the_size_does(name: str, tmp_path: Path) -> None:
+    """Four times as much takes about four times as long, where sixteen would show."""
+    size, make = WORK[name]
+
+    def seconds(n: int) -> float:
+        run, least = make(n), np.inf
+        for _ in range(3):
+            started = time.process_time()
+            with contextlib.suppress(InputError):
+                run(tmp_path)
+            least = min(least, time.process_time() - started)
+        return least
+
+    small = max(seconds(size), 0.01)
+    assert seconds(4 * size) < 9.0 * small
