@@ -85,7 +85,7 @@ def float64() -> Iterator[None]:
 
 @pytest.fixture
 def lenient_promotion() -> Iterator[None]:
-    """For code of others that mixes ranks and dtypes inside: MJX, optax."""
+    """For code of others that mixes ranks and dtypes inside: MJX."""
     with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
         yield
 
