@@ -270,3 +270,11 @@ def test_a_model_loads_under_a_lower_limit_of_memory(tmp_path: Path) -> None:
     limited = ["sh", "-c", 'ulimit -v 7000000; exec "$0" "$@"', *command]
     done = subprocess.run(limited, capture_output=True, text=True)
     assert (done.stdout, done.returncode) == ("4\n", 0), done.stderr[-2000:]
+
+
+def test_without_lxml_the_extra_is_named(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "lxml", None)
+    with pytest.raises(
+        InputError, match=r"E135 .*lxml.*pip install 'sim2gp\[mujoco\]'"
+    ):
+        sy.MuJoCo(written(tmp_path, CRAWLER.format(**USUAL)))
