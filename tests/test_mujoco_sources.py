@@ -53,7 +53,7 @@ def test_no_spelling_of_a_path_leads_outside(tmp_path: Path, spelling: str) -> N
 #: Where MuJoCo looks for the files of each: main text, parts by name, meshes by size.
 LAYOUTS = {
     "folders": (
-        '<compiler meshdir="a//b/.." assetdir="c"/><asset><mesh name="m" '
+        '<compiler meshdir="a/b/.." assetdir="c"/><asset><mesh name="m" '
         'file="./p/x.stl"/><mesh name="n" file="q\\x.stl"/></asset>',
         {},
         {"a/p/x.stl": 0.1, "a/q/x.stl": 0.2, "x.stl": 0.3, "c/x.stl": 0.4},
@@ -167,6 +167,15 @@ def test_files_that_mujoco_could_confuse_are_refused(tmp_path: Path) -> None:
     with pytest.raises(
         InputError, match=r"E172 two files of one name.*two\.xml:line 1"
     ):
+        mjcf_load.compiled(path)
+
+
+def test_a_path_with_an_empty_part_is_refused(tmp_path: Path) -> None:
+    """Before version 4 MuJoCo takes any mesh of that name."""
+    (tmp_path / "p").mkdir()
+    (tmp_path / "p" / "x.stl").write_bytes(tetrahedron(0.1))
+    path = written(tmp_path, MESH.format(compiler="", mesh='file="p//x.stl"'))
+    with pytest.raises(InputError, match=r"E170 no model.*empty part in p//x\.stl"):
         mjcf_load.compiled(path)
 
 

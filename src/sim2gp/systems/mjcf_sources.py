@@ -235,7 +235,12 @@ class _Reader:
     ) -> None:
         """Under every name that MuJoCo may ask for: without one it takes another."""
         for name in ways:
-            key = os.path.normpath(_joined(base, name))
+            path = _joined(base, name)
+            if "//" in path:  # which versions of MuJoCo read differently
+                got, fix = f"an empty part in {_shown(path)}", "write one / there"
+                where = document.where(element)
+                raise InputError("E170", "no model", where=where, got=got, fix=fix)
+            key = os.path.normpath(path)
             self._keep(document, element, f"asset/{key}", data)
             self.sources.assets[key] = data
 
