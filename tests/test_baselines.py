@@ -104,9 +104,13 @@ def test_both_predictors_are_in_both_tables() -> None:
             assert [row[held] for row in table["rows"]] == [f"{hold:.4f}"] * len(rows)
             for row, value in zip(table["rows"], rows, strict=True):
                 assert float(row[other]) == float(value)
+    assert summary["losses"] is None  # q2 loses over all, and the sentence says so
+    found.error[:5, :, 1] = 1e-4
+    found.hold[:5, :, 1] = 0.1
+    summary, _ = scores(found, ["q1", "q2"], logs, 0.5)
     assert summary["losses"] == (
-        "Logs in which holding still or a linear regression predicts better: q2 in 2 "
-        "of 2 (log0.0, log1.0)."
+        "Logs in which holding still or a linear regression predicts better: q2 in 1 "
+        "of 2 (log1.0)."
     )
     unknown = judged(errors, math.nan)
     summary, _ = scores(unknown, ["q1", "q2"], logs, 0.5)
@@ -138,7 +142,7 @@ def test_what_cannot_be_compared_is_left_out() -> None:
 def test_logs_that_a_model_loses_are_named() -> None:
     won = {"q": {"better": "holding still", "error": 1.0, "ratio": 0.5}}
     lost = {"q": {"better": "holding still", "error": 1.0, "ratio": 1.5}}
-    assert loss_sentence({"a": won, "b": won}) is None
-    assert loss_sentence({"a": lost}) is None  # the sentence on all of it says so
+    assert loss_sentence({"a": won, "b": won}, won) is None
+    assert loss_sentence({"a": lost, "b": won}, lost) is None
     many = {f"log{k}": lost if k % 2 else won for k in range(10)}
-    assert "q in 5 of 10 (log1, log3, log5, ...)" in str(loss_sentence(many))
+    assert "q in 5 of 10 (log1, log3, log5, ...)" in str(loss_sentence(many, won))

@@ -22,29 +22,40 @@ def regression_errors(
     train: Grid, test: Grid, rows: Int[np.ndarray, " R"]
 ) -> Float[np.ndarray, "W R c"]:
     """Errors of the linear regression; NaN where it has more unknowns than windows."""
-    parts = [_errors_at(train, test, row) for row in rows.tolist()]
+    inputs = [_mean_inputs(grid, int(rows.max())) for grid in (train, test)]
+    parts = []
+    for row in rows.tolist():
+        (x, moved, known), (x2, moved2, _) = (
+            _features(grid, u[:, :row], row)
+            for grid, u in zip((train, test), inputs, strict=True)
+        )
+        if known.sum() > x.shape[1]:
+            weights = np.linalg.lstsq(x[known], moved[known], rcond=None)[0]
+            parts.append(x2 @ weights - moved2)
+        else:
+            parts.append(np.full_like(moved2, np.nan))
     return np.stack(parts, axis=1)
 
 
-def _errors_at(train: Grid, test: Grid, row: int) -> Float[np.ndarray, "W c"]:
-    (x, moved, known), (x2, moved2, _) = (_features(g, row) for g in (train, test))
-    if known.sum() <= x.shape[1]:
-        return np.full_like(moved2, np.nan)
-    weights = np.linalg.lstsq(x[known], moved[known], rcond=None)[0]
-    return np.asarray(x2 @ weights - moved2)
-
-
-def _features(grid: Grid, row: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _mean_inputs(grid: Grid, row: int) -> Float[np.ndarray, "W row m"]:
+    """Every input's mean over each grid step up to a row."""
     w = grid.windows
     edges = PERIOD * np.arange(row + 1)
-    inputs = [
-        np.diff(np.interp(edges, knots, column))
+    means = [
+        [np.diff(np.interp(edges, knots, column)) for column in np.asarray(area).T]
         for knots, area in zip(w.knots, w.area, strict=True)
-        for column in np.asarray(area).T
     ]
-    u = np.asarray(inputs).reshape(len(w), -1) / PERIOD
+    return np.asarray(means).transpose(0, 2, 1) / PERIOD
+
+
+def _features(
+    grid: Grid, inputs: Float[np.ndarray, "W row m"], row: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Start, inputs and one; the displacement at the row; where it was measured."""
+    w = grid.windows
     start = np.asarray(w.start)
-    x = np.concatenate([start, u, np.ones((len(w), 1))], axis=1)
+    u = inputs.transpose(0, 2, 1).reshape(len(start), -1)
+    x = np.concatenate([start, u, np.ones((len(start), 1))], axis=1)
     moved = np.asarray(w.y)[:, row] - start[:, list(w.outputs)]
     return x, moved, np.all(np.asarray(w.mask)[:, row], axis=1, keepdims=False).ravel()
 
@@ -105,17 +116,20 @@ def forecast_sentence(
 
 def loss_sentence(
     by_log: Mapping[str, Mapping[str, Mapping[str, Any]]],
+    pooled: Mapping[str, Mapping[str, Any]],
 ) -> str | None:
-    """In which logs a model is worse than a predictor without mechanics; or None.
+    """In which logs alone a model is worse than a predictor without mechanics; or None.
 
-    ``by_log`` holds `compared`'s answer for each log.
+    ``by_log`` holds `compared`'s answer for each log, ``pooled`` that for all of them:
+    of a channel that loses there, nothing more is said.
     """
     lost: dict[str, list[str]] = {}
     for log, against in by_log.items():
         for name, entry in against.items():
-            if _lost(entry["ratio"]) == "worse":
+            over_all = name in pooled and _lost(pooled[name]["ratio"])
+            if _lost(entry["ratio"]) == "worse" and not over_all:
                 lost.setdefault(name, []).append(log)
-    if not lost or len(by_log) < 2:
+    if not lost:
         return None
     clauses = [
         f"{name} in {len(logs)} of {len(by_log)} ({_first(logs)})"

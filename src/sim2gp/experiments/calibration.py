@@ -116,7 +116,8 @@ def blocks_of(
         of[recording == each] = count + np.arange(windows) * pieces // windows
         count += int(pieces)
     unit = "recording" if len(present) == 1 else "recordings"
-    stretch = f"stretch{'' if count == 1 else 'es'} of about {length * SPACING:.2g} s"
+    mean = SPACING * len(log) / count
+    stretch = f"stretch{'' if count == 1 else 'es'} of about {mean:.2g} s"
     return Blocks(of, count, f"{count} {stretch} in {len(present)} {unit}")
 
 

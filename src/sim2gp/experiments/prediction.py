@@ -174,7 +174,8 @@ def scores(
     measured = found.valid[:, at].any(axis=0)
     error = np.where(measured, model[at], np.nan)
     summary["trivial"] = compared(names, error, hold[at], regression[at])
-    summary["losses"] = loss_sentence(_against_by_log(found, names, logs, at))
+    by_log = _against_by_log(found, names, logs, at)
+    summary["losses"] = loss_sentence(by_log, summary["trivial"])
     some = np.asarray(found.valid.any(axis=(0, 2)))
     curve = np.asarray([i for i in np.flatnonzero(some) if i != one or at == one])
     seconds = found.rows[curve] * PERIOD

@@ -72,8 +72,8 @@ def unseen(
     traces = trace_arrays(picture, found.tested, logs, names, PREFIX)
     summary["left_out"] = part.words
     summary["headline"] = forecast_sentence(
-        f"A fit that had not seen {part.words} forecasts it {horizon:g} s ahead with a "
-        "root mean square error of",
+        f"A fit that had not seen {part.words} forecasts it {horizon:g} s ahead, "
+        "root mean square errors",
         summary["open_loop_rmse"],
         summary["trivial"],
         units(project.system),
