@@ -124,7 +124,8 @@ class TwoLink(AbstractMechanism):
     ) -> None:
         checks.finite("TwoLink", gravity=gravity)
         sizes = {"length1": length1, "coulomb_width": coulomb_width}
-        checks.positive("TwoLink", **sizes, gear_ratio=gear_ratio)
+        checks.positive("TwoLink", **sizes)
+        checks.not_negative("TwoLink", gear_ratio=gear_ratio)  # 0: rotors do not count
         shapes = "tanh", "arctangent"
         checks.one_of("TwoLink", shapes, coulomb_shape=coulomb_shape)
         self.parameters = table_for(TwoLinkParams, parameters)
