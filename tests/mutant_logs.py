@@ -4,6 +4,7 @@ from mutant_list import Mutant
 
 ARRAYS, EPISODES, FILE = "logs/arrays.py", "logs/episodes.py", "logs/file.py"
 MESSAGES, NPZ, READ = "logs/messages.py", "logs/npz.py", "logs/read.py"
+BUDGET, DEFINITIONS = "logs/budget.py", "logs/definitions.py"
 RESAMPLE, HDF5, PARQUET = "logs/resample.py", "logs/hdf5.py", "logs/parquet.py"
 
 LOGS = (
@@ -176,11 +177,46 @@ LOGS = (
         ("test_formats.py", "by_columns"),
     ),
     Mutant(
-        "budget: a chunk may be larger than it declares",
-        "logs/budget.py",
+        "budget: what is declared is allocated",
+        BUDGET,
+        "if total > self.budget.bytes:",
+        "if False:",
+        ("test_bad_formats.py", "unpacked"),
+    ),
+    Mutant(
+        "budget: one piece may be as large as it likes",
+        BUDGET,
+        "if count > self.limit:",
+        "if False:",
+        ("test_bombs.py", "neither_memory"),
+    ),
+    Mutant(
+        "budget: a chunk is believed",
+        BUDGET,
         "if count > declared:",
         "if False:",
-        ("test_budget.py", None),
+        ("test_budget.py", "declares_little"),
+    ),
+    Mutant(
+        "budget: nothing ends a loop",
+        BUDGET,
+        "_interrupt(self._reader, _OutOfTime)",
+        "break",
+        ("test_budget.py", "does_not_return"),
+    ),
+    Mutant(
+        "definitions: any name will do",
+        DEFINITIONS,
+        "    found = _FIELD.match(line)\n    if not found:",
+        "    found = _FIELD.search(line)\n    if not found:",
+        ("test_definitions.py", "hostile"),
+    ),
+    Mutant(
+        "definitions: an array may have any length",
+        DEFINITIONS,
+        "if count is not None and count > (MAX_ENTRIES if plain else MAX_FIELDS):",
+        "if False:",
+        ("test_definitions.py", "hostile"),
     ),
     Mutant(
         "files: a file may change while it is read",
@@ -188,6 +224,13 @@ LOGS = (
         "(before.st_size, before.st_mtime_ns) != (after.st_size, after.st_mtime_ns)",
         "before.st_size != after.st_size",
         ("test_bad_formats.py", "grows"),
+    ),
+    Mutant(
+        "parquet: a column brings those that its name is a part of",
+        PARQUET,
+        "column_indices=list(leaves)",
+        "column_indices=list(range(file.metadata.num_columns))",
+        ("test_formats.py", "with_dots"),
     ),
     Mutant(
         "parquet: checksums are not looked at",

@@ -89,17 +89,9 @@ def read_log(
     named = time.column if isinstance(time, Column) else time
     clock = time if isinstance(time, Column) else Column(time or TIME, "s")
     plan = _Plan(
-        columns,
-        states,
-        actions,
-        clock,
-        period,
-        resample,
-        exclude,
-        drop_nonfinite,
-        keep_first,
-        limits or {},
-    )
+        columns, states, actions, clock, period, resample, exclude,
+        drop_nonfinite, keep_first, limits or {},
+    )  # fmt: skip
     specs = [spec for spec in columns.values() if isinstance(spec, Column)]
     wanted = list(dict.fromkeys(spec.column for spec in specs))
     found = recordings(
