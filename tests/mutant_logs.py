@@ -188,7 +188,7 @@ LOGS = (
         BUDGET,
         "if count > self.limit:",
         "if False:",
-        ("test_bombs.py", "neither_memory"),
+        ("test_budget.py", "chunks_of_a_bag or many_objects"),
     ),
     Mutant(
         "budget: a chunk is believed",

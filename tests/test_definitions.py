@@ -63,6 +63,8 @@ PLACES = (
 )
 #: Forms that are no names, numbers or types, without a payload.
 ODD = (
+    "(float64 q",
+    "; float64 q",
     "float64 __class__",
     "float64 _q",
     "float64 q.real",
