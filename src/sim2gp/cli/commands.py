@@ -377,7 +377,7 @@ def _out(out: Path | None, name: str) -> Path:
 
 
 def _read(path: Path, given: Reads, *, alike: bool = False) -> tuple[Any, Any]:
-    """A project and its logs; an error of theirs is told before the fits are loaded."""
+    """A project and its logs; their errors come before the fits are loaded."""
     project = import_module("sim2gp.project").load_project(path)
     project = replace(project, budget=_budget(given.budget))
     return project, project.load_logs(strict=given.strict, alike=alike)
