@@ -31,7 +31,7 @@ def run_directory(out: Path | None, name: str) -> Path:
 
 
 def read_project(path: Path, given: Reads, *, alike: bool = False) -> tuple[Any, Any]:
-    """A project and its logs; an error of theirs is told before the fits are loaded."""
+    """A project and its logs; their errors come before the fits are loaded."""
     project = import_module("sim2gp.project").load_project(path)
     project = replace(project, budget=budget(given.budget))
     return project, project.load_logs(strict=given.strict, alike=alike)

@@ -172,7 +172,7 @@ def readable(meter: Meter) -> Iterator[None]:
         watch.stop()  # the interrupt may have come before the first call ended
         raise meter.over_time() from None
     except MemoryError as error:
-        raise meter.over("does not fit in memory", "no memory", "less") from error
+        raise meter.over("does not fit in memory", "no more", "less") from error
     except Exception as error:
         if watch.asked:
             raise meter.over_time() from error
