@@ -117,6 +117,16 @@ def test_no_forbidden_construct() -> None:
     assert not Counter(AUDITED) - Counter(faults.values())  # none is out of date
 
 
+def test_temporary_files_are_made_in_one_place() -> None:
+    """There they are registered, to go with a process that has to end at once."""
+    makers = [
+        relative(path)
+        for path in MODULES
+        if "tempfile" in imported_modules(ast.parse(path.read_text()), "", False)
+    ]
+    assert makers == ["src/sim2gp/cleanup.py"]
+
+
 @pytest.mark.parametrize(
     ("source", "rule"),
     [

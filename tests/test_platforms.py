@@ -57,6 +57,7 @@ import report_example, stub_experiments
 import sim2gp
 from sim2gp.cli import main
 from sim2gp.runs import load_run, new_run
+from sim2gp.runs.cells import Cells
 
 try:
     import fcntl
@@ -78,13 +79,13 @@ with new_run("made", "identify") as run:
     run.write_summary(summary)
     run.write_arrays("arrays.npz", arrays)
 assert main(["report", "made"]) == 0
+Cells(Path("study")).save("a", {"unit": "\u00b5m"}, {"value": 1.0})
+assert Cells(Path("study")).load("a", {"unit": "\u00b5m"}) == {"value": 1.0}
 assert Path("made", "report.html").stat().st_size > 10_000
 """
 
 
-def elsewhere(
-    folder: Path, command: list[str], *, extra: str = ""
-) -> subprocess.CompletedProcess[str]:
+def elsewhere(folder: Path, command: list[str]) -> subprocess.CompletedProcess[str]:
     """Run Python in a folder, as on a machine that lacks what POSIX has."""
     site = folder / "site"
     site.mkdir(exist_ok=True)
@@ -112,12 +113,12 @@ def test_the_command_line_needs_nothing_of_posix(tmp_path: Path) -> None:
     done = elsewhere(tmp_path, ["-c", COMMANDS])
     assert done.returncode == 0, done.stderr
     left = {path.name for path in tmp_path.iterdir()}
-    assert left == {"a.csv", "arm.toml", "site", "run", "made"}
+    assert left == {"a.csv", "arm.toml", "site", "run", "made", "study.cells"}
 
 
 @pytest.mark.nightly
 def test_an_identification_needs_nothing_of_posix(tmp_path: Path) -> None:
-    """The whole way, with fits, workers' counts and a report."""
+    """The whole way, with the fit and the report."""
     for seed in (1, 2):
         log = simulated(seconds=1.3, seed=seed, noise=5e-4)
         write(log, tmp_path / "logs" / f"{seed}.csv")
