@@ -14,6 +14,7 @@ from sim2gp.cli import main
 from sim2gp.errors import InputError
 from sim2gp.experiments import explain, identify
 from sim2gp.experiments import explain_study as study
+from sim2gp.logs import Budget
 from sim2gp.project import load_project
 from sim2gp.runs import Progress, load_run, new_run
 from simulated_logs import simulated
@@ -126,9 +127,16 @@ def test_the_command_line_hands_on(
     monkeypatch.chdir(tmp_path)
 
     def told(
-        path: Path, *, add: bool, out: Path, strict: bool, progress: Progress
+        path: Path,
+        *,
+        add: bool,
+        out: Path,
+        strict: bool,
+        budget: Budget,
+        progress: Progress,
     ) -> dict[str, Any]:
         assert not strict
+        assert budget == Budget()
         return {"path": str(path), "add": add, "out": str(out), "answer": "missing"}
 
     stub_experiments.install(monkeypatch, explain=told)
