@@ -116,7 +116,8 @@ def run(spoil: Callable[[Path], object], code: str, *said: str) -> Input:
         with new_run(folder / "run", "identify") as writer:
             writer.write_summary(summary)
             writer.write_text("project.toml", PROJECT)
-            belief = {"belief/mean": zeros, "belief/scale": np.diag(zeros)}
+            wide = {"intervals/mean": zeros, "intervals/scale": np.diag(zeros)}
+            belief = {"belief/mean": zeros, "belief/scale": np.diag(zeros), **wide}
             writer.write_arrays("arrays.npz", belief)
         spoil(folder / "run")
         return "evaluate", "run", "--logs", "a.csv"
@@ -239,7 +240,7 @@ THIRD: tuple[Case, ...] = (
         stored(
             "a.npz",
             archive(("pos.npy", b"\x93NUMPY\x02\x00" + b"\xff" * 3 + b"\x7f")),
-            "E125",
+            "E126",
         ),
     ),
     case(

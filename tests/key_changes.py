@@ -99,9 +99,15 @@ def of_priors(place: str) -> dict[str, Change]:
         ),
     }
     section, name = place.split("] ")
+    # A delay needs an end, because the inputs before a window reach back so far.
+    bounds = "low = 0.0, high = 0.1, " if name == "delay" else ""
     return {
         key: tuple(  # type: ignore[misc]
-            [f"{section}]\n{name} = {{{said}}}\n" for said in pair] + [machine]
+            [
+                f"{section}]\n{name} = {{{bounds if 'mean' in said else ''}{said}}}\n"
+                for said in pair
+            ]
+            + [machine]
         )
         for key, pair in pairs.items()
     }

@@ -79,8 +79,8 @@ with new_run("made", "identify") as run:
     run.write_summary(summary)
     run.write_arrays("arrays.npz", arrays)
 assert main(["report", "made"]) == 0
-Cells(Path("study")).save("a", {"unit": "\u00b5m"}, {"value": 1.0})
-assert Cells(Path("study")).load("a", {"unit": "\u00b5m"}) == {"value": 1.0}
+Cells(Path("study"), "").save("a", {"unit": "\u00b5m"}, {"value": 1.0})
+assert Cells(Path("study"), "").load("a", {"unit": "\u00b5m"}) == {"value": 1.0}
 assert Path("made", "report.html").stat().st_size > 10_000
 """
 
