@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-#: Held by `run` until the process is gone: whoever comes later waits for that.
+#: Held by `run` until the process is gone: a later caller waits for that.
 _LOCK = threading.RLock()
 _ACTIONS: dict[object, Callable[[], object]] = {}
 
