@@ -273,6 +273,7 @@ def test_a_payload_is_found_and_the_arm_is_known_better(
             assert (mean, sd) == pytest.approx((p.mean, p.sd))
 
 
+@pytest.mark.nightly
 def test_a_value_that_is_wrong_is_seen(
     joined: tuple[WindowsBelief, Windows],
 ) -> None:

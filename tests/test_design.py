@@ -41,6 +41,7 @@ ROWS = eqx.filter_jit(d.experiment.sensitivity_at)
         pytest.param(delayed(), id="delayed"),
     ],
 )
+@pytest.mark.nightly
 def test_it_tells_what_the_log_of_it_would(system) -> None:
     """Against `models.windows`, on the log that the experiment would leave."""
     e, U = experiment(system), commands()
@@ -124,6 +125,7 @@ def test_goals_count_their_directions() -> None:
         assert worth == pytest.approx(count * np.log(1.7), rel=1e-10)
 
 
+@pytest.mark.nightly
 def test_a_prediction_depends_on_what_moves_it() -> None:
     """Rows against differences of simulations over the horizon."""
     e, U = experiment(), commands(1)

@@ -65,6 +65,7 @@ def test_a_search_on_longer_periods_sees_the_same() -> None:
     assert (kept.period, kept.steps, kept.window) == (0.002, 3, 3)
 
 
+@pytest.mark.nightly
 def test_commands_are_made_no_smaller_than_they_must_be() -> None:
     e = experiment()
     box, draws = limits(e.system), jax.random.normal(jax.random.key(1), (100, 3))
@@ -88,6 +89,7 @@ class Away:
         return 0.0 * C + 1.0, state
 
 
+@pytest.mark.nightly
 def test_a_climb_that_ends_far_outside_is_given_up(monkeypatch) -> None:
     e = experiment()
     box, signal = limits(e.system), d.Multisine(PERIOD, STEPS)

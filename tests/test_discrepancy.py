@@ -163,6 +163,7 @@ def away(truth: np.ndarray, found: Gaussian) -> np.ndarray:
     return error
 
 
+@pytest.mark.nightly
 def test_friction_that_the_simulator_lacks_is_in_the_intervals(
     arms: ModuleType,
 ) -> None:

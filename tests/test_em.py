@@ -21,6 +21,7 @@ class Nothing(laplace.AbstractLikelihood):
         return jnp.zeros((1, 1))
 
 
+@pytest.mark.nightly
 def test_student_noise_of_long_windows_is_found_in_a_few_rounds(monkeypatch):
     """Against scipy's maximum of ``sum_w log t_4(r_w | sig)``, from a noise far off."""
     rng = np.random.default_rng(3)

@@ -171,6 +171,7 @@ def test_who_is_best_and_who_is_tied() -> None:
     assert signs.best is signs.refitted[1]
 
 
+@pytest.mark.nightly
 def test_a_fit_that_fails_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     from sim2gp.errors import NotConverged
 

@@ -81,6 +81,7 @@ def told(belief: Known, S: Array) -> float:
         return float(joint(*rows))
 
 
+@pytest.mark.nightly
 def test_what_is_done_counts_no_more() -> None:
     """Steps made, then steps planned: each adds to the log determinant of all."""
     belief, S, A = known()

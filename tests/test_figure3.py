@@ -167,6 +167,7 @@ def test_a_finished_cell_is_not_flown_again(tmp_path: Path, monkeypatch):
 @pytest.mark.parametrize(
     "figure", ["fig3", pytest.param("fig5", marks=pytest.mark.nightly)]
 )
+@pytest.mark.nightly
 def test_the_figure_is_written_whole(figure: str, tmp_path: Path, monkeypatch):
     flown: list[str] = []
 

@@ -127,6 +127,7 @@ def test_divergence_vanishes_at_equality_and_only_there():
     ],
     ids=["recommended", "literal"],
 )
+@pytest.mark.nightly
 def test_gradients_against_differences(objective):
     """Divergence and likelihood; the recommended comparison leaves the noise alone."""
     q, (target, _) = a_q(3), a_target(objective.sets)

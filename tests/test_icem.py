@@ -67,6 +67,7 @@ def test_scanned_and_unrolled_iterations_agree() -> None:
     np.testing.assert_allclose(scanned[1].plan.mean, unrolled[1].plan.mean, atol=1e-5)
 
 
+@pytest.mark.nightly
 def test_decay_shrinks_the_population_down_to_two_elites() -> None:
     rule = ICEM(samples=128, iterations=4, elites=10, decay=2.0)
     recorder = Recorder(jnp.ones((25, 1)))

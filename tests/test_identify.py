@@ -219,6 +219,7 @@ def test_evaluate_predicts_a_log_from_anywhere(
     )
 
 
+@pytest.mark.nightly
 def test_leave_one_out_predicts_every_log(folder: Path, tmp_path: Path) -> None:
     project, out = load_project(project_in(folder)), tmp_path / "out"
     summary = evaluate.leave_one_out(

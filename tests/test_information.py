@@ -75,6 +75,7 @@ def test_a_second_look_without_noise_tells_nothing_more():
     assert np.sum(told[1:]) == pytest.approx(np.log(30.0), rel=0.02)
 
 
+@pytest.mark.nightly
 def test_closed_form_against_nested_monte_carlo():
     """``E log p(y|x,e) - log p(y|x)``, the inner mean over 4096 draws."""
     shared, own, A = rows(2, 2, 2, 1, seed=3)

@@ -327,6 +327,7 @@ def test_a_linear_machines_centre_is_where_the_gaussian_says(
     np.testing.assert_allclose(ours.posterior.mean, plain.posterior.mean, atol=1e-12)
 
 
+@pytest.mark.nightly
 def test_a_constant_at_its_bound_stays_where_the_data_are() -> None:
     """Its map is flat there: with less data the Gaussian alone leaves for the prior."""
     at = Parameter("k1", "1", "slope", "box", low=0.0, high=4.0)

@@ -66,6 +66,7 @@ def dense_sd(log: Log, window: float) -> np.ndarray:
     return np.sqrt(np.diag(np.linalg.inv(precision))[:2])
 
 
+@pytest.mark.nightly
 def test_how_much_more_they_tell(tmp_path: Path) -> None:
     log = recording()
     found = asked(tmp_path, log)

@@ -173,6 +173,7 @@ def test_start_states_of_windows_are_projected_out() -> None:
         assert ours[name].p == pytest.approx(theirs[name].p, rel=1e-6)
 
 
+@pytest.mark.nightly
 def test_windows_raise_no_false_alarm() -> None:
     found = [misfit(**windowed(seed), noise_known=True) for seed in range(150)]
     assert sum(one.alarm for one in found) <= 2

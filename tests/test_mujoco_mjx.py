@@ -95,6 +95,7 @@ def differences(c: sy.MuJoCo, theta: np.ndarray, start: np.ndarray) -> np.ndarra
     ],
 )
 @in_float64
+@pytest.mark.nightly
 def test_rollouts_and_their_jacobians_are_c_mujocos(text, constants, start) -> None:
     """With other values than the file's: what MuJoCo derives of them goes along."""
     c, x = systems(text, constants)

@@ -199,6 +199,7 @@ def test_spans_that_differ_by_rounding_are_one(tmp_path, monkeypatch):
 
 
 @in_float64
+@pytest.mark.nightly
 def test_slopes_are_those_of_our_own_equations(tmp_path):
     """The same arm, integrated alike: its exact derivative, both ways."""
     values = own(ARM)

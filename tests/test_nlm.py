@@ -238,6 +238,7 @@ def test_two_lucky_rows_do_not_end_the_noise():
     assert float(noise[0]) > 0.1
 
 
+@pytest.mark.nightly
 def test_few_noisy_rows_do_not_end_the_noise():
     """Pure noise on 12 rows: type-II training alone explains it by features."""
     rng = np.random.default_rng(6)
@@ -249,6 +250,7 @@ def test_few_noisy_rows_do_not_end_the_noise():
     assert np.all(np.asarray(belief.noise) < 0.3)
 
 
+@pytest.mark.nightly
 def test_held_out_rows_stay_where_they_are():
     def out(count, capacity):
         return np.flatnonzero(features.held_out_rows(jnp.arange(capacity) < count))
@@ -296,6 +298,7 @@ def test_past_actions_move_on():
     assert np.all(np.asarray(latent.sd()[:4]) > 0.0)
 
 
+@pytest.mark.nightly
 def test_growing_data_retrace_nothing():
     traces = []
     inner = module.type_two

@@ -77,6 +77,7 @@ def _precision(z: Array, e: Array, sd: float) -> float:
     return float(np.sqrt(schur))
 
 
+@pytest.mark.nightly
 def test_chains_that_do_not_meet_say_nothing() -> None:
     rng = np.random.default_rng(0)
     draws = rng.standard_normal((4, 250, 2))

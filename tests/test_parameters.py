@@ -253,6 +253,7 @@ def test_a_table_without_free_constants():
     assert set(table.values(jnp.zeros(0))) == set(TABLE.names)
 
 
+@pytest.mark.nightly
 def test_curvature_is_what_the_maps_add_to_a_hessian():
     """A function linear in theta has no other: autodiff's Hessian, any prior scale."""
     kinds = ("box", "log_box", "softplus", "log", "identity")

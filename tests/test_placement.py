@@ -39,6 +39,7 @@ def pendulum_at(p, r):
     ("kind", "rising"), [(sy.BaseTilt, [1.0, 0.0]), (sy.BaseTiltSide, [0.0, 1.0])]
 )
 @pytest.mark.parametrize("tilt", [0.3, -0.02])
+@pytest.mark.nightly
 def test_base_tilt_turns_gravity(kind, rising, tilt):
     up = jnp.array([*(np.sin(tilt) * np.array(rising)), np.cos(tilt)])
 

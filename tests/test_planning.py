@@ -104,6 +104,7 @@ def test_cost_is_within_a_few_percent_of_riccati(update: object) -> None:
     assert 0.999 * optimal < cost < 1.05 * optimal
 
 
+@pytest.mark.nightly
 def test_more_samples_are_not_much_worse() -> None:
     few, many = (
         float(closed_loop(MPC(ICEM(samples=n)), world(), S0, KEY)) for n in (32, 256)

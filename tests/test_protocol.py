@@ -275,7 +275,9 @@ LONG = {draws, update, information, world, loop, forecast}
 def cases():
     for name, consumer in itertools.product(MODELS, CONSUMERS):
         cheap = name in ("PointEstimate(Sim2GP)", "PointEstimate(NLM)")
-        rare = name.startswith(WRAPPED) and not cheap and consumer in LONG
+        wrapped = name.startswith(WRAPPED) and not cheap
+        rare = consumer in LONG and (wrapped or name.endswith("FunctionSpace"))
+        rare |= wrapped and name.endswith(("Residual)", "FunctionSpace)"))
         marks = [pytest.mark.nightly] if rare else []
         yield pytest.param(
             name, consumer, marks=marks, id=f"{name}-{consumer.__name__}"

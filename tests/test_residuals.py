@@ -116,6 +116,7 @@ def test_windows_compiled_in_advance_are_linearised_alike(
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.01])
+@pytest.mark.nightly
 def test_windows_find_a_delay(delay: float) -> None:
     exact, noisy = (
         simulated(seconds=1.3, seed=1, noise=sd, delay=delay, velocities=True)

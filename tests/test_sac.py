@@ -83,6 +83,7 @@ def worth(learner, s, u):
 
 
 # ------------------------------------------------------------------ probe worlds
+@pytest.mark.nightly
 def test_critics_learn_a_reward_of_state_and_action() -> None:
     """Without a future a value is the reward itself."""
     here = world(STAY, reward(s=1.0, sa=0.5))
@@ -201,6 +202,7 @@ def test_the_oldest_rows_are_overwritten() -> None:
     assert int(replay.count) == 8
 
 
+@pytest.mark.nightly
 def test_nothing_is_learned_of_steps_that_the_world_cannot_follow() -> None:
     """Beyond half of the line the world is lost: rows there count for nothing."""
 
@@ -222,6 +224,7 @@ def test_nothing_is_learned_of_steps_that_the_world_cannot_follow() -> None:
     assert bool(SMALL.failed(trained(discounted(0.0), never)))
 
 
+@pytest.mark.nightly
 def test_episodes_begin_where_the_machine_has_been() -> None:
     """Some of them, as soon as there is anywhere."""
     seen = np.full((20, 1), 5.0)

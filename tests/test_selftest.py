@@ -99,6 +99,7 @@ def test_friction_is_noticed_by_the_energy(monkeypatch):
     assert figure("energy") > CHECKS["energy"].limit
 
 
+@pytest.mark.nightly
 def test_intervals_too_narrow_are_noticed_by_the_arm(monkeypatch):
     right = checks.covered
     monkeypatch.setattr(checks, "covered", lambda z, level: right(3.0 * z, level))

@@ -217,6 +217,7 @@ def test_predictive_noise_is_learned(furuta_fits):
     np.testing.assert_allclose(ratio, 1.0, atol=0.12)
 
 
+@pytest.mark.nightly
 def test_a_wrong_model_has_a_posterior_that_converged():
     """The MAP of a misfit is a stationary point too: no silent failure."""
     system = Furuta()

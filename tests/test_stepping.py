@@ -136,6 +136,7 @@ def test_masked_samples_leave_no_transition(log: Log) -> None:
     assert whole - part in (3, 4)
 
 
+@pytest.mark.nightly
 def test_rollouts_are_the_windows_forecasts(log: Log) -> None:
     """At 20 ms with mean inputs, the point is the forecast at 2 ms."""
     system = behind_delay()
