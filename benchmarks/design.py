@@ -23,6 +23,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sim2gp.data.logs import Log
+from sim2gp.data.split_log import cut
+from sim2gp.data.windows import fit_windows
 from sim2gp.design import (
     AbstractSignal,
     Everything,
@@ -38,11 +41,8 @@ from sim2gp.design import (
 )
 from sim2gp.design.limits import excess
 from sim2gp.experiments.claims import of_median
-from sim2gp.gaussian import Gaussian
-from sim2gp.logs import Log
-from sim2gp.models.cutting import cut
-from sim2gp.models.windows import fit_windows
-from sim2gp.parameters import prior_from_moments
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.parameters import prior_from_moments
 from sim2gp.runs.cells import Cells, Old, add_options
 from sim2gp.runs.workers import cores, spread
 from sim2gp.systems import TwoLink

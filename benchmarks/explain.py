@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from sim2gp.experiments import explain_study as study
+from sim2gp.planning.tasks import MACHINES
 from sim2gp.runs import Progress
 from sim2gp.runs.cells import Cells, add_options
 from sim2gp.runs.plain import to_json
-from sim2gp.tasks import MACHINES
 
 ROOT = Path(__file__).resolve().parents[1]
 

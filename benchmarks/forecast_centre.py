@@ -13,10 +13,10 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from sim2gp.diagnose.discrepancy import corrected_windows
+from sim2gp.data.grid import CURVE, evaluation_windows, steps_of
+from sim2gp.data.windows import fit_windows
 from sim2gp.experiments.prediction import channels, cut_logs, predicted, recordings
-from sim2gp.models.grid import CURVE, evaluation_windows, steps_of
-from sim2gp.models.windows import fit_windows
+from sim2gp.identification.intervals.discrepancy import corrected_windows
 from sim2gp.project import load_project
 from sim2gp.types import in_float64
 

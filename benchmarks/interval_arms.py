@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sim2gp.data.logs import Log
 from sim2gp.experiments.explain_study import Cogging
-from sim2gp.logs import Log
 from sim2gp.systems import Perturbed, UniformRodArm
-from sim2gp.systems.effects import AbstractEffect, Coulomb
+from sim2gp.systems.effects.base import AbstractEffect, Coulomb
 
 PERIOD, SECONDS = 0.01, 10.0
 SUBSTEPS = 10  # of RK4 in a period: dry friction is stiff

@@ -1,4 +1,5 @@
-"""What `sim2gp.diagnose.intervals` was chosen from, and the oracle beside it.
+"""What `sim2gp.identification.intervals.scatter` was chosen from, and the oracle beside
+it.
 
 Each gives centre and sd in prior sd of the virtual constants, from the linearisation of
 a fit at its MAP. None of these is part of the library.
@@ -10,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import nnls
 
-from sim2gp.diagnose.intervals import Pulls
+from sim2gp.data.windows import Windows, WindowsBelief, linearise
+from sim2gp.identification.intervals.scatter import Pulls
 from sim2gp.models.tempering import FEW, disagreement
-from sim2gp.models.windows import Windows, WindowsBelief, linearise
 
 #: Correlation times of the mixture, in samples; 0 is white noise.
 TIMES = (0, 1, 2, 4, 8, 16, 32)

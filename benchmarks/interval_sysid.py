@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from interval_arms import LENGTHS, NAMES, PERIOD, Recordings
 
-from sim2gp.parameters import Parameters
+from sim2gp.inference.parameters import Parameters
 
 STEP = 2e-3  # s
 EDGE = 1e-6  # of the box: where an interval's end beyond a bound is cut

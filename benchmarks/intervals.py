@@ -37,12 +37,12 @@ from interval_arms import (
 from interval_sysid import intervals
 from scipy.stats import beta, norm
 
-from sim2gp.diagnose.discrepancy import corrected_windows
-from sim2gp.diagnose.intervals import NOTHING, Corrected
-from sim2gp.diagnose.pulls import pulls_of_windows
-from sim2gp.diagnose.residuals import misfit_of_windows
-from sim2gp.models.cutting import cut
-from sim2gp.models.windows import WindowsBelief, fit_windows
+from sim2gp.data.split_log import cut
+from sim2gp.data.windows import WindowsBelief, fit_windows
+from sim2gp.identification.intervals.discrepancy import corrected_windows
+from sim2gp.identification.intervals.pulls import pulls_of_windows
+from sim2gp.identification.intervals.scatter import NOTHING, Corrected
+from sim2gp.identification.misfit.residuals import misfit_of_windows
 from sim2gp.runs.cells import Cells, add_options
 from sim2gp.runs.workers import cores, spread
 from sim2gp.systems import UniformRodArm

@@ -16,14 +16,14 @@ import jax
 import numpy as np
 from one_step import EPISODES, STEPS, random_episode
 
+from sim2gp.data.transitions import Transitions
 from sim2gp.experiments.compare import MODELS
-from sim2gp.flight import oracle_world, world_of
 from sim2gp.models import Sim2GP
 from sim2gp.planning import MPC, MarkovObjective, World
+from sim2gp.planning.episode import oracle_world, world_of
 from sim2gp.planning.icem import ICEM
+from sim2gp.planning.tasks import Task, furuta_swingup
 from sim2gp.systems import Furuta
-from sim2gp.tasks import Task, furuta_swingup
-from sim2gp.transitions import Transitions
 
 SIMULATOR, LINEAR = "plain simulator", "SIM2GP"
 PLANNER = MPC(update=ICEM(samples=128, iterations=4), horizon=30)

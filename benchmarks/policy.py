@@ -11,12 +11,12 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from sim2gp.flight import oracle_world
 from sim2gp.planning import SAC
+from sim2gp.planning.episode import oracle_world
+from sim2gp.planning.tasks import furuta_swingup
 from sim2gp.robot import NumpyPolicy, load_policy
 from sim2gp.robot.export import export_policy
 from sim2gp.systems import Furuta
-from sim2gp.tasks import furuta_swingup
 
 GOAL = 50.0  # us, of 99 in 100 steps
 WIDTHS = (64, 128)

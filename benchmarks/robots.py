@@ -26,14 +26,14 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from sim2gp.diagnose.discrepancy import corrected_windows
+from sim2gp.data.windows import fit_windows
 from sim2gp.errors import InputError, NotConverged, NotFinite
 from sim2gp.experiments.prediction import cut_logs
-from sim2gp.models.windows import fit_windows
+from sim2gp.identification.intervals.discrepancy import corrected_windows
 from sim2gp.project import Project, load_project
 from sim2gp.runs.cells import Cells, add_options
 from sim2gp.runs.workers import cores, spread
-from sim2gp.systems.actuator import bare
+from sim2gp.systems.actuators import bare
 from sim2gp.types import in_float64
 
 SECONDS, HOLD, NOISE = 10.0, 0.1, 1e-3  # s, s, rad or m

@@ -23,10 +23,10 @@ from sim2gp.experiments.swingup import (
     median_episode,
     study,
 )
+from sim2gp.planning.tasks import SOLVED
 from sim2gp.runs import Progress
 from sim2gp.runs.cells import add_options
 from sim2gp.runs.workers import cores
-from sim2gp.tasks import SOLVED
 
 LEARNERS = ("SIM2GP", "NLM", "RES", "FS", "RES-FS", "SIM2GP with the term")
 CONDITIONS = ("nominal", "mismatch")

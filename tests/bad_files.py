@@ -32,7 +32,7 @@ from sim2gp.runs import new_run
 
 def crashing(folder: Path, patch: Patch) -> Sequence[str]:
     """No file is known that crashes this parser: its process is one that dies."""
-    from sim2gp.systems import mjcf_load
+    from sim2gp.systems.mujoco import load as mjcf_load
 
     child = folder / "child.py"
     child.write_text("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")

@@ -32,8 +32,8 @@ from bad_inputs import (
     table,
     text,
 )
+from sim2gp.data.logs import period_matches, shared_rows
 from sim2gp.errors import InputError
-from sim2gp.logs import period_matches, shared_rows
 from sim2gp.project import load_project
 
 HEAD, BODY = TEXTS.split("\n", 1)

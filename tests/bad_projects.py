@@ -21,9 +21,9 @@ from bad_inputs import (
     renamed,
     stored,
 )
-from sim2gp import laplace
-from sim2gp.arrowhead import Elimination
-from sim2gp.gaussian import from_covariance
+from sim2gp.inference import levenberg_marquardt as laplace
+from sim2gp.inference.arrowhead import Elimination
+from sim2gp.inference.gaussian import from_covariance
 from sim2gp.types import in_float64
 
 

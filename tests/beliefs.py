@@ -1,15 +1,15 @@
-"""Beliefs made by hand for the tests of `sim2gp.diagnose`."""
+"""Beliefs made by hand for the tests of `sim2gp.identification`."""
 
 import json
 
 import jax
 import jax.numpy as jnp
 
-from sim2gp import diagnose
-from sim2gp.diagnose.table import verdicts
-from sim2gp.gaussian import Gaussian
-from sim2gp.least_squares import triangular
-from sim2gp.parameters import Parameter, Parameters
+from sim2gp.identification import summary as diagnose
+from sim2gp.identification.identifiability.table import verdicts
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.least_squares import triangular
+from sim2gp.inference.parameters import Parameter, Parameters
 from sim2gp.types import in_float64
 
 

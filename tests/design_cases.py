@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim2gp import design as d
-from sim2gp.gaussian import Gaussian
-from sim2gp.systems.actuator import Actuated, actuator_prior
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.systems.actuators import Actuated, actuator_prior
 from simulated_logs import pendulum
 
 PERIOD, STEPS, WINDOW = 0.01, 200, 20

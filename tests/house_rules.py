@@ -9,66 +9,25 @@ from collections.abc import Iterator
 
 #: Imports point down; rooms of one layer do not see each other, but for SIBLINGS.
 LAYERS: tuple[frozenset[str], ...] = (
-    frozenset(
-        "types errors checks cleanup linalg gaussian least_squares arrowhead laplace "
-        "em bijections configurations weighed parameters transitions ahead "
-        "descent".split()
-    ),
-    frozenset({"systems", "logs"}),
-    frozenset({"models", "tasks", "planning"}),
-    frozenset({"flight", "exploration", "randomised"}),
-    frozenset({"loops", "oracle"}),
-    frozenset({"project", "runs", "robot", "design", "diagnose"}),
-    frozenset({"cli", "experiments", "report"}),
+    frozenset({"types", "errors", "checks", "cleanup", "compilation"}),
+    frozenset({"inference"}),
+    frozenset({"systems"}),
+    frozenset({"belief", "data", "runs"}),
+    frozenset({"models", "identification", "planning"}),
+    frozenset({"project", "design", "robot", "report"}),
+    frozenset({"experiments"}),
+    frozenset({"cli"}),
 )
-#: Within the lowest layer the modules build on each other (in this order, no cycles);
-#: in the highest, the command line calls the other two and an experiment reports.
+#: In the lowest layer modules build on each other; a belief is fitted to data.
 SIBLINGS: frozenset[tuple[str, str]] = frozenset(
     {
-        ("cli", "experiments"),
-        ("cli", "report"),
-        ("experiments", "report"),
-        ("randomised", "flight"),
-        ("robot", "runs"),
-        ("ahead", "types"),
+        ("checks", "errors"),
         ("types", "errors"),
         ("types", "checks"),
-        ("checks", "errors"),
-        ("descent", "types"),
-        ("gaussian", "linalg"),
-        ("gaussian", "types"),
-        ("gaussian", "errors"),
-        ("configurations", "types"),
-        ("configurations", "errors"),
-        ("parameters", "bijections"),
-        ("parameters", "configurations"),
-        ("parameters", "weighed"),
-        ("weighed", "types"),
-        ("weighed", "errors"),
-        ("weighed", "checks"),
-        ("parameters", "types"),
-        ("parameters", "errors"),
-        ("parameters", "checks"),
-        ("parameters", "gaussian"),
-        ("transitions", "types"),
-        ("transitions", "errors"),
-        ("em", "types"),
-        ("em", "arrowhead"),
-        ("em", "laplace"),
-        ("laplace", "types"),
-        ("laplace", "errors"),
-        ("laplace", "gaussian"),
-        ("laplace", "linalg"),
-        ("laplace", "least_squares"),
-        ("laplace", "arrowhead"),
-        ("arrowhead", "linalg"),
-        ("arrowhead", "types"),
-        ("arrowhead", "least_squares"),
-        ("least_squares", "linalg"),
-        ("least_squares", "types"),
-        ("least_squares", "errors"),
-        ("least_squares", "gaussian"),
-        ("least_squares", "parameters"),
+        ("compilation", "types"),
+        ("belief", "data"),
+        ("identification", "models"),
+        ("planning", "models"),
     }
 )
 #: Never loaded by importing sim2gp, so never imported at the top of a module.
@@ -85,7 +44,7 @@ CATCH_ALL = frozenset({"Exception", "BaseException"})
 
 
 def room_of(module: str) -> str:
-    """`sim2gp.systems.furuta` lives in the room `systems`."""
+    """`sim2gp.systems.plants.furuta` lives in the room `systems`."""
     return module.split(".")[1] if "." in module else ""
 
 

@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from sim2gp.models.windows import Windows
-from sim2gp.parameters import Parameter, Parameters
+from sim2gp.data.transitions import Transitions
+from sim2gp.data.windows import Windows
+from sim2gp.inference.parameters import Parameter, Parameters
 from sim2gp.systems import AbstractODE, Channel
-from sim2gp.transitions import Transitions
 
 
 class Linear(AbstractODE):

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from jaxtyping import Array
 
-from sim2gp.flight import Trajectory, episode, oracle_world
-from sim2gp.gaussian import Gaussian
-from sim2gp.models.base import AbstractBelief, AbstractModel
+from sim2gp.belief import AbstractBelief, AbstractModel
+from sim2gp.data.transitions import Transitions
+from sim2gp.inference.gaussian import Gaussian
 from sim2gp.planning import ICEM, MPC, AbstractPlanner, World
-from sim2gp.tasks import Task
-from sim2gp.transitions import Transitions
+from sim2gp.planning.episode import Trajectory, episode, oracle_world
+from sim2gp.planning.tasks import Task
 from sim2gp.types import Box, Dynamics, Key, State
 
 KEY = jax.random.key(0)

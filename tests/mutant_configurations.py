@@ -2,8 +2,8 @@
 
 from mutant_list import Mutant
 
-GATHER, MACHINES = "configurations.py", "systems/configured.py"
-SUMS, INFORMED = "weighed.py", "models/informed.py"
+GATHER, MACHINES = "inference/variants.py", "systems/variants.py"
+SUMS, INFORMED = "inference/linear_measurements.py", "inference/informed_prior.py"
 HERE, WEIGHED = "test_configurations.py", "test_weighed.py"
 CLOSED = (HERE, "closed_form")
 ROW = (WEIGHED, "one_more_row")
@@ -25,7 +25,7 @@ CONFIGURATIONS = (
     ),
     Mutant(
         "configurations: windows of the wrong machine",
-        "models/windows.py",
+        "data/windows.py",
         "values = self.system.parameters.values(tt, window.configuration)",
         "values = self.system.parameters.values(tt, 0 * window.configuration)",
         CLOSED,
@@ -61,14 +61,14 @@ CONFIGURATIONS = (
     ),
     Mutant(
         "configurations: a known value clipped to the bounds",
-        "systems/external.py",
+        "systems/plants/external.py",
         "np.minimum(by.low, theta), np.maximum(by.high, theta)",
         "np.minimum(by.low, np.inf), np.maximum(by.high, -np.inf)",
         (HERE, "on_the_host"),
     ),
     Mutant(
         "configurations: more rows forget whose they are",
-        "transitions.py",
+        "data/transitions.py",
         "which[:count] = np.asarray(self.configuration)[:count]",
         "which[:count] = 0",
         (HERE, "one_step"),
@@ -96,21 +96,21 @@ CONFIGURATIONS = (
     ),
     Mutant(
         "weighed: not in the cost",
-        "laplace.py",
+        "inference/levenberg_marquardt.py",
         "z @ z + apart @ apart)",
         "z @ z + 0.0 * apart @ apart)",
         ROW,
     ),
     Mutant(
         "weighed: not in the posterior",
-        "laplace.py",
+        "inference/levenberg_marquardt.py",
         "full = with_prior(arrow.data, best.z, best.known)",
         "full = with_prior(arrow.data, best.z)",
         ROW,
     ),
     Mutant(
         "weighed: not in the gradient",
-        "laplace.py",
+        "inference/levenberg_marquardt.py",
         "+ z + known[:, :-1].T @ apart",
         "+ z",
         (WEIGHED, "gradient"),
@@ -124,7 +124,7 @@ CONFIGURATIONS = (
     ),
     Mutant(
         "weighed: information in the old prior's units",
-        "models/windows.py",
+        "data/windows.py",
         "factor = self.information @ jnp.linalg.solve(L0, prior.scale)",
         "factor = self.information",
         (WEIGHED, "prior_to_the_logs"),

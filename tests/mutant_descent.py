@@ -2,7 +2,11 @@
 
 from mutant_list import MODEL, Mutant
 
-LAPLACE, ARROWS, NOISE = "laplace.py", "arrowhead.py", "em.py"
+LAPLACE, ARROWS, NOISE = (
+    "inference/levenberg_marquardt.py",
+    "inference/arrowhead.py",
+    "inference/expectation_maximisation.py",
+)
 DESCENT = (
     "test_laplace.py",
     "finite or last_turn or noise or too_long or gains or stationary",
@@ -94,7 +98,7 @@ DESCENTS = (
     ),
     Mutant(
         "large batches for the pool of threads",
-        "linalg.py",
+        "inference/linalg.py",
         "jax.custom_jvp(sequential_vmap(function))",
         "jax.custom_jvp(function)",
         ("test_linalg.py", "large_batch"),
@@ -192,7 +196,7 @@ DESCENTS = (
     ),
     Mutant(
         "a fit near another keeps its starts",
-        "models/windows.py",
+        "data/windows.py",
         "_whitened(exact, near.starts), near.known, NEAR_ROUNDS",
         "_whitened(exact, near.starts), near.known, 0",
         ("test_windows.py", "near_another"),

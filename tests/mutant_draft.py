@@ -3,7 +3,7 @@
 from mutant_list import Mutant
 
 COLUMNS, READINGS = "project/columns.py", "project/readings.py"
-DRAFT, ZEROS = "project/draft.py", "systems/zeros.py"
+DRAFT, ZEROS = "project/draft.py", "systems/sensors.py"
 ODD = ("test_draft.py", "odd_log")
 
 FIRST_DRAFT = (
@@ -72,14 +72,14 @@ FIRST_DRAFT = (
     ),
     Mutant(
         "mujoco: a coarse model is stepped finely",
-        "systems/mujoco.py",
+        "systems/mujoco/system.py",
         "max(LONGEST_MEAN, float(self.engine.model.opt.timestep))",
         "LONGEST_MEAN",
         ("test_draft.py", "coarse"),
     ),
     Mutant(
         "a small step makes a MAP of a cusp",
-        "laplace.py",
+        "inference/levenberg_marquardt.py",
         "(best.gradient <= flat) & (left <= near)",
         "left <= near",
         ("test_laplace.py", "stalled"),

@@ -2,7 +2,7 @@
 
 from mutant_list import Mutant
 
-INF, EXP = "models/information.py", "exploration.py"
+INF, EXP = "inference/information.py", "planning/exploration.py"
 JOINT = ("test_information.py", "log_determinant")
 STEPS = ("test_information.py", "left or leaves")
 
@@ -65,7 +65,7 @@ EXPLORING = (
     ),
     Mutant(
         "episode: the objective's memory is not kept",
-        "flight.py",
+        "planning/episode.py",
         "Resumed(world.objective, now.memory)",
         "Resumed(world.objective, world.objective.init())",
         ("test_exploration.py", "episode"),

@@ -2,7 +2,11 @@
 
 from mutant_list import Mutant
 
-ALIGNMENT, CHECKS, TABLE = "logs/alignment.py", "logs/checks.py", "logs/table.py"
+ALIGNMENT, CHECKS, TABLE = (
+    "data/logs/alignment.py",
+    "data/logs/checks.py",
+    "data/logs/table.py",
+)
 TESTS = "test_all_bad_inputs.py"
 
 INPUTS = (
@@ -43,7 +47,7 @@ INPUTS = (
     ),
     Mutant(
         "inputs: every file says what holds for all",
-        "logs/notes.py",
+        "data/logs/notes.py",
         "if count > 1:",
         "if False:",
         ("test_logs.py", "said_once"),
@@ -57,7 +61,7 @@ INPUTS = (
     ),
     Mutant(
         "inputs: tensors are text",
-        "logs/file.py",
+        "data/logs/file.py",
         'if path.suffix.lower() == ".safetensors":',
         "if False:",
         (TESTS, "tensors"),
@@ -106,14 +110,14 @@ INPUTS = (
     ),
     Mutant(
         "inputs: a covariance is what it is called",
-        "gaussian.py",
+        "inference/gaussian.py",
         "if values[0] < -slack:",
         "if False:",
         ("test_gaussian.py", "another_tool"),
     ),
     Mutant(
         "inputs: units decide what a covariance is",
-        "gaussian.py",
+        "inference/gaussian.py",
         "scaled = covariance / np.outer(unit, unit)",
         "scaled = covariance",
         ("test_gaussian.py", "another_tool"),
@@ -169,7 +173,7 @@ INPUTS = (
     ),
     Mutant(
         "project: an effect is on any machine",
-        "systems/homes.py",
+        "systems/effects/units.py",
         "if isinstance(system, kind) and where == channel:",
         "if True:",
         ("test_unused_keys.py", "cannot_use"),

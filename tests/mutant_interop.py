@@ -3,8 +3,8 @@
 from mutant_list import Mutant
 
 GYM, VECTOR = "robot/gymnasium.py", "robot/gymnasium_vector.py"
-BOX = "systems/black_box.py"
-SINKS, SYSID = "runs/sinks.py", "systems/sysid.py"
+BOX = "systems/plants/black_box.py"
+SINKS, SYSID = "runs/sinks.py", "systems/mujoco/sysid.py"
 
 INTEROP = (
     Mutant(
@@ -93,14 +93,14 @@ INTEROP = (
     ),
     Mutant(
         "black box: a fault amid an episode is JAX's",
-        "flight.py",
+        "planning/episode.py",
         "@of_callbacks()\ndef episode(",
         "def episode(",
         ("test_black_box.py", "amid_an_episode"),
     ),
     Mutant(
         "black box: a fault amid training is JAX's",
-        "loops.py",
+        "planning/loop.py",
         "@of_callbacks()\ndef posterior_sampling(",
         "def posterior_sampling(",
         ("test_black_box.py", "amid_an_episode"),

@@ -2,8 +2,14 @@
 
 from mutant_list import Mutant
 
-SCATTER, WEIGHTS = "diagnose/intervals.py", "diagnose/importance.py"
-PULLS, LACKING = "diagnose/pulls.py", "diagnose/discrepancy.py"
+SCATTER, WEIGHTS = (
+    "identification/intervals/scatter.py",
+    "identification/exact_posterior/importance.py",
+)
+PULLS, LACKING = (
+    "identification/intervals/pulls.py",
+    "identification/intervals/discrepancy.py",
+)
 HERE, TAILS, LACKS = "test_intervals.py", "test_importance.py", "test_discrepancy.py"
 LONGER = "experiments/longer.py"
 

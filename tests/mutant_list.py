@@ -39,8 +39,16 @@ class Mutant:
         path.write_text(changed)
 
 
-LS, SIM, LIN = "least_squares.py", "models/sim2gp.py", "models/linearized.py"
-TABLE, GAUSS, MAPS = "parameters.py", "gaussian.py", "bijections.py"
+LS, SIM, LIN = (
+    "inference/least_squares.py",
+    "models/sim2gp.py",
+    "inference/linearized.py",
+)
+TABLE, GAUSS, MAPS = (
+    "inference/parameters.py",
+    "inference/gaussian.py",
+    "inference/bijections.py",
+)
 
 #: Where each quantity is formed.
 ROWS = "prior = jnp.concatenate(["

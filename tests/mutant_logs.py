@@ -2,10 +2,18 @@
 
 from mutant_list import Mutant
 
-ARRAYS, EPISODES, FILE = "logs/arrays.py", "logs/episodes.py", "logs/file.py"
-MESSAGES, NPZ, READ = "logs/messages.py", "logs/npz.py", "logs/read.py"
-BUDGET, DEFINITIONS = "logs/budget.py", "logs/definitions.py"
-RESAMPLE, HDF5, PARQUET = "logs/resample.py", "logs/hdf5.py", "logs/parquet.py"
+ARRAYS, EPISODES, FILE = (
+    "data/logs/arrays.py",
+    "data/logs/episodes.py",
+    "data/logs/file.py",
+)
+MESSAGES, NPZ, READ = "data/logs/messages.py", "data/logs/npz.py", "data/logs/read.py"
+BUDGET, DEFINITIONS = "data/logs/budget.py", "data/logs/definitions.py"
+RESAMPLE, HDF5, PARQUET = (
+    "data/logs/resample.py",
+    "data/logs/hdf5.py",
+    "data/logs/parquet.py",
+)
 
 LOGS = (
     Mutant(

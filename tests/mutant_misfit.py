@@ -2,7 +2,7 @@
 
 from mutant_list import Mutant
 
-CORE, FITS = "diagnose/misfit.py", "diagnose/residuals.py"
+CORE, FITS = "identification/misfit/tests.py", "identification/misfit/residuals.py"
 
 MISFIT = (
     Mutant(

@@ -2,35 +2,35 @@
 
 from mutant_list import Mutant
 
-EXTERNAL, ENGINE = "systems/external.py", "systems/mujoco_engine.py"
-MJCF, FILE = "systems/mjcf.py", "systems/mjcf_file.py"
-SAY, SOURCES = "systems/mjcf_say.py", "systems/mjcf_sources.py"
+EXTERNAL, ENGINE = "systems/plants/external.py", "systems/mujoco/engine.py"
+MJCF, FILE = "systems/mujoco/constants.py", "systems/mujoco/model_file.py"
+SAY, SOURCES = "systems/mujoco/write_back.py", "systems/mujoco/sources.py"
 
 ON_THE_HOST = (
     Mutant(
         "forecasts are stepped finer than fits",
-        "models/grid.py",
+        "data/grid.py",
         "if whole % k == 0 and k <= longest)",
         "if k == 1)",
         ("test_forecast.py", "stepped_as_in_a_fit"),
     ),
     Mutant(
         "forecasts are stepped coarser than the log",
-        "models/grid.py",
+        "data/grid.py",
         "min(system.window_substep, stamps) / PERIOD",
         "system.window_substep / PERIOD",
         ("test_forecast.py", "stepped_as_in_a_fit"),
     ),
     Mutant(
         "the host is asked for one column after the other",
-        "models/windows.py",
+        "data/windows.py",
         "at_once=on_host(system)",
         "at_once=False",
         ("test_black_box.py", "asked_for_once"),
     ),
     Mutant(
         "each rounding of a span has a rollout",
-        "systems/mujoco_engine.py",
+        "systems/mujoco/engine.py",
         "h = np.round(h, 12)",
         "h = np.asarray(h)",
         ("test_mujoco_system.py", "differ_by_rounding"),
@@ -142,21 +142,21 @@ ON_THE_HOST = (
     ),
     Mutant(
         "urdf say: welded links keep their mass",
-        "systems/urdf_say.py",
+        "systems/mujoco/write_urdf.py",
         'yield from self._welded(self._named("link", child))',
         "pass",
         ("test_mujoco_text.py", "own_words"),
     ),
     Mutant(
         "mjcf text: every quote is double",
-        "systems/mjcf_text.py",
+        "systems/mujoco/text.py",
         "quote = found.group(2)[:1]",
         "quote = b'\"'",
         ("test_mujoco_text.py", "one_constant"),
     ),
     Mutant(
         "mjcf text: white space between numbers is lost",
-        "systems/mjcf_text.py",
+        "systems/mujoco/text.py",
         "between = gaps[1:-1] +",
         "between =",
         ("test_mujoco_text.py", "one_constant"),
@@ -191,28 +191,28 @@ ON_THE_HOST = (
     ),
     Mutant(
         "mjcf child: bodies stay simplified",
-        "systems/mjcf_child.py",
+        "systems/mujoco/child.py",
         "body.simple = 0",
         "pass",
         ("test_inertia.py", "centre_moves"),
     ),
     Mutant(
         "inertia: about another point",
-        "systems/inertia.py",
+        "systems/mujoco/inertia.py",
         "P[:3, :3] += mass * np.outer(com, com)",
         "P[:3, :3] += 0.9 * mass * np.outer(com, com)",
         ("test_inertia.py", "deformation"),
     ),
     Mutant(
         "inertia: shears are mixed up",
-        "systems/inertia.py",
+        "systems/mujoco/inertia.py",
         "    (1, 2),\n    (0, 2),\n",
         "    (0, 2),\n    (1, 2),\n",
         ("test_inertia.py", "deformation"),
     ),
     Mutant(
         "inertia: open beside its mass",
-        "systems/mujoco.py",
+        "systems/mujoco/system.py",
         "if c.index in own and c.quantity in OF_INERTIA:",
         "if False:",
         ("test_inertia.py", "priors"),
@@ -226,21 +226,21 @@ ON_THE_HOST = (
     ),
     Mutant(
         "mjx: derived constants are those of the file",
-        "systems/mujoco_mjx.py",
+        "systems/mujoco/mjx.py",
         "return _derived(model) if self.derive else model",
         "return model",
         ("test_mujoco_mjx.py", "follows"),
     ),
     Mutant(
         "mjx: bodies that slide are as others",
-        "systems/mujoco_mjx.py",
+        "systems/mujoco/mjx.py",
         "if model.body_simple[body] == 2:",
         "if False:",
         ("test_mujoco_mjx.py", "follows"),
     ),
     Mutant(
         "mjx: constants stay at one",
-        "systems/mujoco_mjx.py",
+        "systems/mujoco/mjx.py",
         "one + jnp.tensordot(theta - 1.0, by, 1)",
         "one + 0.0 * jnp.tensordot(theta - 1.0, by, 1)",
         ("test_mujoco_mjx.py", "follows"),
@@ -296,42 +296,42 @@ ON_THE_HOST = (
     ),
     Mutant(
         "mjcf xml: document types are read",
-        "systems/mjcf_xml.py",
+        "systems/mujoco/xml.py",
         "if root.getroottree().docinfo.internalDTD is not None:",
         "if False:",
         ("test_mujoco_sources.py", "though_they_are_not_xml"),
     ),
     Mutant(
         "mjcf xml: numbers need not be finite",
-        "systems/mjcf_xml.py",
+        "systems/mujoco/xml.py",
         "if not text and any(_endless(word) for word in value.split()):",
         "if False:",
         ("test_mujoco_file.py", "is_not_finite"),
     ),
     Mutant(
         "mjcf child: it opens files all the same",
-        "systems/mjcf_child.py",
+        "systems/mujoco/child.py",
         'limit("RLIMIT_NOFILE", 0)',
         "pass",
         ("test_mujoco_sources.py", "opens_no_file"),
     ),
     Mutant(
         "mjcf child: limits are raised",
-        "systems/mjcf_child.py",
+        "systems/mujoco/child.py",
         "lowest = min(most, *now) if now else most",
         "lowest = most",
         ("test_mujoco_file.py", "never_raised"),
     ),
     Mutant(
         "mjcf child: warnings of Python are lost",
-        "systems/mjcf_child.py",
+        "systems/mujoco/child.py",
         'warnings.showwarning = lambda message, *_: say("WARNING:", message)',
         "warnings.showwarning = lambda *_: None",
         ("test_mujoco_file.py", "line_that_mujoco_names"),
     ),
     Mutant(
         "mujoco: delays are left to the engine",
-        "systems/mujoco.py",
+        "systems/mujoco/system.py",
         "    _check_delays(found)\n",
         "",
         ("test_mujoco_file.py", "own_delay"),

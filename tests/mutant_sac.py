@@ -3,8 +3,12 @@
 from mutant_list import Mutant
 
 SAC, NETWORKS = "planning/sac.py", "planning/networks.py"
-RANDOMISED, POLICY, EXPORT = "randomised.py", "robot/policy.py", "robot/export.py"
-FLIGHT = "flight.py"
+RANDOMISED, POLICY, EXPORT = (
+    "planning/domain_randomisation.py",
+    "robot/policy.py",
+    "robot/export.py",
+)
+FLIGHT = "planning/episode.py"
 
 OFF_POLICY = (
     Mutant(

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.integrate
 
-from sim2gp.logs import Log
-from sim2gp.parameters import Parameter
+from sim2gp.data.logs import Log
+from sim2gp.inference.parameters import Parameter
 from sim2gp.systems import ODE, Channel
 
 ARM, GRAVITY = 0.3, 9.81  # m, m/s^2

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.integrate
 
-from sim2gp.logs import Log
+from sim2gp.data.logs import Log
 from sim2gp.systems import AbstractEffect, Furuta, Perturbed
 
 NAMES = ("theta", "alpha", "theta.velocity", "alpha.velocity")

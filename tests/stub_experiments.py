@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from sim2gp.logs import Log, note_lines
+from sim2gp.data.logs import Log, note_lines
 from sim2gp.project import Project
 from sim2gp.runs import Progress, new_run
 

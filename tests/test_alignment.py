@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from recordings import Channel
-from sim2gp.logs import Log
-from sim2gp.logs.alignment import misaligned
+from sim2gp.data.logs import Log
+from sim2gp.data.logs.alignment import misaligned
 from sim2gp.project import load_project
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -20,9 +20,9 @@ import pytest
 
 import recordings as rec
 from recordings import Channel
+from sim2gp.data.logs import Column, read_log
+from sim2gp.data.logs import file as files
 from sim2gp.errors import InputError
-from sim2gp.logs import Column, read_log
-from sim2gp.logs import file as files
 
 STATES = (Channel("q", "rad", angle=True), Channel("dq", "rad/s"))
 ACTIONS = (Channel("u", "V"),)
@@ -310,7 +310,7 @@ def test_a_missing_extra_is_named(
 def test_reading_imports_what_it_needs_alone() -> None:
     """sim2gp starts without any of the optional libraries."""
     code = (
-        "import sys, sim2gp.logs; names = {n.split('.')[0] for n in sys.modules};"
+        "import sys, sim2gp.data.logs; names = {n.split('.')[0] for n in sys.modules};"
         "print(sorted(names & {'h5py', 'pyarrow', 'rosbags', 'mcap', 'minari'}))"
     )
     done = subprocess.run(

@@ -5,6 +5,8 @@ import math
 import numpy as np
 import pytest
 
+from sim2gp.data.grid import evaluation_windows
+from sim2gp.data.logs import Log
 from sim2gp.experiments.baselines import (
     compared,
     forecast_sentence,
@@ -12,8 +14,6 @@ from sim2gp.experiments.baselines import (
     regression_errors,
 )
 from sim2gp.experiments.prediction import Judged, scores
-from sim2gp.logs import Log
-from sim2gp.models.grid import evaluation_windows
 from sim2gp.systems import CartPole
 
 UNITS = {"q1": "rad", "q2": "rad"}

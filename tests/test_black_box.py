@@ -8,19 +8,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sim2gp.data.logs import Log
+from sim2gp.data.split_log import cut
+from sim2gp.data.transitions import Transitions
+from sim2gp.data.windows import WindowsBelief, linearise
 from sim2gp.errors import InputError
-from sim2gp.flight import episode, oracle_world
-from sim2gp.logs import Log
-from sim2gp.loops import psrl
+from sim2gp.inference.parameters import Parameter, Parameters
 from sim2gp.models import Sim2GP
-from sim2gp.models.cutting import cut
-from sim2gp.models.windows import WindowsBelief, linearise
-from sim2gp.parameters import Parameter, Parameters
 from sim2gp.planning import AbstractPlanner
+from sim2gp.planning.episode import episode, oracle_world
+from sim2gp.planning.loop import psrl
+from sim2gp.planning.tasks import furuta_swingup
 from sim2gp.robot.export import export_model
 from sim2gp.systems import ODE, BlackBox, Channel, Furuta
-from sim2gp.tasks import furuta_swingup
-from sim2gp.transitions import Transitions
 from sim2gp.types import in_float64
 
 DT = 0.05

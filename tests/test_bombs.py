@@ -17,7 +17,7 @@ import json, resource, sys, time
 import h5py, lz4.frame, mcap.reader, pyarrow.parquet, rosbags.rosbag2, zstandard
 import rosbags.typesys
 from sim2gp.errors import InputError
-from sim2gp.logs import Column, read_log
+from sim2gp.data.logs import Column, read_log
 
 class Channel:
     def __init__(self, name, unit):

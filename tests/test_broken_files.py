@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 import recordings as rec
+from sim2gp.data.logs import columns_of
+from sim2gp.data.logs.arrays import Entry, distinct
+from sim2gp.data.logs.file import MAGIC, SUFFIXES
+from sim2gp.data.logs.hdf5 import episodes_of
 from sim2gp.errors import InputError
-from sim2gp.logs import columns_of
-from sim2gp.logs.arrays import Entry, distinct
-from sim2gp.logs.file import MAGIC, SUFFIXES
-from sim2gp.logs.hdf5 import episodes_of
 from sim2gp.project.project import read_spec
 from sim2gp.project.source import read_source
 from sim2gp.runs import load_run

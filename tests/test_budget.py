@@ -17,10 +17,10 @@ import bombs
 import recordings as rec
 from recordings import Channel
 from sim2gp.cli import main
+from sim2gp.data.logs import Budget, Column, columns_of, read_log
+from sim2gp.data.logs.budget import Meter, readable
+from sim2gp.data.logs.unpack import inflated, lzf_pieces, pieces
 from sim2gp.errors import InputError
-from sim2gp.logs import Budget, Column, columns_of, read_log
-from sim2gp.logs.budget import Meter, readable
-from sim2gp.logs.unpack import inflated, lzf_pieces, pieces
 
 MIB = 2**20
 SMALL = Budget(64 * MIB, 30.0)  # a piece may have 2 MiB

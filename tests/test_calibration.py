@@ -6,6 +6,7 @@ from statistics import NormalDist
 import numpy as np
 import pytest
 
+from sim2gp.data.logs import Log
 from sim2gp.experiments.calibration import (
     LEVELS,
     blocks_of,
@@ -13,7 +14,6 @@ from sim2gp.experiments.calibration import (
     half_widths,
 )
 from sim2gp.experiments.prediction import Judged
-from sim2gp.logs import Log
 
 HORIZON = 0.5  # s; windows start every 0.1 s, so that five of them overlap
 NAMES = ("q1", "q2")

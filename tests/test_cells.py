@@ -298,7 +298,9 @@ def test_imports_are_found_wherever_they_are(tmp_path: Path) -> None:
         "import numpy\nfrom part import name\n\n"
         "def work():\n    import other.deep\n    from sim2gp import Progress\n"
     )
-    (tmp_path / "part.py").write_text("from sim2gp.gaussian import Gaussian\n")
+    (tmp_path / "part.py").write_text(
+        "from sim2gp.inference.gaussian import Gaussian\n"
+    )
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "__init__.py").write_text("")
     (tmp_path / "other" / "deep.py").write_text("from .near import x\n")
@@ -308,8 +310,12 @@ def test_imports_are_found_wherever_they_are(tmp_path: Path) -> None:
     scripts = {m for m in modules if m.split(".")[0] != "sim2gp"}
     assert scripts == {"study", "part", "other", "other.deep", "other.near"}
     # A name of the package itself may come from any room.
-    assert {"sim2gp.gaussian", "sim2gp.linalg", "sim2gp.loops"} <= modules
+    assert {
+        "sim2gp.inference.gaussian",
+        "sim2gp.inference.linalg",
+        "sim2gp.planning.loop",
+    } <= modules
     (tmp_path / "less.py").write_text("from part import name\n")
     modules = set(source_of(tmp_path / "less.py").modules)
-    assert "sim2gp.linalg" in modules
-    assert "sim2gp.loops" not in modules
+    assert "sim2gp.inference.linalg" in modules
+    assert "sim2gp.planning.loop" not in modules

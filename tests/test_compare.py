@@ -16,7 +16,7 @@ from sim2gp.models import ResidualFunctionSpace
 from sim2gp.project import load_project
 from sim2gp.runs import Progress, load_run
 from sim2gp.systems import Perturbed, UniformRodArm
-from sim2gp.systems.effects import Spring
+from sim2gp.systems.effects.base import Spring
 
 QUIET = Progress(quiet=True)
 #: The simulator and one learned model: each model more is half a minute of compiling,

@@ -6,11 +6,11 @@ from collections.abc import Iterator
 import jax
 import pytest
 
-from sim2gp.loops import Episode, psrl
 from sim2gp.models import Sim2GP
 from sim2gp.planning import ICEM, MPC
+from sim2gp.planning.loop import Episode, psrl
+from sim2gp.planning.tasks import Task, furuta_swingup
 from sim2gp.systems import Furuta
-from sim2gp.tasks import Task, furuta_swingup
 
 COMPILED = "/jax/core/compile/backend_compile_duration"
 

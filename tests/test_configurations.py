@@ -11,18 +11,19 @@ import pytest
 
 from linear_system import linear, windows_of
 from payload_arm import TRUTH, arm, log
-from sim2gp.arrowhead import Noise
-from sim2gp.configurations import Configuration
-from sim2gp.diagnose.residuals import misfit_of_windows
+from sim2gp.data import windows as likelihood
+from sim2gp.data.logs import Log
+from sim2gp.data.split_log import cut
+from sim2gp.data.transitions import Transitions
+from sim2gp.data.windows import Windows, WindowsBelief, fit_windows
 from sim2gp.errors import InputError
-from sim2gp.gaussian import Gaussian
-from sim2gp.laplace import Fit, minimise
-from sim2gp.logs import Log
+from sim2gp.identification.misfit.residuals import misfit_of_windows
+from sim2gp.inference.arrowhead import Noise
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.levenberg_marquardt import Fit, minimise
+from sim2gp.inference.parameters import Parameter
+from sim2gp.inference.variants import Configuration
 from sim2gp.models import Sim2GP
-from sim2gp.models import windows as likelihood
-from sim2gp.models.cutting import cut
-from sim2gp.models.windows import Windows, WindowsBelief, fit_windows
-from sim2gp.parameters import Parameter
 from sim2gp.systems import (
     ODE,
     AbstractSystem,
@@ -32,9 +33,8 @@ from sim2gp.systems import (
     alone,
     configured,
 )
-from sim2gp.systems.actuator import actuator_prior
-from sim2gp.systems.configured import own_table
-from sim2gp.transitions import Transitions
+from sim2gp.systems.actuators import actuator_prior
+from sim2gp.systems.variants import own_table
 from sim2gp.types import in_float64
 
 KEY = jax.random.key(0)

@@ -10,10 +10,10 @@ import pytest
 
 import bombs
 from recordings import Channel
+from sim2gp.data.logs import Column, read_log
+from sim2gp.data.logs.budget import Meter
+from sim2gp.data.logs.definitions import parsed
 from sim2gp.errors import InputError
-from sim2gp.logs import Column, read_log
-from sim2gp.logs.budget import Meter
-from sim2gp.logs.definitions import parsed
 
 #: Python that would leave a folder behind, in the forms that a template may be left by.
 RUN = "__import__('os').mkdir('was-run')"

@@ -20,12 +20,12 @@ from design_cases import (
     limits,
 )
 from sim2gp import design as d
+from sim2gp.data.logs import Log
+from sim2gp.data.split_log import cut
+from sim2gp.data.windows import WindowsBelief, information_at
 from sim2gp.design import search
 from sim2gp.design.limits import excess, kept
 from sim2gp.errors import InputError
-from sim2gp.logs import Log
-from sim2gp.models.cutting import cut
-from sim2gp.models.windows import WindowsBelief, information_at
 from simulated_logs import pendulum
 
 pytestmark = pytest.mark.usefixtures("float64")
@@ -43,7 +43,7 @@ ROWS = eqx.filter_jit(d.experiment.sensitivity_at)
 )
 @pytest.mark.nightly
 def test_it_tells_what_the_log_of_it_would(system) -> None:
-    """Against `models.windows`, on the log that the experiment would leave."""
+    """Against `data.windows`, on the log that the experiment would leave."""
     e, U = experiment(system), commands()
     nowhere = jnp.zeros_like(e.belief.mean)
     states = TRAJECTORY(e, e.belief.at(nowhere), U)

@@ -21,7 +21,7 @@ from sim2gp import design as d
 from sim2gp.design import search
 from sim2gp.design.limits import excess
 from sim2gp.errors import InputError
-from sim2gp.gaussian import Gaussian
+from sim2gp.inference.gaussian import Gaussian
 
 pytestmark = pytest.mark.usefixtures("float64")
 

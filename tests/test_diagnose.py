@@ -10,11 +10,12 @@ import pytest
 import scipy.stats
 
 from beliefs import believe, named, study, words_of
-from sim2gp import diagnose
-from sim2gp.diagnose import conflicts, words
-from sim2gp.diagnose.table import physical_moments
-from sim2gp.gaussian import Gaussian
-from sim2gp.parameters import Parameter, Parameters
+from sim2gp.identification import summary as diagnose
+from sim2gp.identification import words
+from sim2gp.identification.identifiability import conflicts
+from sim2gp.identification.identifiability.table import physical_moments
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.parameters import Parameter, Parameters
 
 # --- Moments -------------------------------------------------------------------------
 

@@ -12,18 +12,23 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from sim2gp.diagnose import intervals
-from sim2gp.diagnose.discrepancy import _with, corrected_windows
-from sim2gp.diagnose.intervals import NOTHING, SHARES, Corrected, corrected
-from sim2gp.diagnose.pulls import Pulls
+from sim2gp.data.split_log import cut
+from sim2gp.data.windows import Windows, WindowsBelief, fit_windows
 from sim2gp.experiments.told_intervals import lacking_table, told_intervals
-from sim2gp.gaussian import Gaussian
-from sim2gp.models.cutting import cut
-from sim2gp.models.windows import Windows, WindowsBelief, fit_windows
-from sim2gp.parameters import Parameter
+from sim2gp.identification.intervals import scatter as intervals
+from sim2gp.identification.intervals.discrepancy import _with, corrected_windows
+from sim2gp.identification.intervals.pulls import Pulls
+from sim2gp.identification.intervals.scatter import (
+    NOTHING,
+    SHARES,
+    Corrected,
+    corrected,
+)
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.parameters import Parameter
 from sim2gp.systems import UniformRodArm
-from sim2gp.systems.actuator import Actuated
-from sim2gp.systems.library import smooth_effects
+from sim2gp.systems.actuators import Actuated
+from sim2gp.systems.effects.library import smooth_effects
 from sim2gp.types import in_float64
 from test_intervals import HIGH, LOW, Linear, Plain, ar1, gaussian, smooth
 

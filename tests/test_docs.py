@@ -18,7 +18,7 @@ import pytest
 
 from sim2gp import cli
 from sim2gp.cli.commands import COMMANDS
-from sim2gp.logs.arrays import missing
+from sim2gp.data.logs.arrays import missing
 from sim2gp.project.effects import EFFECTS
 from sim2gp.project.project import SYSTEMS, system_class
 from sim2gp.project.schema import ProjectSpec

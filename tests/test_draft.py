@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from sim2gp.cli import main
+from sim2gp.data.logs import Column, Log
+from sim2gp.data.split_log import cut
 from sim2gp.errors import InputError
-from sim2gp.logs import Column, Log
-from sim2gp.models.cutting import cut
 from sim2gp.project import load_project
 from sim2gp.project.columns import match, time_column, unit_in, words_of
 from sim2gp.systems import MuJoCo

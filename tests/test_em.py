@@ -5,7 +5,15 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from sim2gp import arrowhead, em, laplace
+from sim2gp.inference import (
+    arrowhead,
+)
+from sim2gp.inference import (
+    expectation_maximisation as em,
+)
+from sim2gp.inference import (
+    levenberg_marquardt as laplace,
+)
 
 
 class Nothing(laplace.AbstractLikelihood):

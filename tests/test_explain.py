@@ -9,14 +9,20 @@ import numpy as np
 import pytest
 
 from sim2gp import systems as sy
-from sim2gp.arrowhead import Noise
-from sim2gp.diagnose.evidence import Fitted, OneStepData
-from sim2gp.diagnose.explain import explain
-from sim2gp.diagnose.missing import Refitted, Search, search
-from sim2gp.diagnose.score import Scored, inflation_of, score, tempered, widened
 from sim2gp.experiments import explain_study as study
 from sim2gp.experiments.explain_words import candidate_rows, headline, table
-from sim2gp.tasks import MACHINES
+from sim2gp.identification.missing_physics.data import Fitted, OneStepData
+from sim2gp.identification.missing_physics.explain import explain
+from sim2gp.identification.missing_physics.score import (
+    Scored,
+    inflation_of,
+    score,
+    tempered,
+    widened,
+)
+from sim2gp.identification.missing_physics.search import Refitted, Search, search
+from sim2gp.inference.arrowhead import Noise
+from sim2gp.planning.tasks import MACHINES
 from sim2gp.types import in_float64
 
 

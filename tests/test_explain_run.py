@@ -11,10 +11,10 @@ import pytest
 import stub_experiments
 from sim2gp import systems as sy
 from sim2gp.cli import main
+from sim2gp.data.logs import Budget
 from sim2gp.errors import InputError
 from sim2gp.experiments import explain, identify
 from sim2gp.experiments import explain_study as study
-from sim2gp.logs import Budget
 from sim2gp.project import load_project
 from sim2gp.runs import Progress, load_run, new_run
 from simulated_logs import simulated
@@ -33,7 +33,7 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
         every = sy.library(system, windows=windows)
         return tuple(c for c in every if c.name in kinds)
 
-    monkeypatch.setattr("sim2gp.diagnose.missing.library", short)
+    monkeypatch.setattr("sim2gp.identification.missing_physics.search.library", short)
 
 
 @pytest.fixture(scope="module")

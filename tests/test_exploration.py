@@ -21,11 +21,8 @@ from mass_task import (
     mass_task,
     single,
 )
-from sim2gp import loops
-from sim2gp.exploration import InformationGain, Optimistic, Restrained
-from sim2gp.flight import episode, world_of
-from sim2gp.models.base import AbstractBelief
-from sim2gp.models.information import joint
+from sim2gp.belief import AbstractBelief
+from sim2gp.inference.information import joint
 from sim2gp.planning import (
     AbstractObjective,
     AbstractPlanner,
@@ -35,8 +32,11 @@ from sim2gp.planning import (
     RandomInput,
     World,
 )
-from sim2gp.planning.base import rollout
+from sim2gp.planning import loop as loops
+from sim2gp.planning.episode import episode, world_of
+from sim2gp.planning.exploration import InformationGain, Optimistic, Restrained
 from sim2gp.planning.mpc import from_unit
+from sim2gp.planning.world import rollout
 from sim2gp.types import Action, State
 
 assert fresh_counters  # applies to this file

@@ -15,14 +15,14 @@ import pytest
 
 import bad_policies
 from sim2gp.errors import InputError, NotFinite
-from sim2gp.flight import oracle_world
 from sim2gp.models import NLM, Sim2GP
 from sim2gp.planning import SAC, Observation, Policy
+from sim2gp.planning.episode import oracle_world
+from sim2gp.planning.tasks import furuta_swingup
 from sim2gp.robot import NumpyPolicy, load_policy
 from sim2gp.robot.export import export_model, export_policy
 from sim2gp.runs import load_run, new_run, store
 from sim2gp.systems import Actuated, CartPole, Furuta, MuJoCo
-from sim2gp.tasks import furuta_swingup
 
 KEY = jax.random.key(0)
 TASK, SYSTEM = furuta_swingup(), Furuta()

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim2gp.systems.external import AbstractSimulator, Differences, flow
+from sim2gp.systems.plants.external import AbstractSimulator, Differences, flow
 from sim2gp.types import in_float64
 
 THETA = np.array([1.3, 0.2])

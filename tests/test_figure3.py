@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 import scipy.stats
 
+from sim2gp.belief import AbstractBelief
 from sim2gp.errors import InputError
 from sim2gp.experiments import exploring, figure3
 from sim2gp.experiments.exploring import METHODS, Cell, HeldOut
 from sim2gp.experiments.swingup import CONDITIONS, meeting
-from sim2gp.gaussian import Gaussian
-from sim2gp.models.base import AbstractBelief
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.planning.tasks import MACHINES
 from sim2gp.report import figure3 as drawn
 from sim2gp.runs import Progress
 from sim2gp.runs.cells import Cells
-from sim2gp.tasks import MACHINES
 
 
 def test_transitions_needed_by_hand():

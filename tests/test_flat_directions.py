@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from beliefs import believe, named, rows_of, study
-from sim2gp import diagnose
-from sim2gp.parameters import Parameter, Parameters, parameters_of
-from sim2gp.systems.two_link import TwoLink, UniformRodArm, UniformRodParams
+from sim2gp.identification import summary as diagnose
+from sim2gp.inference.parameters import Parameter, Parameters, parameters_of
+from sim2gp.systems.plants.two_link import TwoLink, UniformRodArm, UniformRodParams
 
 # --- Unidentified truth is said: 50 degenerate systems -------------------------------
 

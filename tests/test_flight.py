@@ -22,10 +22,9 @@ from mass_task import (
     start,
     traces,
 )
-from sim2gp import tasks
 from sim2gp.errors import NotFinite, Sim2GPWarning
-from sim2gp.flight import Trajectory, episode, fly, oracle_world, world_of
-from sim2gp.planning import AbstractPlanner, MarkovObjective, World
+from sim2gp.planning import AbstractPlanner, MarkovObjective, World, tasks
+from sim2gp.planning.episode import Trajectory, episode, fly, oracle_world, world_of
 from sim2gp.systems import InputDelay
 from sim2gp.types import Key, State
 

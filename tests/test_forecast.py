@@ -10,16 +10,16 @@ import pytest
 
 from oracles import log_protocol as protocol
 from oracles import plain_least_squares as plain
-from sim2gp.gaussian import Gaussian
-from sim2gp.logs import Log
-from sim2gp.models.forecast import (
+from sim2gp.data.grid import CURVE, evaluation_windows, slopes, steps_of
+from sim2gp.data.logs import Log
+from sim2gp.identification.forecast import (
     Band,
     _forecast,
     compile_forecast,
     fit_band,
     forecast,
 )
-from sim2gp.models.grid import CURVE, evaluation_windows, slopes, steps_of
+from sim2gp.inference.gaussian import Gaussian
 from sim2gp.systems import TwoLink
 from sim2gp.types import in_float64
 from test_black_box import EXACT, TABLE_OF, TRUTH, black_box, step
@@ -290,7 +290,7 @@ def test_published_models_score_as_known(
     shared_data: Path, model: str, pooled: tuple[float, float]
 ) -> None:
     """The figures that the recordings come with, through the package's own path."""
-    from sim2gp.logs import Column, read_log
+    from sim2gp.data.logs import Column, read_log
 
     arm_folder = shared_data / "double_pendulum"
     text = (arm_folder / "published_parameters" / f"c1_model_{model}.yml").read_text()

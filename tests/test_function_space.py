@@ -10,16 +10,11 @@ import pytest
 
 from linear_system import Linear, linear, transitions
 from sim2gp.errors import InputError, NotFinite
-from sim2gp.gaussian import Gaussian
-from sim2gp.models import (
-    FunctionSpace,
-    ResidualFunctionSpace,
-    Sim2GP,
-    features,
-    matching,
-)
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.models import FunctionSpace, ResidualFunctionSpace, Sim2GP, features
 from sim2gp.models import function_space as module
-from sim2gp.models.matching import OBJECTIVES, Objective
+from sim2gp.models import function_space_loss as matching
+from sim2gp.models.function_space_loss import OBJECTIVES, Objective
 
 P, D, M = 3, 2, 5
 KEY = jax.random.key(0)

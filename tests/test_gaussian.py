@@ -7,7 +7,7 @@ import pytest
 import scipy.stats
 
 from sim2gp.errors import InputError
-from sim2gp.gaussian import (
+from sim2gp.inference.gaussian import (
     Gaussian,
     from_covariance,
     log_det_factor,

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sim2gp.configurations import Configuration
+from sim2gp.data.logs import Log
 from sim2gp.errors import InputError
 from sim2gp.experiments import (
     apply,
@@ -19,7 +19,7 @@ from sim2gp.experiments import (
 )
 from sim2gp.experiments.configurations import told
 from sim2gp.experiments.identified import restored
-from sim2gp.logs import Log
+from sim2gp.inference.variants import Configuration
 from sim2gp.project import load_project
 from sim2gp.runs import Progress, load_run
 from sim2gp.systems import Furuta

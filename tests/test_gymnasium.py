@@ -14,12 +14,12 @@ from gymnasium.utils.env_checker import check_env
 from jaxtyping import Array, Bool
 
 from sim2gp.errors import InputError, NotFinite
-from sim2gp.flight import Purpose, fly, key_for, oracle_world
 from sim2gp.planning import AbstractPlanner, World
+from sim2gp.planning.episode import Purpose, fly, key_for, oracle_world
 from sim2gp.planning.mpc import from_unit
+from sim2gp.planning.tasks import MACHINES, Task, draw_truth, furuta_swingup
 from sim2gp.robot.gymnasium import NAMES, _kind, after, environment, register
 from sim2gp.systems import Furuta, InputDelay
-from sim2gp.tasks import MACHINES, Task, draw_truth, furuta_swingup
 from sim2gp.types import Key, State
 
 SEED = 7

@@ -10,8 +10,7 @@ from jaxtyping import Array, Float
 from scipy.stats import genpareto, norm
 from scipy.stats import t as student
 
-from sim2gp.arrowhead import Blocks, Noise
-from sim2gp.diagnose.importance import (
+from sim2gp.identification.exact_posterior.importance import (
     DRAWS,
     Checked,
     _log_posterior,
@@ -19,8 +18,9 @@ from sim2gp.diagnose.importance import (
     pareto,
     smoothed,
 )
-from sim2gp.laplace import AbstractLikelihood
-from sim2gp.least_squares import factor
+from sim2gp.inference.arrowhead import Blocks, Noise
+from sim2gp.inference.least_squares import factor
+from sim2gp.inference.levenberg_marquardt import AbstractLikelihood
 
 
 @pytest.mark.parametrize("k", [-0.3, 0.0, 0.4, 0.9])

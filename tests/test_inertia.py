@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from sim2gp.errors import InputError
-from sim2gp.parameters import Parameter
-from sim2gp.systems.inertia import (
+from sim2gp.inference.parameters import Parameter
+from sim2gp.systems.mujoco.inertia import (
     NAMES,
     BodyInertia,
     deformation,
@@ -18,7 +18,7 @@ from sim2gp.systems.inertia import (
 mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is not installed")
 
 from sim2gp import systems as sy  # noqa: E402
-from sim2gp.systems.mjcf import constants_of, set_constants  # noqa: E402
+from sim2gp.systems.mujoco.constants import constants_of, set_constants  # noqa: E402
 
 RNG = np.random.default_rng(0)
 MODEL = """<mujoco><worldbody><body name="arm">

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim2gp.models.information import Seen, increments, joint
+from sim2gp.inference.information import Seen, increments, joint
 
 pytestmark = pytest.mark.usefixtures("float64")
 

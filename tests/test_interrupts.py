@@ -63,7 +63,7 @@ def work():
 """
 COMPILES_AHEAD = """
 def work():
-    from sim2gp.ahead import _COMPILER
+    from sim2gp.compilation import _COMPILER
     lowered = jax.jit(unrolled).lower(jnp.ones((3, 3)))
     future = _COMPILER.submit(lowered.compile)
     ready()

@@ -12,17 +12,22 @@ import scipy.signal
 from beliefs import believe, named, study
 from linear_system import Linear as Machine
 from linear_system import linear
-from sim2gp.diagnose import intervals
-from sim2gp.diagnose.discrepancy import corrected_windows
-from sim2gp.diagnose.importance import DRAWS, check_windows
-from sim2gp.diagnose.intervals import corrected
-from sim2gp.diagnose.pulls import Pulls, cost_of_rows, pulls_of_windows, rows_of
+from sim2gp.data.logs import Log
+from sim2gp.data.split_log import cut
+from sim2gp.data.windows import Windows, WindowsBelief, fit_windows, linearise
 from sim2gp.errors import NotFinite
-from sim2gp.gaussian import Gaussian
-from sim2gp.logs import Log
-from sim2gp.models.cutting import cut
-from sim2gp.models.windows import Windows, WindowsBelief, fit_windows, linearise
-from sim2gp.parameters import Parameter, Parameters
+from sim2gp.identification.exact_posterior.importance import DRAWS, check_windows
+from sim2gp.identification.intervals import scatter as intervals
+from sim2gp.identification.intervals.discrepancy import corrected_windows
+from sim2gp.identification.intervals.pulls import (
+    Pulls,
+    cost_of_rows,
+    pulls_of_windows,
+    rows_of,
+)
+from sim2gp.identification.intervals.scatter import corrected
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.parameters import Parameter, Parameters
 
 W, L, P = 40, 10, 3
 ROWS = W * L

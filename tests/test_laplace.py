@@ -9,10 +9,18 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from sim2gp import arrowhead, em, laplace
-from sim2gp import least_squares as ls
 from sim2gp.errors import DeadParameters, NotConverged, NotFinite
-from sim2gp.gaussian import Gaussian
+from sim2gp.inference import (
+    arrowhead,
+)
+from sim2gp.inference import (
+    expectation_maximisation as em,
+)
+from sim2gp.inference import least_squares as ls
+from sim2gp.inference import (
+    levenberg_marquardt as laplace,
+)
+from sim2gp.inference.gaussian import Gaussian
 
 pytestmark = pytest.mark.usefixtures("float64")
 

@@ -12,7 +12,8 @@ import jax.scipy.linalg as jsl
 import numpy as np
 import pytest
 
-from sim2gp import linalg
+from sim2gp.data.transitions import Transitions
+from sim2gp.inference import linalg
 from sim2gp.models import (
     NLM,
     FunctionSpace,
@@ -26,7 +27,6 @@ from sim2gp.models import (
     sim2gp,
 )
 from sim2gp.systems import Furuta
-from sim2gp.transitions import Transitions
 
 pytestmark = pytest.mark.usefixtures("float64")
 
@@ -136,7 +136,7 @@ FIT = """
 import jax, numpy as np
 from sim2gp.models import ResidualFunctionSpace, Sim2GP
 from sim2gp.systems import Furuta
-from sim2gp.transitions import Transitions
+from sim2gp.data.transitions import Transitions
 rng = np.random.default_rng(0)
 S, A = rng.uniform(-1, 1, (250, 4)), rng.uniform(-1, 1, (250, 1))
 system = Furuta()

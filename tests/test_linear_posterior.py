@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from oracles import exact
-from sim2gp import least_squares as ls
-from sim2gp.gaussian import Gaussian
+from sim2gp.inference import least_squares as ls
+from sim2gp.inference.gaussian import Gaussian
 
 #: (p, outputs, most rows): one compilation each.
 SHAPES = [(1, 2, 500), (2, 1, 100), (3, 4, 20), (4, 3, 500), (6, 2, 100)]

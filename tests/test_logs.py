@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from recordings import Channel
-from sim2gp.errors import InputError
-from sim2gp.logs import (
+from sim2gp.data.logs import (
     Column,
     Log,
     Note,
@@ -19,7 +18,8 @@ from sim2gp.logs import (
     read_log,
     shared_rows,
 )
-from sim2gp.logs.units import UNITS, factor
+from sim2gp.data.logs.units import UNITS, factor
+from sim2gp.errors import InputError
 
 STATES = (
     Channel("q", "rad", angle=True),

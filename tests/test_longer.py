@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from linear_system import linear
-from sim2gp.diagnose.discrepancy import corrected_windows
-from sim2gp.diagnose.intervals import Corrected
-from sim2gp.diagnose.residuals import misfit_of_windows
+from sim2gp.data.logs import Log
+from sim2gp.data.windows import fit_windows
 from sim2gp.experiments.longer import TIMES, Longer, advice, lengthened
 from sim2gp.experiments.prediction import cut_logs
-from sim2gp.logs import Log
-from sim2gp.models.windows import fit_windows
+from sim2gp.identification.intervals.discrepancy import corrected_windows
+from sim2gp.identification.intervals.scatter import Corrected
+from sim2gp.identification.misfit.residuals import misfit_of_windows
 from sim2gp.project import Project, load_project
 
 RATE, NOISE, WINDOW = 10.0, 0.02, 0.5  # Hz, m, s

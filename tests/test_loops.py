@@ -23,15 +23,16 @@ from mass_task import (
     single,
     traces,
 )
-from sim2gp import flight, loops, tasks
-from sim2gp import oracle as references
+from sim2gp.belief import AbstractBelief
+from sim2gp.data.transitions import Transitions
 from sim2gp.errors import NotFinite, Sim2GPError
-from sim2gp.flight import Trajectory, key_for, world_of
-from sim2gp.models.base import AbstractBelief
-from sim2gp.planning import MPC, AbstractPlanner, MarkovObjective, World
+from sim2gp.planning import MPC, AbstractPlanner, MarkovObjective, World, tasks
+from sim2gp.planning import episode as flight
+from sim2gp.planning import loop as loops
+from sim2gp.planning import oracle as references
+from sim2gp.planning.episode import Trajectory, key_for, world_of
+from sim2gp.planning.tasks import Task
 from sim2gp.systems import Furuta
-from sim2gp.tasks import Task
-from sim2gp.transitions import Transitions
 from sim2gp.types import Key, State
 
 

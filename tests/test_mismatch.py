@@ -11,10 +11,10 @@ import pytest
 from sim2gp.errors import InputError
 from sim2gp.experiments import mismatch, swingup
 from sim2gp.experiments.swingup import CONDITIONS, METHODS, WITH_TERM, Cell
+from sim2gp.planning.tasks import MACHINES, furuta_swingup
 from sim2gp.runs import Progress
 from sim2gp.systems import Actuated, Furuta
-from sim2gp.systems.perturbed import InputDelay, effect
-from sim2gp.tasks import MACHINES, furuta_swingup
+from sim2gp.systems.effects.perturbed import InputDelay, effect
 
 ORACLE = {"hang_return": 50.0, "oracle_return": 150.0, "redrawn": 0, "returns": [150.0]}
 

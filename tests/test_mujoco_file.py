@@ -11,7 +11,8 @@ import pytest
 
 from sim2gp import systems as sy
 from sim2gp.errors import InputError, Sim2GPWarning
-from sim2gp.systems import mjcf_child, mjcf_load
+from sim2gp.systems.mujoco import child as mjcf_child
+from sim2gp.systems.mujoco import load as mjcf_load
 
 mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is not installed")
 
@@ -263,7 +264,7 @@ def test_a_model_loads_under_a_lower_limit_of_memory(tmp_path: Path) -> None:
     """As after `ulimit -v`, where no process may raise it again."""
     path = written(tmp_path, CRAWLER.format(**USUAL))
     code = (
-        "import pathlib, sys; from sim2gp.systems.mjcf_load import compiled;"
+        "import pathlib, sys; from sim2gp.systems.mujoco.load import compiled;"
         "print(compiled(pathlib.Path(sys.argv[1])).njnt)"
     )
     command = [sys.executable, "-c", code, str(path)]

@@ -12,9 +12,10 @@ import pytest
 import hostile_models
 from hostile_models import SHOWN, Hostile, furnish, hostile, watched
 from sim2gp.errors import InputError
-from sim2gp.systems import mjcf_load, mjcf_sources
-from sim2gp.systems.mjcf_load import compiled
-from sim2gp.systems.mjcf_sources import read_sources
+from sim2gp.systems.mujoco import load as mjcf_load
+from sim2gp.systems.mujoco import sources as mjcf_sources
+from sim2gp.systems.mujoco.load import compiled
+from sim2gp.systems.mujoco.sources import read_sources
 
 mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is not installed")
 pytest.importorskip("lxml", reason="the extra `mujoco` is not installed")

@@ -7,7 +7,7 @@ import pytest
 
 from sim2gp import systems as sy
 from sim2gp.errors import InputError
-from sim2gp.parameters import Parameter
+from sim2gp.inference.parameters import Parameter
 from sim2gp.types import in_float64
 
 mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is not installed")

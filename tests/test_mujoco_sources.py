@@ -10,7 +10,7 @@ import pytest
 
 from hostile_models import tetrahedron
 from sim2gp.errors import InputError
-from sim2gp.systems import mjcf_load
+from sim2gp.systems.mujoco import load as mjcf_load
 
 mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is not installed")
 
@@ -142,7 +142,7 @@ def test_files_are_found_where_mujoco_finds_them(tmp_path: Path, layout: str) ->
 
 def test_a_file_has_every_name_that_mujoco_may_ask_for(tmp_path: Path) -> None:
     """Without one MuJoCo takes any file with the same last part of the name."""
-    from sim2gp.systems.mjcf_sources import read_sources
+    from sim2gp.systems.mujoco.sources import read_sources
 
     (tmp_path / "sub").mkdir()
     (tmp_path / "sub" / "x.stl").write_bytes(tetrahedron(0.1))
@@ -199,7 +199,7 @@ def test_forms_that_mujoco_reads_though_they_are_not_xml(tmp_path: Path) -> None
 @pytest.mark.skipif(sys.platform == "win32", reason="no limits")
 def test_the_child_opens_no_file_after_it_has_read_its_own(tmp_path: Path) -> None:
     """A text that names a file, past the guard: the compiler gets nothing of it."""
-    from sim2gp.systems.mjcf_sources import Sources
+    from sim2gp.systems.mujoco.sources import Sources
 
     (tmp_path / "x.stl").write_bytes(tetrahedron(0.1))
     text = MESH.format(compiler="", mesh=f'file="{tmp_path}/x.stl"')

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import mjcf
-from sim2gp import diagnose
 from sim2gp import systems as sy
+from sim2gp.data.transitions import Transitions
 from sim2gp.errors import InputError
-from sim2gp.gaussian import Gaussian
+from sim2gp.identification import summary as diagnose
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.parameters import Parameter
 from sim2gp.models import Sim2GP
-from sim2gp.parameters import Parameter
-from sim2gp.transitions import Transitions
 from sim2gp.types import in_float64
 
 mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is not installed")

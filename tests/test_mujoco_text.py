@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from sim2gp.errors import InputError
-from sim2gp.systems.mjcf_file import ModelFile
-from sim2gp.systems.mjcf_load import compiled, compiled_all
+from sim2gp.systems.mujoco.load import compiled, compiled_all
+from sim2gp.systems.mujoco.model_file import ModelFile
 
 mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is not installed")
 

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from oracles import exact
+from sim2gp.data.transitions import Transitions
 from sim2gp.errors import InputError, NotFinite
-from sim2gp.gaussian import Gaussian
-from sim2gp.models import NLM, features, last_layer
+from sim2gp.inference import linear_regression as last_layer
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.models import NLM, features
 from sim2gp.models import nlm as module
 from sim2gp.systems import Actuated, Furuta
-from sim2gp.transitions import Transitions
 
 KEY = jax.random.key(0)
 N, M, D = 40, 7, 2

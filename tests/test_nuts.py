@@ -10,11 +10,11 @@ import pytest
 from jaxtyping import Array, Float
 from scipy.stats import norm
 
-from sim2gp.arrowhead import Blocks, Noise
-from sim2gp.diagnose.nuts import Sampled, judged, sampled, sampler
 from sim2gp.errors import InputError
-from sim2gp.laplace import AbstractLikelihood, minimise
-from sim2gp.least_squares import factor
+from sim2gp.identification.exact_posterior.nuts import Sampled, judged, sampled, sampler
+from sim2gp.inference.arrowhead import Blocks, Noise
+from sim2gp.inference.least_squares import factor
+from sim2gp.inference.levenberg_marquardt import AbstractLikelihood, minimise
 
 GOOD = Sampled(np.zeros(2), np.ones(2), 1.001, 900.0, 0)
 

@@ -11,10 +11,10 @@ import pytest
 import scipy.integrate
 import scipy.stats
 
-from sim2gp.bijections import MAPS
 from sim2gp.errors import InputError
-from sim2gp.gaussian import Gaussian
-from sim2gp.parameters import (
+from sim2gp.inference.bijections import MAPS
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.parameters import (
     Parameter,
     Parameters,
     bounded,

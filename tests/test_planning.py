@@ -31,10 +31,10 @@ from sim2gp.planning import (
     Resumed,
     World,
 )
-from sim2gp.planning.base import DIVERGED, masked, rollout
+from sim2gp.planning.coloured_noise import colour_factor, coloured_noise
 from sim2gp.planning.mpc import Underway, from_unit, promising
 from sim2gp.planning.mppi import softmax_of_size
-from sim2gp.planning.noise import colour_factor, coloured_noise
+from sim2gp.planning.world import DIVERGED, masked, rollout
 
 
 # ---------------------------------------------------------------- coloured noise

@@ -12,11 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sim2gp.errors import InputError
-from sim2gp.parameters import BOX_SD
+from sim2gp.inference.parameters import BOX_SD
 from sim2gp.project import Project, load_project
 from sim2gp.project.source import read_source
-from sim2gp.systems.actuator import Actuated
-from sim2gp.systems.two_link import TwoLink
+from sim2gp.systems.actuators import Actuated
+from sim2gp.systems.plants.two_link import TwoLink
 
 BASE = """system = "two_link"
 

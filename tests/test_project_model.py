@@ -17,7 +17,7 @@ from sim2gp.experiments.design_verdict import Asked
 from sim2gp.experiments.identified import restored
 from sim2gp.project import load_project
 from sim2gp.runs import load_run, new_run
-from sim2gp.systems.mjcf_load import compiled_all
+from sim2gp.systems.mujoco.load import compiled_all
 
 mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is not installed")
 

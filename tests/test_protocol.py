@@ -15,12 +15,13 @@ from scipy.stats import multivariate_normal
 
 import sim2gp as sg
 from mass_task import mass_task, single
+from sim2gp.data import one_step_log as stepping
 from sim2gp.errors import InputError
-from sim2gp.exploration import InformationGain, Optimistic
-from sim2gp.flight import world_of
-from sim2gp.models import stepping
 from sim2gp.models.auto import log_scores
+from sim2gp.models.ensemble import ensemble
 from sim2gp.planning import MarkovObjective, RandomInput
+from sim2gp.planning.episode import world_of
+from sim2gp.planning.exploration import InformationGain, Optimistic
 from sim2gp.robot.export import export_model
 from sim2gp.runs.sinks import each_episode
 from sim2gp.types import single as in_float32
@@ -243,7 +244,7 @@ def forecast(name, model, data, before, belief):
         (4,),
         (0, 1),
     )
-    found = stepping.ensemble(belief, steps, np.zeros(D), draws=5, key=KEY)
+    found = ensemble(belief, steps, np.zeros(D), draws=5, key=KEY)
     assert found.finite()
     assert found.draws.shape == (5, 3, 1, D)
     assert np.all(np.std(found.draws, axis=0) > 0.0)

@@ -5,12 +5,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sim2gp.gaussian import Gaussian
+from sim2gp.inference.gaussian import Gaussian
 from sim2gp.models import Sim2GP
 from sim2gp.planning import SAC, World
-from sim2gp.randomised import randomised_world
+from sim2gp.planning.domain_randomisation import randomised_world
+from sim2gp.planning.tasks import furuta_swingup
 from sim2gp.systems import Furuta
-from sim2gp.tasks import furuta_swingup
 from sim2gp.types import single
 
 KEY = jax.random.key(0)

@@ -15,7 +15,7 @@ from sim2gp import report
 from sim2gp.errors import InputError
 from sim2gp.report import markup
 from sim2gp.runs import store
-from sim2gp.systems.mujoco_film import BYTES
+from sim2gp.systems.mujoco.film import BYTES
 
 
 @pytest.fixture(scope="module")

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from linear_system import linear, transitions
-from sim2gp.gaussian import Gaussian
-from sim2gp.models import Residual, Sim2GP, features, last_layer
+from sim2gp.inference import linear_regression as last_layer
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.models import Residual, Sim2GP, features
 from sim2gp.models import residual as module
-from sim2gp.models.base import PointEstimate
+from sim2gp.models.point_estimate import PointEstimate
 
 P, D, M = 3, 2, 5
 KEY = jax.random.key(0)

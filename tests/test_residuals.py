@@ -9,23 +9,23 @@ import numpy as np
 import pytest
 
 from linear_system import linear, transitions
-from sim2gp.diagnose import misfit
-from sim2gp.diagnose.residuals import (
-    earlier,
-    encoded,
-    misfit_of_transitions,
-    misfit_of_windows,
-)
-from sim2gp.gaussian import Gaussian
-from sim2gp.models import Sim2GP
-from sim2gp.models.cutting import cut
-from sim2gp.models.windows import (
+from sim2gp.data.split_log import cut
+from sim2gp.data.windows import (
     Windows,
     WindowsBelief,
     _linearise,
     compile_linearise,
     linearise,
 )
+from sim2gp.identification.misfit.residuals import (
+    earlier,
+    encoded,
+    misfit_of_transitions,
+    misfit_of_windows,
+)
+from sim2gp.identification.summary import misfit
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.models import Sim2GP
 from sim2gp.systems import Channel, Furuta
 from sim2gp.types import in_float64
 from simulated_logs import pendulum, simulated

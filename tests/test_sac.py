@@ -13,9 +13,9 @@ from scipy.linalg import solve_discrete_are
 
 from double_integrator import A, B, Q, R
 from double_integrator import world as double_integrator
+from sim2gp.data.transitions import Transitions
 from sim2gp.planning import SAC, MarkovObjective, Observation, World, sac
 from sim2gp.planning.networks import LOG_SD, MLP, squashed, values
-from sim2gp.transitions import Transitions
 from sim2gp.types import Box
 
 KEY = jax.random.key(0)

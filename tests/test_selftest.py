@@ -117,7 +117,7 @@ def test_arms_that_do_not_converge_count_as_missed(monkeypatch):
 def test_bounds_that_leak_are_noticed(monkeypatch):
     right = checks.Furuta().parameters.constrain.__func__
     monkeypatch.setattr(
-        "sim2gp.parameters.Parameters.constrain",
+        "sim2gp.inference.parameters.Parameters.constrain",
         lambda self, tt: right(self, tt) * jnp.asarray(1.0 + 1e-9),
     )
     assert figure("bounds") > CHECKS["bounds"].limit

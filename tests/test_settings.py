@@ -13,19 +13,19 @@ from design_cases import experiment, limits
 from double_integrator import world
 from linear_system import linear, windows_of
 from mass_task import GainModel, mass_task, single
-from sim2gp import checks, oracle, tasks
+from sim2gp import checks
 from sim2gp import systems as sy
+from sim2gp.data.grid import evaluation_windows
 from sim2gp.design.goals import Everything
 from sim2gp.design.search import design
 from sim2gp.design.signals import Free
 from sim2gp.design.signals import Multisine as Sines
 from sim2gp.errors import InputError
-from sim2gp.gaussian import Gaussian
-from sim2gp.models.grid import evaluation_windows
-from sim2gp.parameters import Parameter, Parameters, prior_from_moments
-from sim2gp.planning import Chirp, Multisine, Observation, RandomInput
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.linear_measurements import Weighed
+from sim2gp.inference.parameters import Parameter, Parameters, prior_from_moments
+from sim2gp.planning import Chirp, Multisine, Observation, RandomInput, oracle, tasks
 from sim2gp.robot.export import export_model
-from sim2gp.weighed import Weighed
 
 NAN, INF = float("nan"), float("inf")
 KEY = jax.random.key(0)

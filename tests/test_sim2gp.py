@@ -12,11 +12,11 @@ import scipy.stats
 
 from linear_system import linear, transitions
 from oracles import exact
+from sim2gp.data.transitions import Transitions
 from sim2gp.errors import DeadParameters, NotFinite
-from sim2gp.gaussian import Gaussian
+from sim2gp.inference.gaussian import Gaussian
 from sim2gp.models import PointEstimate, PriorMean, Sim2GP
 from sim2gp.models import sim2gp as module
-from sim2gp.transitions import Transitions
 
 P, D, N = 3, 2, 40
 KEY = jax.random.key(0)

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 import machines
-from sim2gp import arrowhead, laplace
-from sim2gp.gaussian import Gaussian
-from sim2gp.least_squares import RANK_TOLERANCE
-from sim2gp.models import Sim2GP, linearized
+from sim2gp.data.transitions import Transitions
+from sim2gp.inference import arrowhead, linearized
+from sim2gp.inference import levenberg_marquardt as laplace
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.least_squares import RANK_TOLERANCE
+from sim2gp.models import Sim2GP
 from sim2gp.models import sim2gp as module
 from sim2gp.systems import CartPole, Furuta, UniformRodArm
-from sim2gp.transitions import Transitions
 
 KEY = jax.random.key(0)
 DT = 0.02

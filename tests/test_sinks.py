@@ -15,9 +15,9 @@ import pytest
 
 from sim2gp.errors import InputError
 from sim2gp.experiments.demo import _told
-from sim2gp.flight import Trajectory
-from sim2gp.loops import Episode
 from sim2gp.models import PointEstimate, Sim2GP
+from sim2gp.planning.episode import Trajectory
+from sim2gp.planning.loop import Episode
 from sim2gp.runs.sinks import JSONLines, Sink, TensorBoard, WandB, each_episode, opened
 from sim2gp.systems import CartPole
 

@@ -51,7 +51,7 @@ def swing(count: int = 40) -> np.ndarray:
 
 def test_an_arm_is_posed_as_its_closed_form_says() -> None:
     mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is absent")
-    from sim2gp.systems.mujoco_figure import figure_of
+    from sim2gp.systems.mujoco.figure import figure_of
 
     q = swing()
     figure = figure_of(mujoco.MjModel.from_xml_string(ARM), q)
@@ -70,7 +70,7 @@ def test_an_arm_is_posed_as_its_closed_form_says() -> None:
 
 def test_a_cart_slides_on_its_rail() -> None:
     mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is absent")
-    from sim2gp.systems.mujoco_figure import figure_of
+    from sim2gp.systems.mujoco.figure import figure_of
 
     q = swing() * [0.4, 1.0]
     figure = figure_of(mujoco.MjModel.from_xml_string(CART), q)
@@ -220,7 +220,7 @@ def test_a_large_figure_does_not_make_a_heavy_page() -> None:
 
 def test_an_entry_of_a_summary_is_plain() -> None:
     mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is absent")
-    from sim2gp.systems.mujoco_figure import figure_of
+    from sim2gp.systems.mujoco.figure import figure_of
 
     figure = figure_of(mujoco.MjModel.from_xml_string(CART), swing())
     entry = json.loads(json.dumps(figure_entry(figure)))
@@ -234,7 +234,7 @@ def test_no_back_end_is_no_picture_and_no_noise(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is absent")
-    from sim2gp.systems.mujoco_film import backends, rendered
+    from sim2gp.systems.mujoco.film import backends, rendered
 
     assert backends({}, "linux") == ["egl", "osmesa"]
     assert backends({}, "darwin") == [""]
@@ -257,7 +257,7 @@ def test_mujoco_sees_the_machine_where_the_figure_is(text: str) -> None:
     """Every joint of the figure lies on the machine that MuJoCo drew."""
     mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is absent")
     from sim2gp.experiments.motion import _frames
-    from sim2gp.systems.mujoco_figure import figure_of
+    from sim2gp.systems.mujoco.figure import figure_of
 
     model = mujoco.MjModel.from_xml_string(text)
     q = swing(33)

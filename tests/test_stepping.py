@@ -6,14 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim2gp.gaussian import Gaussian
-from sim2gp.logs import Log
-from sim2gp.models import Sim2GP, Sim2GPBelief
-from sim2gp.models.base import AbstractBelief
-from sim2gp.models.grid import evaluation_windows, steps_of
-from sim2gp.models.stepping import (
+from sim2gp.belief import AbstractBelief
+from sim2gp.data.grid import evaluation_windows, steps_of
+from sim2gp.data.logs import Log
+from sim2gp.data.one_step_log import (
     Steps,
-    ensemble,
     mean_inputs,
     samples_of,
     smoothed_states,
@@ -21,10 +18,13 @@ from sim2gp.models.stepping import (
     steps_of_grid,
     transitions,
 )
-from sim2gp.models.stretch import simulate
-from sim2gp.models.windows import Windows
+from sim2gp.data.transitions import Transitions
+from sim2gp.data.windows import Windows
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.models import Sim2GP, Sim2GPBelief
+from sim2gp.models.ensemble import ensemble
 from sim2gp.systems import AbstractSystem, Actuated, Furuta, actuator_prior
-from sim2gp.transitions import Transitions
+from sim2gp.systems.simulate import simulate
 from sim2gp.types import Dynamics, in_float64
 from simulated_logs import pendulum, simulated
 

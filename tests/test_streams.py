@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 
 import recordings as rec
 from recordings import Channel
+from sim2gp.data.logs import Column, Log, Resample, read_log
+from sim2gp.data.logs.resample import Track, joined
+from sim2gp.data.logs.table import Rows
 from sim2gp.errors import InputError
-from sim2gp.logs import Column, Log, Resample, read_log
-from sim2gp.logs.resample import Track, joined
-from sim2gp.logs.table import Rows
 
 STATES = (Channel("q", "rad", angle=True), Channel("x", "m"))
 ACTIONS = (Channel("u", "V"),)

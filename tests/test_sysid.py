@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from sim2gp.errors import InputError
-from sim2gp.parameters import Parameter, Parameters
+from sim2gp.inference.parameters import Parameter, Parameters
 from sim2gp.systems import MuJoCo, read_sysid, write_sysid
 
 #: What `ParameterDict.save_to_disk` made of a scalar, a frozen whole number, an array,

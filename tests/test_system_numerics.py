@@ -8,8 +8,8 @@ import pytest
 import machines
 from sim2gp import systems as sy
 from sim2gp.errors import InputError
-from sim2gp.parameters import parameters_of
-from sim2gp.systems.friction import coulomb, coulomb_arctangent, dead_zone
+from sim2gp.inference.parameters import parameters_of
+from sim2gp.systems.effects.friction_laws import coulomb, coulomb_arctangent, dead_zone
 
 pytestmark = pytest.mark.usefixtures("float64")
 

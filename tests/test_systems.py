@@ -14,7 +14,7 @@ import lagrangians
 import machines
 from machines import close
 from sim2gp import systems as sy
-from sim2gp.parameters import parameters_of
+from sim2gp.inference.parameters import parameters_of
 
 pytestmark = pytest.mark.usefixtures("float64")
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from sim2gp import tasks
 from sim2gp.errors import InputError
+from sim2gp.planning import tasks
+from sim2gp.planning.tasks import CartPoleReward, FurutaReward, Task
 from sim2gp.systems import CartPole, Coulomb, Furuta, InputDelay
-from sim2gp.tasks import CartPoleReward, FurutaReward, Task
 
 KEY = jax.random.key(0)
 PRESETS = [tasks.furuta_swingup, tasks.cartpole_swingup]

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from sim2gp.transitions import Transitions
+from sim2gp.data.transitions import Transitions
 
 RNG = np.random.default_rng(0)
 
@@ -24,7 +24,7 @@ def test_empty_has_room_and_no_rows():
 
 def test_rows_stay_in_order_and_capacity_doubles(caplog):
     data, seen = Transitions.empty(4, 3, 2), []
-    with caplog.at_level(logging.INFO, logger="sim2gp.transitions"):
+    with caplog.at_level(logging.INFO, logger="sim2gp.data.transitions"):
         for count in (3, 1, 0, 5, 30):
             seen.append(rows(count))
             data = data.extend(*seen[-1])

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from key_changes import GROUP, REFUSED, column_with, loaded, write_files
+from sim2gp.data.logs import Column, read_log
 from sim2gp.errors import InputError
-from sim2gp.logs import Column, read_log
 from sim2gp.project.project import system_class
 from test_streams import asynchronous
 

@@ -10,21 +10,21 @@ import pytest
 import scipy.optimize
 
 from linear_system import linear, transitions, windows_of
-from sim2gp.arrowhead import Noise
-from sim2gp.diagnose.score import _Linear
+from sim2gp.data.windows import WindowsBelief, fit_windows
 from sim2gp.errors import InputError
-from sim2gp.laplace import minimise
+from sim2gp.identification.missing_physics.score import _Linear
+from sim2gp.inference.arrowhead import Noise
+from sim2gp.inference.informed_prior import informed_prior
+from sim2gp.inference.levenberg_marquardt import minimise
+from sim2gp.inference.linear_measurements import Weighed
+from sim2gp.inference.parameters import Parameter, Parameters
 from sim2gp.models import Sim2GP
-from sim2gp.models.informed import informed_prior
 from sim2gp.models.sim2gp import likelihood
-from sim2gp.models.windows import WindowsBelief, fit_windows
-from sim2gp.parameters import Parameter, Parameters
 from sim2gp.project import load_project
 from sim2gp.systems import Candidate, Configuration, Coulomb, InputDelay, configured
-from sim2gp.systems.configured import Configured, with_weighed
-from sim2gp.systems.furuta import Furuta
+from sim2gp.systems.plants.furuta import Furuta
+from sim2gp.systems.variants import Configured, with_weighed
 from sim2gp.types import in_float64
-from sim2gp.weighed import Weighed
 
 KEY = jax.random.key(0)
 SUM = Weighed(("k0", "k1"), (1.0, 1.0), 3.0, 0.01)

@@ -8,17 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim2gp import arrowhead
-from sim2gp.gaussian import Gaussian
-from sim2gp.logs import Log
-from sim2gp.models import Sim2GP, stretch
-from sim2gp.models import windows as likelihood
-from sim2gp.models.cutting import cut
-from sim2gp.models.grid import evaluation_windows
-from sim2gp.models.windows import Windows, fit_windows
+from sim2gp.data import windows as likelihood
+from sim2gp.data.grid import evaluation_windows
+from sim2gp.data.logs import Log
+from sim2gp.data.split_log import cut
+from sim2gp.data.transitions import Transitions
+from sim2gp.data.windows import Windows, fit_windows
+from sim2gp.inference import arrowhead
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.models import Sim2GP
 from sim2gp.systems import Actuated, Furuta
-from sim2gp.systems.actuator import actuator_prior
-from sim2gp.transitions import Transitions
+from sim2gp.systems import simulate as stretch
+from sim2gp.systems.actuators import actuator_prior
 from sim2gp.types import in_float64
 from simulated_logs import FREE, NAMES, pendulum, simulated
 

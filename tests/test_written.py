@@ -15,10 +15,10 @@ from mass_task import mass_task
 from sim2gp import checks
 from sim2gp import systems as sy
 from sim2gp.errors import InputError
-from sim2gp.parameters import Parameter, Parameters
+from sim2gp.inference.parameters import Parameter, Parameters
 from sim2gp.planning import AbstractObjective, MarkovObjective
-from sim2gp.systems.effects import AbstractForce
-from sim2gp.tasks import furuta_swingup
+from sim2gp.planning.tasks import furuta_swingup
+from sim2gp.systems.effects.base import AbstractForce
 
 TABLE = [Parameter("gravity", "1/s^2", "gravity over length", "log_box", 3.0, 30.0)]
 STATES = [sy.Channel("q", "rad", angle=True), sy.Channel("q.velocity", "rad/s")]

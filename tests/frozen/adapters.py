@@ -12,18 +12,19 @@ import payload_arm
 import sim2gp as sg
 import simulated_logs
 from sim2gp import systems as sy
-from sim2gp.configurations import Configuration
-from sim2gp.diagnose.discrepancy import corrected_windows
-from sim2gp.diagnose.evidence import WindowData
-from sim2gp.diagnose.score import score
-from sim2gp.models import sim2gp, windows
-from sim2gp.models.cutting import cut
-from sim2gp.models.windows import WindowsBelief, fit_windows, linearise
-from sim2gp.systems.configured import with_weighed
-from sim2gp.systems.library import Candidate, library
-from sim2gp.transitions import Transitions
+from sim2gp.data import windows
+from sim2gp.data.split_log import cut
+from sim2gp.data.transitions import Transitions
+from sim2gp.data.windows import WindowsBelief, fit_windows, linearise
+from sim2gp.identification.intervals.discrepancy import corrected_windows
+from sim2gp.identification.missing_physics.data import WindowData
+from sim2gp.identification.missing_physics.score import score
+from sim2gp.inference.linear_measurements import Weighed
+from sim2gp.inference.variants import Configuration
+from sim2gp.models import sim2gp
+from sim2gp.systems.effects.library import Candidate, library
+from sim2gp.systems.variants import with_weighed
 from sim2gp.types import in_float64
-from sim2gp.weighed import Weighed
 
 
 def stepped() -> dict[str, sg.AbstractSystem]:

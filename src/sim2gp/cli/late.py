@@ -39,7 +39,7 @@ def read_project(path: Path, given: Reads, *, alike: bool = False) -> tuple[Any,
 
 def budget(factor: float) -> Any:
     """So many times what one file may take to read."""
-    return import_module("sim2gp.logs").Budget().times(factor)
+    return import_module("sim2gp.data.logs").Budget().times(factor)
 
 
 def experiment(module: str, name: str = "run") -> Callable[..., Any]:

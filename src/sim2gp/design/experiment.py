@@ -1,7 +1,7 @@
 """What an experiment that was not made yet would tell: the likelihood of logs, ahead.
 
 The commands are held over each period, the outputs are sampled at its ends, and what is
-learned is exactly what `models.windows` would learn from that log: windows that do not
+learned is exactly what `data.windows` would learn from that log: windows that do not
 overlap, each with an unknown start, noise of the sensors on every sample. Only the
 derivatives of that likelihood are needed, and they do not depend on what comes out.
 """
@@ -16,13 +16,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sim2gp import checks
-from sim2gp.gaussian import Gaussian
-from sim2gp.least_squares import over
-from sim2gp.linalg import triangular
-from sim2gp.models.cutting import TOLERANCE
-from sim2gp.models.linearized import value_and_jacobian
-from sim2gp.models.stretch import DELAY_BLUR, Stretch, simulate
+from sim2gp.data.split_log import TOLERANCE
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.least_squares import over
+from sim2gp.inference.linalg import triangular
+from sim2gp.inference.linearized import value_and_jacobian
 from sim2gp.systems.base import WINDOW_SUBSTEP, AbstractSystem
+from sim2gp.systems.simulate import DELAY_BLUR, Stretch, simulate
 
 #: Commands over each period, in the units of the inputs.
 Commands = Float[Array, "T m"]

@@ -11,8 +11,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sim2gp.gaussian import log_det_factor
-from sim2gp.linalg import triangular
+from sim2gp.inference.gaussian import log_det_factor
+from sim2gp.inference.linalg import triangular
 from sim2gp.types import Scalar
 
 #: Square root of a covariance of the virtual parameters.

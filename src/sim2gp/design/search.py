@@ -19,8 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sim2gp import checks
-from sim2gp.ahead import ahead
-from sim2gp.descent import Moments, adam, descend
+from sim2gp.compilation import ahead
 from sim2gp.design.experiment import (
     Experiment,
     after,
@@ -32,6 +31,7 @@ from sim2gp.design.goals import AbstractGoal
 from sim2gp.design.limits import Limits, excess
 from sim2gp.design.signals import AbstractSignal, Multisine
 from sim2gp.errors import InputError, NotFinite
+from sim2gp.models.training import Moments, adam, descend
 from sim2gp.types import Key, in_float64, single
 
 GRID, SUBSTEP = 0.01, 0.0025  # s, the shortest period and substep that a search sees

@@ -14,8 +14,8 @@ from jaxtyping import Array, Float
 
 from sim2gp import checks
 from sim2gp.design.limits import Limits, kept
+from sim2gp.planning.coloured_noise import coloured_noise
 from sim2gp.planning.mpc import from_unit
-from sim2gp.planning.noise import coloured_noise
 from sim2gp.types import Box, Key
 
 FADE = 0.25  # s, in which a multisine comes and goes

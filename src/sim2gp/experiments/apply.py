@@ -24,11 +24,11 @@ from sim2gp.project.project import is_model
 from sim2gp.runs import Progress, load_run
 from sim2gp.runs.store import Run, check_absent
 from sim2gp.systems import MuJoCo
-from sim2gp.systems.actuator import bare
-from sim2gp.systems.configured import own_table
-from sim2gp.systems.mjcf import matching
-from sim2gp.systems.mjcf_file import Edited, ModelFile
-from sim2gp.systems.mjcf_load import compiled_all
+from sim2gp.systems.actuators import bare
+from sim2gp.systems.mujoco.constants import matching
+from sim2gp.systems.mujoco.load import compiled_all
+from sim2gp.systems.mujoco.model_file import Edited, ModelFile
+from sim2gp.systems.variants import own_table
 
 Written = list[tuple[str, bytes]]
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from sim2gp.models.grid import PERIOD, Grid
+from sim2gp.data.grid import PERIOD, Grid
 
 HOLD, REGRESSION = "holding still", "a linear regression"
 ALIKE = 0.05  # a smaller relative difference of two errors is none

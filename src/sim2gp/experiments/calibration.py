@@ -29,11 +29,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from sim2gp.data.grid import steps_of
+from sim2gp.data.logs import Log
+from sim2gp.data.split_log import SPACING
 from sim2gp.experiments.calibration_words import verdict, words
 from sim2gp.experiments.prediction import Judged, recordings
-from sim2gp.logs import Log
-from sim2gp.models.cutting import SPACING
-from sim2gp.models.grid import steps_of
 
 LEVELS = (*(round(0.05 * k, 2) for k in range(1, 20)), 0.99)
 FEWEST = 8  # blocks that a verdict needs

@@ -2,7 +2,7 @@
 
 Recordings are left out in turn. A fit of the others' windows gives the simulator's
 constants, as `identify` does; smoothed one-step data of the same logs
-(`sim2gp.models.stepping`) then train what is learned beside it, with those constants
+(`sim2gp.data.one_step_log`) then train what is learned beside it, with those constants
 given. All models forecast the recording left out, open loop, from the same causal
 starts: the best single prediction, and draws for the spread.
 """
@@ -18,24 +18,12 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from sim2gp.errors import InputError
-from sim2gp.experiments import scoring
-from sim2gp.experiments.baselines import regression_errors
-from sim2gp.experiments.compare_summary import Held, summarise
-from sim2gp.experiments.evaluate import check_horizon, windows_for
-from sim2gp.experiments.prediction import channels, cut_logs, recordings, subset
-from sim2gp.experiments.record import command, provenance
-from sim2gp.logs import Log, note_lines
-from sim2gp.models import NLM, FunctionSpace, Residual, ResidualFunctionSpace, Sim2GP
-from sim2gp.models.auto import log_scores
-from sim2gp.models.base import AbstractModel
-from sim2gp.models.cutting import measured_states
-from sim2gp.models.forecast import inflation_of
-from sim2gp.models.grid import CURVE, PERIOD, Grid
-from sim2gp.models.stepping import (
+from sim2gp.belief import AbstractModel
+from sim2gp.data.grid import CURVE, PERIOD, Grid
+from sim2gp.data.logs import Log, note_lines
+from sim2gp.data.one_step_log import (
     Samples,
     Steps,
-    ensemble,
     samples_of,
     smoothed_states,
     stepping,
@@ -43,7 +31,19 @@ from sim2gp.models.stepping import (
     stride_of,
     transitions,
 )
-from sim2gp.models.windows import Windows, WindowsBelief, fit_windows
+from sim2gp.data.split_log import measured_states
+from sim2gp.data.windows import Windows, WindowsBelief, fit_windows
+from sim2gp.errors import InputError
+from sim2gp.experiments import scoring
+from sim2gp.experiments.baselines import regression_errors
+from sim2gp.experiments.compare_summary import Held, summarise
+from sim2gp.experiments.evaluate import check_horizon, windows_for
+from sim2gp.experiments.prediction import channels, cut_logs, recordings, subset
+from sim2gp.experiments.record import command, provenance
+from sim2gp.identification.forecast import inflation_of
+from sim2gp.models import NLM, FunctionSpace, Residual, ResidualFunctionSpace, Sim2GP
+from sim2gp.models.auto import log_scores
+from sim2gp.models.ensemble import ensemble
 from sim2gp.project import Project
 from sim2gp.runs import Progress, new_run
 from sim2gp.systems.base import AbstractSystem

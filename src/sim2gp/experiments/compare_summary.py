@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from sim2gp.data.logs import Log
 from sim2gp.experiments import scoring
 from sim2gp.experiments.baselines import compared, forecast_sentence
 from sim2gp.experiments.prediction import recordings
 from sim2gp.experiments.scoring import Paired
-from sim2gp.logs import Log
 
 FEWEST = 4  # recordings that a bootstrap can draw from; of fewer, seconds are drawn
 STRETCH = 1.0  # s

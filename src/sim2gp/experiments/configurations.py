@@ -3,10 +3,10 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sim2gp.diagnose.words import quantity
+from sim2gp.data.logs import Log
 from sim2gp.experiments.prediction import recordings
-from sim2gp.logs import Log
-from sim2gp.parameters import Parameters
+from sim2gp.identification.words import quantity
+from sim2gp.inference.parameters import Parameters
 
 
 def told(

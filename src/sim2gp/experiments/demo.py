@@ -2,7 +2,7 @@
 
 For each seed a machine is drawn from the prior, and three learners meet it under the
 same noise: posterior sampling, its point estimate, and the prior mean that never
-learns. Every real interaction counts; scores are those of `sim2gp.tasks`.
+learns. Every real interaction counts; scores are those of `sim2gp.planning.tasks`.
 """
 
 import time
@@ -15,16 +15,17 @@ from typing import Any
 import jax
 import numpy as np
 
-from sim2gp import diagnose
-from sim2gp.diagnose.residuals import misfit_of_transitions
+from sim2gp.belief import AbstractModel
 from sim2gp.experiments.record import provenance
-from sim2gp.loops import Episode, History, psrl
-from sim2gp.models import AbstractModel, PointEstimate, PriorMean, Sim2GP, Sim2GPBelief
-from sim2gp.oracle import AcceptedTruth, accept_truth
+from sim2gp.identification import summary as diagnose
+from sim2gp.identification.misfit.residuals import misfit_of_transitions
+from sim2gp.models import PointEstimate, PriorMean, Sim2GP, Sim2GPBelief
 from sim2gp.planning import MPC
+from sim2gp.planning.loop import Episode, History, psrl
+from sim2gp.planning.oracle import AcceptedTruth, accept_truth
+from sim2gp.planning.tasks import MACHINES, Task, episodes_to_95, hanging_return, score
 from sim2gp.runs import Progress, new_run, sinks
 from sim2gp.systems.base import AbstractSystem
-from sim2gp.tasks import MACHINES, Task, episodes_to_95, hanging_return, score
 from sim2gp.types import Key
 
 LEARNER = "posterior sampling"

@@ -30,16 +30,16 @@ from sim2gp.design import (
     design,
     prediction_rows,
 )
-from sim2gp.diagnose.table import physical_moments
 from sim2gp.errors import InputError
 from sim2gp.experiments.design_verdict import Asked, expected_table, foretold, verdict
 from sim2gp.experiments.identified import Identified, used
 from sim2gp.experiments.prediction import units
 from sim2gp.experiments.record import command, provenance
+from sim2gp.identification.identifiability.table import physical_moments
+from sim2gp.inference.informed_prior import informed_prior
+from sim2gp.inference.parameters import unknown_parameter
 from sim2gp.models.features import Encoding
-from sim2gp.models.informed import informed_prior
 from sim2gp.models.sim2gp import PRIOR_NOISE
-from sim2gp.parameters import unknown_parameter
 from sim2gp.project import Project
 from sim2gp.runs import Progress, new_run
 from sim2gp.systems import alone

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sim2gp.diagnose.words import digits, listed
+from sim2gp.identification.words import digits, listed
 
 NARROWER = 0.05  # an experiment must narrow what is asked by this share
 

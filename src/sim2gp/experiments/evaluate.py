@@ -2,8 +2,8 @@
 
 `run` holds a finished identification against other logs; `leave_one_out` fits all of a
 project's logs but one and predicts that one, in turn. The protocol is that of
-`sim2gp.models.grid`; the bands are those of `sim2gp.models.forecast`, fitted to the
-training logs alone.
+`sim2gp.data.grid`; the bands are those of `sim2gp.identification.forecast`, fitted to
+the training logs alone.
 """
 
 import time
@@ -15,6 +15,9 @@ from typing import Any
 import jax
 import numpy as np
 
+from sim2gp.data.grid import CURVE, Grid, evaluation_windows, steps_of
+from sim2gp.data.logs import Log, Note, note_lines, shared_rows
+from sim2gp.data.windows import Windows
 from sim2gp.errors import InputError
 from sim2gp.experiments.baselines import forecast_sentence, regression_errors
 from sim2gp.experiments.calibration import calibration
@@ -36,10 +39,7 @@ from sim2gp.experiments.prediction import (
     units,
 )
 from sim2gp.experiments.record import command, provenance
-from sim2gp.gaussian import Gaussian
-from sim2gp.logs import Log, Note, note_lines, shared_rows
-from sim2gp.models.grid import CURVE, Grid, evaluation_windows, steps_of
-from sim2gp.models.windows import Windows
+from sim2gp.inference.gaussian import Gaussian
 from sim2gp.project import Project
 from sim2gp.runs import Progress, new_run
 from sim2gp.types import in_float64

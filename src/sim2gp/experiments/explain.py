@@ -12,19 +12,23 @@ from typing import Any
 
 import numpy as np
 
-from sim2gp.diagnose.evidence import AbstractData, OneStepData, WindowData
-from sim2gp.diagnose.explain import explain
+from sim2gp.data.logs import Budget
 from sim2gp.errors import InputError
 from sim2gp.experiments.explain_words import candidate_rows, headline, table
 from sim2gp.experiments.identified import PROJECT, project_of, stood
 from sim2gp.experiments.prediction import cut_logs
 from sim2gp.experiments.record import command, provenance
-from sim2gp.logs import Budget
+from sim2gp.identification.missing_physics.data import (
+    AbstractData,
+    OneStepData,
+    WindowData,
+)
+from sim2gp.identification.missing_physics.explain import explain
+from sim2gp.planning.tasks import MACHINES
 from sim2gp.project import Project, load_project
 from sim2gp.project.amend import amend
 from sim2gp.runs import Progress, load_run, new_run
 from sim2gp.runs.store import Run
-from sim2gp.tasks import MACHINES
 
 SHARED_SECOND = 1.0  # s of windows whose errors may be correlated
 

@@ -17,9 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from sim2gp.diagnose.evidence import OneStepData
-from sim2gp.diagnose.explain import explain
-from sim2gp.planning.noise import coloured_noise
+from sim2gp.identification.missing_physics.data import OneStepData
+from sim2gp.identification.missing_physics.explain import explain
+from sim2gp.planning.coloured_noise import coloured_noise
+from sim2gp.planning.tasks import MACHINES, Task, draw_truth
 from sim2gp.systems import (
     AbstractSystem,
     BaseTilt,
@@ -31,14 +32,13 @@ from sim2gp.systems import (
     effect,
 )
 from sim2gp.systems.base import AbstractMechanism
-from sim2gp.systems.effects import (
+from sim2gp.systems.effects.base import (
     AbstractEffect,
     AbstractForce,
     AbstractInputEffect,
     Pair,
 )
-from sim2gp.systems.perturbed import perturb
-from sim2gp.tasks import MACHINES, Task, draw_truth
+from sim2gp.systems.effects.perturbed import perturb
 from sim2gp.types import Key, Scalar
 
 Planted = AbstractEffect | InputDelay | InputLag

@@ -4,10 +4,10 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sim2gp.diagnose.explain import Explanation
-from sim2gp.diagnose.misfit import Misfit
-from sim2gp.diagnose.missing import Refitted, Scored
-from sim2gp.diagnose.words import digits, listed, quantity
+from sim2gp.identification.misfit.tests import Misfit
+from sim2gp.identification.missing_physics.explain import Explanation
+from sim2gp.identification.missing_physics.search import Refitted, Scored
+from sim2gp.identification.words import digits, listed, quantity
 
 
 def candidate_rows(found: Explanation) -> list[dict[str, Any]]:

@@ -18,14 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sim2gp.belief import AbstractBelief, AbstractModel
+from sim2gp.data.transitions import Transitions
 from sim2gp.errors import NotConverged, NotFinite
 from sim2gp.experiments import swingup
 from sim2gp.experiments.stages import described
-from sim2gp.flight import Purpose, episode, key_for, oracle_world
-from sim2gp.gaussian import LOG_2PI
-from sim2gp.loops import Episode, drawn, expected, psal
-from sim2gp.models import AbstractModel
-from sim2gp.models.base import AbstractBelief
+from sim2gp.inference.gaussian import LOG_2PI
 from sim2gp.planning import (
     ICEM,
     MPC,
@@ -34,9 +32,10 @@ from sim2gp.planning import (
     Multisine,
     RandomInput,
 )
+from sim2gp.planning.episode import Purpose, episode, key_for, oracle_world
+from sim2gp.planning.loop import Episode, drawn, expected, psal
+from sim2gp.planning.tasks import Task
 from sim2gp.runs.cells import Cells, Old
-from sim2gp.tasks import Task
-from sim2gp.transitions import Transitions
 from sim2gp.types import Dynamics, Key, in_float64
 
 #: Information hardly depends on the last digits of a plan: fewer sequences than a

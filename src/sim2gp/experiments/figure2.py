@@ -33,9 +33,9 @@ from sim2gp.experiments.swingup import (
     median_episode,
     study,
 )
+from sim2gp.planning.tasks import MACHINES, SOLVED
 from sim2gp.runs import Progress, new_run
 from sim2gp.runs.cells import Old
-from sim2gp.tasks import MACHINES, SOLVED
 
 SEEDS, EPISODES = 5, 10
 QUICK_SEEDS, QUICK_EPISODES = 2, 4

@@ -27,9 +27,9 @@ from sim2gp.experiments.exploring import (
 from sim2gp.experiments.record import provenance, reproduce
 from sim2gp.experiments.stages import in_stages
 from sim2gp.experiments.swingup import CONDITIONS
+from sim2gp.planning.tasks import MACHINES
 from sim2gp.runs import Progress, new_run
 from sim2gp.runs.cells import Cells, Old
-from sim2gp.tasks import MACHINES
 
 SEEDS, EPISODES = 5, 10
 QUICK_SEEDS, QUICK_EPISODES = 1, 2

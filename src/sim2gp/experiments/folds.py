@@ -13,6 +13,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool
 
+from sim2gp.data.grid import CURVE, PERIOD, Grid, steps_of
+from sim2gp.data.logs import Log
+from sim2gp.data.windows import Windows, WindowsBelief, fit_windows
 from sim2gp.experiments.baselines import regression_errors
 from sim2gp.experiments.prediction import (
     Judged,
@@ -22,11 +25,8 @@ from sim2gp.experiments.prediction import (
     rows_for,
     subset,
 )
-from sim2gp.gaussian import Gaussian
-from sim2gp.logs import Log
-from sim2gp.models.forecast import Band, Forecast, fit_band
-from sim2gp.models.grid import CURVE, PERIOD, Grid, steps_of
-from sim2gp.models.windows import Windows, WindowsBelief, fit_windows
+from sim2gp.identification.forecast import Band, Forecast, fit_band
+from sim2gp.inference.gaussian import Gaussian
 from sim2gp.project import Project
 from sim2gp.types import Key
 
@@ -104,7 +104,7 @@ def fold(
 ) -> Fold:
     """The fit of what ``part`` may see, begun ``near`` another, judged by the rest.
 
-    Raises as `sim2gp.models.windows.fit_windows` does.
+    Raises as `sim2gp.data.windows.fit_windows` does.
     """
     rows = rows_for(horizon)
     mask = np.asarray(windows.mask) & part.train[:, None, None]

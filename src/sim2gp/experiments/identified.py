@@ -13,12 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from sim2gp.configurations import index_of
+from sim2gp.data.logs import Budget, Log, none_unused
 from sim2gp.errors import InputError
-from sim2gp.gaussian import Gaussian
-from sim2gp.logs import Budget, Log, none_unused
-from sim2gp.models.forecast import Band
-from sim2gp.parameters import Parameters
+from sim2gp.identification.forecast import Band
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.parameters import Parameters
+from sim2gp.inference.variants import index_of
 from sim2gp.project import Project, load_project
 from sim2gp.runs import load_run
 from sim2gp.runs.store import Run

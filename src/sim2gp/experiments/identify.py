@@ -13,12 +13,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from sim2gp import diagnose
-from sim2gp.diagnose.discrepancy import compile_corrected, corrected_windows
-from sim2gp.diagnose.importance import check_windows
-from sim2gp.diagnose.intervals import Corrected
-from sim2gp.diagnose.nuts import sample_windows, sampler
-from sim2gp.diagnose.residuals import misfit_of_windows
+from sim2gp.data.grid import CURVE, Grid, evaluation_windows
+from sim2gp.data.logs import Log, note_lines
+from sim2gp.data.windows import Windows, WindowsBelief, fit_windows, information_at
 from sim2gp.experiments.configurations import told
 from sim2gp.experiments.identified import PROJECT, physical
 from sim2gp.experiments.longer import advice
@@ -37,16 +34,17 @@ from sim2gp.experiments.prediction import (
 from sim2gp.experiments.record import command, provenance
 from sim2gp.experiments.told_intervals import lacking_table, told_intervals
 from sim2gp.experiments.unseen import Unseen, unseen
-from sim2gp.gaussian import Gaussian
-from sim2gp.logs import Log, note_lines
-from sim2gp.models.forecast import Band, compile_forecast, fit_band
-from sim2gp.models.grid import CURVE, Grid, evaluation_windows
-from sim2gp.models.windows import (
-    Windows,
-    WindowsBelief,
-    fit_windows,
-    information_at,
+from sim2gp.identification import summary as diagnose
+from sim2gp.identification.exact_posterior.importance import check_windows
+from sim2gp.identification.exact_posterior.nuts import sample_windows, sampler
+from sim2gp.identification.forecast import Band, compile_forecast, fit_band
+from sim2gp.identification.intervals.discrepancy import (
+    compile_corrected,
+    corrected_windows,
 )
+from sim2gp.identification.intervals.scatter import Corrected
+from sim2gp.identification.misfit.residuals import misfit_of_windows
+from sim2gp.inference.gaussian import Gaussian
 from sim2gp.project import Project
 from sim2gp.runs import Progress, new_run
 

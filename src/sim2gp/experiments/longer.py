@@ -11,14 +11,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sim2gp.diagnose.discrepancy import corrected_windows
-from sim2gp.diagnose.intervals import Corrected
-from sim2gp.diagnose.residuals import misfit_of_windows
-from sim2gp.diagnose.words import digits
+from sim2gp.data.logs import Log
+from sim2gp.data.windows import WindowsBelief, fit_windows
 from sim2gp.errors import DeadParameters, InputError, NotConverged, NotFinite
 from sim2gp.experiments.prediction import cut_logs
-from sim2gp.logs import Log
-from sim2gp.models.windows import WindowsBelief, fit_windows
+from sim2gp.identification.intervals.discrepancy import corrected_windows
+from sim2gp.identification.intervals.scatter import Corrected
+from sim2gp.identification.misfit.residuals import misfit_of_windows
+from sim2gp.identification.words import digits
 from sim2gp.project import Project
 from sim2gp.types import Key, in_float64
 

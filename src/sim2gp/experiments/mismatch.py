@@ -1,8 +1,8 @@
 """The mismatch map: every learner under five effects at three strengths (Furuta).
 
 Registered before it is run: the effects and strengths of the catalogue
-(`sim2gp.systems.perturbed`), scores of the third episode, and the cumulative regret of
-the model that chooses, against the best model that was fixed beforehand.
+(`sim2gp.systems.effects.perturbed`), scores of the third episode, and the cumulative
+regret of the model that chooses, against the best model that was fixed beforehand.
 """
 
 import time
@@ -28,10 +28,10 @@ from sim2gp.experiments.swingup import (
     first_at,
     study,
 )
+from sim2gp.planning.tasks import SOLVED
 from sim2gp.runs import Progress, new_run
 from sim2gp.runs.cells import Old
-from sim2gp.systems.perturbed import STRENGTHS
-from sim2gp.tasks import SOLVED
+from sim2gp.systems.effects.perturbed import STRENGTHS
 
 MACHINE = "furuta"
 EFFECTS = ("coulomb", "dead_zone", "spring", "delay", "drag")

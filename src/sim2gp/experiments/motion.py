@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from sim2gp.data.grid import Grid
+from sim2gp.data.logs import Log
 from sim2gp.experiments.prediction import Picture
-from sim2gp.gaussian import Gaussian
-from sim2gp.logs import Log
-from sim2gp.models.grid import Grid
+from sim2gp.inference.gaussian import Gaussian
 from sim2gp.systems import CartPole, Furuta, MuJoCo, TwoLink, UniformRodArm
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import in_float64
@@ -147,7 +147,7 @@ def _drawing(
     if not isinstance(machine, MuJoCo):
         return {}, {}
     from sim2gp.report.skeleton import figure_entry, skeleton
-    from sim2gp.systems.mujoco_figure import figure_of
+    from sim2gp.systems.mujoco.figure import figure_of
 
     theta = np.asarray([values[name] for name in machine.names])
     model = machine.engine.with_values(theta)
@@ -170,7 +170,7 @@ def _frames(
 
     One each ``least`` rows, or fewer if they would be too many.
     """
-    from sim2gp.systems.mujoco_film import MOST, rendered
+    from sim2gp.systems.mujoco.film import MOST, rendered
 
     every = max(1, least, -(-len(motion[0]) // MOST))
     width, height = scene.width * 3 // 4, scene.height * 3 // 4

@@ -12,13 +12,13 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from sim2gp.data.grid import CURVE, PERIOD, Grid, steps_of
+from sim2gp.data.logs import Log
+from sim2gp.data.split_log import cut
+from sim2gp.data.windows import Windows
 from sim2gp.experiments.baselines import compared, loss_sentence
-from sim2gp.gaussian import Gaussian
-from sim2gp.logs import Log
-from sim2gp.models.cutting import cut
-from sim2gp.models.forecast import Band, Forecast, forecast
-from sim2gp.models.grid import CURVE, PERIOD, Grid, steps_of
-from sim2gp.models.windows import Windows
+from sim2gp.identification.forecast import Band, Forecast, forecast
+from sim2gp.inference.gaussian import Gaussian
 from sim2gp.project import Project
 from sim2gp.systems.base import AbstractSystem
 

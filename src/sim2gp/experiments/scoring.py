@@ -18,7 +18,7 @@ import numpy as np
 import scipy.special
 from jaxtyping import Bool, Float, Int
 
-from sim2gp.gaussian import LOG_2PI
+from sim2gp.inference.gaussian import LOG_2PI
 
 Values = Float[np.ndarray, "..."]
 

@@ -20,8 +20,8 @@ from jaxtyping import Array, Float
 from sim2gp.cleanup import temporary_folder
 from sim2gp.errors import InputError, NotConverged
 from sim2gp.experiments.two_link_study import DT, LEVELS, covered, record
-from sim2gp.gaussian import Gaussian
-from sim2gp.least_squares import linear_posterior
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.least_squares import linear_posterior
 from sim2gp.models import Sim2GP
 from sim2gp.runs import load_run, new_run
 from sim2gp.systems import CartPole, Furuta, TwoLink, UniformRodArm

@@ -16,13 +16,11 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from sim2gp.belief import AbstractModel
 from sim2gp.errors import NotConverged, NotFinite
 from sim2gp.experiments.stages import AnyCell, described, in_stages
-from sim2gp.flight import Purpose, Trajectory, key_for, oracle_world
-from sim2gp.loops import psrl
 from sim2gp.models import (
     NLM,
-    AbstractModel,
     Auto,
     FunctionSpace,
     PointEstimate,
@@ -30,16 +28,18 @@ from sim2gp.models import (
     ResidualFunctionSpace,
     Sim2GP,
 )
-from sim2gp.oracle import accept_truth, flights
 from sim2gp.planning import ICEM, MPC, SAC, AbstractPlanner, World
-from sim2gp.randomised import randomised_world
+from sim2gp.planning.domain_randomisation import randomised_world
+from sim2gp.planning.episode import Purpose, Trajectory, key_for, oracle_world
+from sim2gp.planning.loop import psrl
+from sim2gp.planning.oracle import accept_truth, flights
+from sim2gp.planning.tasks import MACHINES, Task, draw_truth, hanging_return, score
 from sim2gp.runs import Progress
 from sim2gp.runs.cells import Cells, Old
 from sim2gp.systems import Candidate
 from sim2gp.systems.base import AbstractMechanism
-from sim2gp.systems.effects import AbstractEffect, RailFriction, Spring
-from sim2gp.systems.perturbed import InputDelay, effect
-from sim2gp.tasks import MACHINES, Task, draw_truth, hanging_return, score
+from sim2gp.systems.effects.base import AbstractEffect, RailFriction, Spring
+from sim2gp.systems.effects.perturbed import InputDelay, effect
 
 Effect = AbstractEffect | InputDelay
 Group = TypeVar("Group")

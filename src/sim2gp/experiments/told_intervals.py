@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from sim2gp.diagnose import intervals
-from sim2gp.diagnose.intervals import NOTHING, Corrected
-from sim2gp.diagnose.words import digits
+from sim2gp.identification.intervals import scatter as intervals
+from sim2gp.identification.intervals.scatter import NOTHING, Corrected
+from sim2gp.identification.words import digits
 from sim2gp.systems.base import AbstractSystem
-from sim2gp.systems.library import smooth_effects, with_effects
+from sim2gp.systems.effects.library import smooth_effects, with_effects
 from sim2gp.types import in_float64
 
 

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sim2gp import diagnose
 from sim2gp.experiments.record import provenance
 from sim2gp.experiments.two_link_study import (
     DT,
@@ -30,6 +29,7 @@ from sim2gp.experiments.two_link_study import (
     learn,
     nominal_truth,
 )
+from sim2gp.identification import summary as diagnose
 from sim2gp.models import Sim2GPBelief
 from sim2gp.runs import Progress, new_run
 from sim2gp.types import Action, Dynamics, Key, State, in_float64

@@ -16,11 +16,11 @@ import numpy as np
 import scipy.stats
 from jaxtyping import Array, Float
 
+from sim2gp.data.transitions import Transitions
 from sim2gp.errors import NotConverged, NotFinite
 from sim2gp.models import Sim2GP, Sim2GPBelief
 from sim2gp.runs import Progress
 from sim2gp.systems import UniformRodArm
-from sim2gp.transitions import Transitions
 from sim2gp.types import Action, Key, State, in_float64
 
 DT = 0.02  # s

@@ -10,6 +10,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from sim2gp.data.grid import CURVE, Grid, steps_of
+from sim2gp.data.logs import Log
+from sim2gp.data.windows import Windows, WindowsBelief
 from sim2gp.errors import DeadParameters, NotConverged, NotFinite
 from sim2gp.experiments.baselines import forecast_sentence
 from sim2gp.experiments.calibration import calibration
@@ -23,9 +26,6 @@ from sim2gp.experiments.prediction import (
     trace_arrays,
     units,
 )
-from sim2gp.logs import Log
-from sim2gp.models.grid import CURVE, Grid, steps_of
-from sim2gp.models.windows import Windows, WindowsBelief
 from sim2gp.project import Project
 
 PREFIX = "unseen"  # of the traces

@@ -2,21 +2,15 @@
 
 from sim2gp.models.auto import Auto as Auto
 from sim2gp.models.auto import AutoBelief as AutoBelief
-from sim2gp.models.base import AbstractBelief as AbstractBelief
-from sim2gp.models.base import AbstractModel as AbstractModel
-from sim2gp.models.base import PointEstimate as PointEstimate
-from sim2gp.models.base import PriorMean as PriorMean
-from sim2gp.models.cutting import cut as cut
 from sim2gp.models.function_space import FunctionSpace as FunctionSpace
 from sim2gp.models.hybrid import HybridBelief as HybridBelief
 from sim2gp.models.nlm import NLM as NLM
 from sim2gp.models.nlm import NLMBelief as NLMBelief
+from sim2gp.models.point_estimate import PointEstimate as PointEstimate
+from sim2gp.models.point_estimate import PriorMean as PriorMean
 from sim2gp.models.residual import Residual as Residual
 from sim2gp.models.residual_function_space import (
     ResidualFunctionSpace as ResidualFunctionSpace,
 )
 from sim2gp.models.sim2gp import Sim2GP as Sim2GP
 from sim2gp.models.sim2gp import Sim2GPBelief as Sim2GPBelief
-from sim2gp.models.windows import Windows as Windows
-from sim2gp.models.windows import WindowsBelief as WindowsBelief
-from sim2gp.models.windows import fit_windows as fit_windows

@@ -15,11 +15,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from sim2gp.belief import AbstractBelief, AbstractModel
+from sim2gp.data.transitions import Transitions
 from sim2gp.errors import InputError
-from sim2gp.gaussian import Gaussian
-from sim2gp.models.base import AbstractBelief, AbstractModel
-from sim2gp.models.information import Sensitivity
-from sim2gp.transitions import Transitions
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.information import Sensitivity
 from sim2gp.types import Action, Dynamics, Key, Scalar, State, in_float64
 
 

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp import checks
+from sim2gp.data.transitions import Transitions
 from sim2gp.systems.base import AbstractSystem, index_of
-from sim2gp.transitions import Transitions
 from sim2gp.types import Action, Key, State
 
 #: Half-width of a channel without limits, by its unit: how far a small machine moves.

@@ -16,16 +16,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from sim2gp import checks
+from sim2gp.belief import AbstractBelief, AbstractModel
+from sim2gp.data.transitions import Transitions
 from sim2gp.errors import NotFinite
-from sim2gp.gaussian import Gaussian, lower_factor
-from sim2gp.models import features, hybrid, matching, nlm
-from sim2gp.models.base import AbstractBelief, AbstractModel
+from sim2gp.inference.gaussian import Gaussian, lower_factor
+from sim2gp.inference.linear_regression import LastLayer
+from sim2gp.models import features, hybrid, nlm
+from sim2gp.models import function_space_loss as matching
 from sim2gp.models.features import Encoding
+from sim2gp.models.function_space_loss import OBJECTIVES, Budget, Objective, Variational
 from sim2gp.models.hybrid import HybridBelief
-from sim2gp.models.last_layer import LastLayer
-from sim2gp.models.matching import OBJECTIVES, Budget, Objective, Variational
 from sim2gp.models.sim2gp import Sim2GP, Sim2GPBelief
-from sim2gp.transitions import Transitions
 from sim2gp.types import Action, Key, State, in_float64
 
 FS_PRIORS = ("posterior", "prior")

@@ -12,12 +12,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from sim2gp.gaussian import Gaussian
-from sim2gp.models import last_layer, linearized
-from sim2gp.models.base import AbstractBelief
+from sim2gp.belief import AbstractBelief
+from sim2gp.data.transitions import Transitions
+from sim2gp.inference import linear_regression as last_layer
+from sim2gp.inference import linearized
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.information import Sensitivity
+from sim2gp.inference.linear_regression import LastLayer
 from sim2gp.models.features import Encoding, Network, stepped
-from sim2gp.models.information import Sensitivity
-from sim2gp.models.last_layer import LastLayer
 from sim2gp.models.nlm import (
     Head,
     Trained,
@@ -26,7 +28,6 @@ from sim2gp.models.nlm import (
 )
 from sim2gp.models.sim2gp import Sim2GP, Sim2GPBelief
 from sim2gp.systems.base import AbstractSystem
-from sim2gp.transitions import Transitions
 from sim2gp.types import Action, Dynamics, Key, Scalar, State, double, in_float64
 
 

@@ -17,17 +17,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from sim2gp.descent import adam, chosen, descend
+from sim2gp.belief import AbstractBelief, AbstractModel
+from sim2gp.data.transitions import Transitions
 from sim2gp.errors import NotFinite
-from sim2gp.gaussian import Gaussian
-from sim2gp.linalg import cholesky, solve_triangular
-from sim2gp.models import features, last_layer
-from sim2gp.models.base import AbstractBelief, AbstractModel
+from sim2gp.inference import linear_regression as last_layer
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.information import Sensitivity
+from sim2gp.inference.linalg import cholesky, solve_triangular
+from sim2gp.inference.linear_regression import LastLayer
+from sim2gp.models import features
 from sim2gp.models.features import Encoding, Network, stepped
-from sim2gp.models.information import Sensitivity
-from sim2gp.models.last_layer import LastLayer
+from sim2gp.models.training import adam, chosen, descend
 from sim2gp.systems.base import AbstractSystem
-from sim2gp.transitions import Transitions
 from sim2gp.types import Action, Dynamics, Key, Scalar, State, double, in_float64
 
 BLOCK = 100  # steps between two looks at the held-out rows

@@ -17,15 +17,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from sim2gp import checks
-from sim2gp.descent import chosen
-from sim2gp.gaussian import LOG_2PI
-from sim2gp.models import features, hybrid, last_layer, nlm
-from sim2gp.models.base import AbstractBelief, AbstractModel
+from sim2gp.belief import AbstractBelief, AbstractModel
+from sim2gp.data.transitions import Transitions
+from sim2gp.inference import linear_regression as last_layer
+from sim2gp.inference.gaussian import LOG_2PI
+from sim2gp.inference.linear_regression import LastLayer
+from sim2gp.models import features, hybrid, nlm
 from sim2gp.models.features import Encoding
 from sim2gp.models.hybrid import HybridBelief
-from sim2gp.models.last_layer import LastLayer
 from sim2gp.models.sim2gp import Sim2GP, Sim2GPBelief
-from sim2gp.transitions import Transitions
+from sim2gp.models.training import chosen
 from sim2gp.types import Action, Key, State, in_float64
 
 SCALE = 3.0  # a residual's prior sd, in fitted noises of the simulator

@@ -15,9 +15,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from sim2gp.descent import chosen
-from sim2gp.models import features, hybrid, matching, nlm
-from sim2gp.models.base import AbstractBelief, AbstractModel
+from sim2gp.belief import AbstractBelief, AbstractModel
+from sim2gp.data.transitions import Transitions
+from sim2gp.models import features, hybrid, nlm
+from sim2gp.models import function_space_loss as matching
 from sim2gp.models.features import Encoding
 from sim2gp.models.function_space import (
     budget_of,
@@ -25,12 +26,12 @@ from sim2gp.models.function_space import (
     objective_of,
     start,
 )
+from sim2gp.models.function_space_loss import Budget, Objective
 from sim2gp.models.hybrid import HybridBelief
-from sim2gp.models.matching import Budget, Objective
 from sim2gp.models.residual import SCALE
 from sim2gp.models.sim2gp import Sim2GP, Sim2GPBelief
 from sim2gp.models.tempering import tempered
-from sim2gp.transitions import Transitions
+from sim2gp.models.training import chosen
 from sim2gp.types import Action, Key, State, in_float64
 
 #: Measured on the Furuta: a narrower start or a faster rate covers less.

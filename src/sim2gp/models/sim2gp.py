@@ -15,18 +15,19 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from sim2gp import checks
-from sim2gp.arrowhead import Blocks, Noise
-from sim2gp.em import expectation
-from sim2gp.gaussian import LOG_2PI, Gaussian
-from sim2gp.laplace import AbstractLikelihood, Fit, multi_start
-from sim2gp.least_squares import factor, gauss_newton_step, over, stack
-from sim2gp.linalg import triangular
-from sim2gp.models import linearized
-from sim2gp.models.base import AbstractBelief, AbstractModel
+from sim2gp.belief import AbstractBelief, AbstractModel
+from sim2gp.data.transitions import Transitions
+from sim2gp.inference import linearized
+from sim2gp.inference.arrowhead import Blocks, Noise
+from sim2gp.inference.expectation_maximisation import expectation
+from sim2gp.inference.gaussian import LOG_2PI, Gaussian
+from sim2gp.inference.information import Sensitivity
+from sim2gp.inference.least_squares import factor, gauss_newton_step, over, stack
+from sim2gp.inference.levenberg_marquardt import AbstractLikelihood, Fit, multi_start
+from sim2gp.inference.linalg import triangular
+from sim2gp.models import draws
 from sim2gp.models.features import Encoding
-from sim2gp.models.information import Sensitivity
 from sim2gp.systems.base import AbstractSystem
-from sim2gp.transitions import Transitions
 from sim2gp.types import Action, Dynamics, Key, Scalar, State, double, in_float64
 
 NOISE_ROUNDS = 5  # EM; the last change of sig is below 1e-3 relative from here on
@@ -58,15 +59,13 @@ class Sim2GPBelief(AbstractBelief):
 
     @in_float64
     def sample(self, key: Key) -> Dynamics:
-        return linearized.draw(
-            self.system, self.posterior, self.dt, key, linear=self.linear
-        )
+        return draws.draw(self.system, self.posterior, self.dt, key, linear=self.linear)
 
     @in_float64
     def point(self) -> Dynamics:
         at_map = Gaussian(self.posterior.mean, jnp.zeros_like(self.posterior.scale))
         key = jax.random.key(0)  # the scale is zero: no randomness is used
-        return linearized.draw(self.system, at_map, self.dt, key, linear=self.linear)
+        return draws.draw(self.system, at_map, self.dt, key, linear=self.linear)
 
     def sensitivity(self, s: State, a: Action) -> Sensitivity:
         d = self.noise.size

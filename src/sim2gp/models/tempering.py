@@ -32,8 +32,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from sim2gp.gaussian import Gaussian
-from sim2gp.least_squares import over, stack
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.least_squares import over, stack
 from sim2gp.models.sim2gp import Sim2GPBelief
 from sim2gp.types import Scalar
 

@@ -20,9 +20,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp import checks
-from sim2gp.planning.base import AbstractPlanner, World, masked, rollout
 from sim2gp.planning.icem import ICEM
 from sim2gp.planning.update import AbstractUpdate, Plan
+from sim2gp.planning.world import AbstractPlanner, World, masked, rollout
 from sim2gp.types import Action, Box, Key, State
 
 

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from sim2gp import checks
-from sim2gp.planning.base import World, masked
-from sim2gp.planning.noise import coloured_noise
+from sim2gp.planning.coloured_noise import coloured_noise
 from sim2gp.planning.update import AbstractUpdate, Evaluate, Plan
+from sim2gp.planning.world import World, masked
 from sim2gp.types import Key, Scalar
 
 #: Bisections of log T over 28 nepers: more than float32 can resolve.

@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sim2gp.gaussian import LOG_2PI
-from sim2gp.planning.base import Observation
+from sim2gp.inference.gaussian import LOG_2PI
 from sim2gp.planning.mpc import from_unit
+from sim2gp.planning.world import Observation
 from sim2gp.types import Action, Box, Key, Scalar, State
 
 #: Bounds of a policy's log sd, which its network moves between.

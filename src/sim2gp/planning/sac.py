@@ -21,8 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp import checks
-from sim2gp.descent import Moments, adam, adam_step
-from sim2gp.planning.base import AbstractPlanner, Observation, World
+from sim2gp.models.training import Moments, adam, adam_step
 from sim2gp.planning.mpc import from_unit
 from sim2gp.planning.networks import (
     MLP,
@@ -32,6 +31,7 @@ from sim2gp.planning.networks import (
     squashed,
     values,
 )
+from sim2gp.planning.world import AbstractPlanner, Observation, World
 from sim2gp.types import Action, Box, Key, Scalar, State
 
 

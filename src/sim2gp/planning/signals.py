@@ -14,11 +14,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp import checks
-from sim2gp.planning.base import AbstractPlanner, World, masked, rollout
+from sim2gp.planning.coloured_noise import coloured_noise
 from sim2gp.planning.icem import ICEM
 from sim2gp.planning.mpc import from_unit
-from sim2gp.planning.noise import coloured_noise
 from sim2gp.planning.update import AbstractUpdate
+from sim2gp.planning.world import AbstractPlanner, World, masked, rollout
 from sim2gp.types import Action, Key, State
 
 

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from sim2gp.planning.base import World
+from sim2gp.planning.world import World
 from sim2gp.types import Key
 
 #: Unit-box sequences ``(N, H, m)`` to their returns and validity ``(N,)``.

@@ -9,9 +9,9 @@ from typing import Any, get_type_hints
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from sim2gp.configurations import AT
 from sim2gp.errors import InputError
-from sim2gp.parameters import Parameter, Parameters, unknown_parameter
+from sim2gp.inference.parameters import Parameter, Parameters, unknown_parameter
+from sim2gp.inference.variants import AT
 from sim2gp.project import slips
 from sim2gp.project.effects import perturbed
 from sim2gp.project.priors import located, prior
@@ -25,7 +25,7 @@ from sim2gp.project.schema import (
 from sim2gp.project.source import Source
 from sim2gp.project.validate import unknown, words, wrong_value
 from sim2gp.systems import AbstractSystem
-from sim2gp.systems.actuator import Actuated, actuator_prior
+from sim2gp.systems.actuators import Actuated, actuator_prior
 
 
 def build_system(

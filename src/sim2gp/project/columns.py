@@ -13,10 +13,10 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Float
 
+from sim2gp.data.logs import Column
+from sim2gp.data.logs.checks import follows
+from sim2gp.data.logs.units import UNITS
 from sim2gp.errors import InputError
-from sim2gp.logs import Column
-from sim2gp.logs.checks import follows
-from sim2gp.logs.units import UNITS
 from sim2gp.systems.base import Channel
 
 Values = Float[np.ndarray, " N"]

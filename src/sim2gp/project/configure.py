@@ -10,16 +10,16 @@ the prior of its constant, or of ``[parameters."body/hand/mass @ payload"]``.
 
 from collections.abc import Mapping
 
-from sim2gp.configurations import AT, Configuration
 from sim2gp.errors import InputError
-from sim2gp.parameters import Parameter, unknown_parameter
+from sim2gp.inference.linear_measurements import Weighed
+from sim2gp.inference.parameters import Parameter, unknown_parameter
+from sim2gp.inference.variants import AT, Configuration
 from sim2gp.project.priors import located, prior
 from sim2gp.project.schema import ParameterSpec, ProjectSpec
 from sim2gp.project.source import Source
 from sim2gp.systems import AbstractSystem, configured
-from sim2gp.systems.configured import with_weighed
-from sim2gp.systems.written import names_of
-from sim2gp.weighed import Weighed
+from sim2gp.systems.function_checks import names_of
+from sim2gp.systems.variants import with_weighed
 
 
 def in_configurations(

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from sim2gp.data.logs import Budget, Column, read_log
+from sim2gp.data.logs.formats import recordings
+from sim2gp.data.logs.units import UNITS
 from sim2gp.errors import InputError
-from sim2gp.logs import Budget, Column, read_log
-from sim2gp.logs.formats import recordings
-from sim2gp.logs.units import UNITS
 from sim2gp.project.columns import Match, match, time_column
 from sim2gp.project.project import (
     SYSTEMS,

@@ -14,19 +14,15 @@ from typing import Any
 import jax.numpy as jnp
 
 from sim2gp.errors import InputError, nearest
-from sim2gp.parameters import Parameter
+from sim2gp.inference.parameters import Parameter
 from sim2gp.project.priors import prior
 from sim2gp.project.schema import EFFECT_OPTIONS, EffectSpec
 from sim2gp.project.source import Source
 from sim2gp.project.validate import unknown
-from sim2gp.systems import (
-    AbstractMechanism,
-    AbstractSystem,
-    Perturbed,
-    effects,
-    placement,
-)
-from sim2gp.systems.effects import AbstractEffect
+from sim2gp.systems import AbstractMechanism, AbstractSystem, Perturbed
+from sim2gp.systems.effects import base as effects
+from sim2gp.systems.effects import placement
+from sim2gp.systems.effects.base import AbstractEffect
 
 #: Effects by the last part of their constant's name, ``<channel>.<effect>``.
 EFFECTS: dict[str, Any] = {

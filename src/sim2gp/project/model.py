@@ -11,9 +11,9 @@ usual constants that are not zero in the model are open.
 
 from pathlib import Path
 
-from sim2gp.configurations import AT
 from sim2gp.errors import InputError
-from sim2gp.parameters import Parameter
+from sim2gp.inference.parameters import Parameter
+from sim2gp.inference.variants import AT
 from sim2gp.project.build import actuated
 from sim2gp.project.effects import effect_options
 from sim2gp.project.priors import located, prior
@@ -22,9 +22,9 @@ from sim2gp.project.source import Source
 from sim2gp.project.validate import unknown
 from sim2gp.systems import AbstractSystem, MuJoCo
 from sim2gp.systems.base import AbstractPlant
-from sim2gp.systems.mjcf import SIGNED, Constant, constants_of, matching
-from sim2gp.systems.mujoco import default_prior, loaded
-from sim2gp.systems.zeros import Zeroed, offset_prior
+from sim2gp.systems.mujoco.constants import SIGNED, Constant, constants_of, matching
+from sim2gp.systems.mujoco.system import default_prior, loaded
+from sim2gp.systems.sensors import Zeroed, offset_prior
 
 
 def build_model(

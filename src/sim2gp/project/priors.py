@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from sim2gp.errors import InputError
-from sim2gp.parameters import BOX_SD, Parameter, prior_from_moments
+from sim2gp.inference.parameters import BOX_SD, Parameter, prior_from_moments
 from sim2gp.project.schema import PriorSpec
 
 _MATTER = {"kg": "mass", "kg m^2": "inertia"}

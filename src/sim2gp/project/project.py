@@ -14,9 +14,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sim2gp.data.logs import Budget, Column, Log, Resample, none_unused, read_log
+from sim2gp.data.logs.file import shown
 from sim2gp.errors import InputError, nearest
-from sim2gp.logs import Budget, Column, Log, Resample, none_unused, read_log
-from sim2gp.logs.file import shown
 from sim2gp.project.schema import (
     ColumnSpec,
     LogSpec,

@@ -22,13 +22,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from sim2gp.data.logs import Column, Log
+from sim2gp.data.logs.units import factor
+from sim2gp.data.split_log import cut
+from sim2gp.data.windows import Windows, fit_windows
 from sim2gp.errors import NotConverged, NotFinite
-from sim2gp.logs import Column, Log
-from sim2gp.logs.units import factor
-from sim2gp.models.cutting import cut
-from sim2gp.models.stretch import simulate
-from sim2gp.models.windows import Windows, fit_windows
 from sim2gp.systems.base import AbstractSystem
+from sim2gp.systems.simulate import simulate
 from sim2gp.types import Key, in_float64
 
 SURE = 5.0  # nats of evidence that a reading is better than another by

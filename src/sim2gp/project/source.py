@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from sim2gp.data.logs.file import read_bytes, shown
+from sim2gp.data.logs.table import decode
 from sim2gp.errors import InputError
-from sim2gp.logs.file import read_bytes, shown
-from sim2gp.logs.table import decode
 from sim2gp.project.syntax import of_repeated, of_syntax
 
 MAX_BYTES = 1_000_000

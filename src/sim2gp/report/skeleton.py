@@ -28,7 +28,7 @@ Moving = Float[np.ndarray, "T j 3"]
 
 
 def figure_entry(figure: Any) -> dict[str, Any]:
-    """A `sim2gp.systems.mujoco_figure.Figure`, without its motion, for a summary."""
+    """A `sim2gp.systems.mujoco.figure.Figure`, without its motion, for a summary."""
     return {
         "fixed": np.round(figure.fixed, 5).tolist(),
         "rods": [list(rod) for rod in figure.rods],

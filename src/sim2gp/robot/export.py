@@ -12,17 +12,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim2gp import checks
+from sim2gp.belief import AbstractBelief
 from sim2gp.errors import InputError
-from sim2gp.gaussian import Gaussian
-from sim2gp.models import AbstractBelief
+from sim2gp.inference.gaussian import Gaussian
 from sim2gp.planning import Policy
 from sim2gp.robot.format import FORMAT, check_shapes, check_values, header
 from sim2gp.runs import new_run
 from sim2gp.runs.archive import Declared
 from sim2gp.runs.store import Writer
 from sim2gp.systems import AbstractSystem, BlackBox, MuJoCo
-from sim2gp.systems.actuator import bare
-from sim2gp.systems.mjcf_load import compiled_all
+from sim2gp.systems.actuators import bare
+from sim2gp.systems.mujoco.load import compiled_all
 from sim2gp.types import Key, in_float64, single
 
 #: Files that one child process compiles, and models that are in memory at once.

@@ -23,12 +23,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from sim2gp.errors import InputError, NotFinite, missing_extra
-from sim2gp.flight import Purpose, key_for
-from sim2gp.parameters import unknown_parameter
+from sim2gp.inference.parameters import unknown_parameter
+from sim2gp.planning.episode import Purpose, key_for
 from sim2gp.planning.mpc import from_unit
+from sim2gp.planning.tasks import MACHINES, TRUTHS, Task, draw_truth
 from sim2gp.systems import AbstractEffect, InputDelay
-from sim2gp.systems.perturbed import effect
-from sim2gp.tasks import MACHINES, TRUTHS, Task, draw_truth
+from sim2gp.systems.effects.perturbed import effect
 from sim2gp.types import Action, AnyArray, Key, Scalar, State
 
 #: Environments by name, and their machines.

@@ -16,7 +16,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp.errors import InputError, missing_extra
-from sim2gp.flight import Purpose, key_for
+from sim2gp.planning.episode import Purpose, key_for
+from sim2gp.planning.tasks import Task
 from sim2gp.robot.gymnasium import (
     PUBLISHED,
     SEEDS,
@@ -31,7 +32,6 @@ from sim2gp.robot.gymnasium import (
     key_of,
 )
 from sim2gp.systems import AbstractEffect, InputDelay
-from sim2gp.tasks import Task
 from sim2gp.types import AnyArray, Key
 
 

@@ -62,7 +62,7 @@ def source_of(file: str | Path) -> Source:
 
 
 def _name(path: Path) -> str:
-    """`sim2gp.systems.furuta`; of a script, its stem."""
+    """`sim2gp.systems.plants.furuta`; of a script, its stem."""
     if not path.is_relative_to(PACKAGE):
         return path.stem
     parts = path.relative_to(PACKAGE.parent).with_suffix("").parts

@@ -1,7 +1,7 @@
 """Physics only: machines as differential equations, with published constants."""
 
-from sim2gp.configurations import Configuration
-from sim2gp.systems.actuator import Actuated, ActuatedParams, actuator_prior
+from sim2gp.inference.variants import Configuration
+from sim2gp.systems.actuators import Actuated, ActuatedParams, actuator_prior
 from sim2gp.systems.base import (
     AbstractMechanism,
     AbstractODE,
@@ -12,10 +12,7 @@ from sim2gp.systems.base import (
     delayed_means,
     rk4,
 )
-from sim2gp.systems.black_box import BlackBox
-from sim2gp.systems.cartpole import CartPole, CartPoleParams
-from sim2gp.systems.configured import Configured, alone, configured
-from sim2gp.systems.effects import (
+from sim2gp.systems.effects.base import (
     AbstractEffect,
     BackEmf,
     Coulomb,
@@ -28,12 +25,8 @@ from sim2gp.systems.effects import (
     Spring,
     Stribeck,
 )
-from sim2gp.systems.functions import ODE
-from sim2gp.systems.furuta import Furuta, FurutaParams
-from sim2gp.systems.lag import Lagged, LaggedParams, lagged_means
-from sim2gp.systems.library import Candidate, InputLag, library
-from sim2gp.systems.mujoco import MuJoCo
-from sim2gp.systems.perturbed import (
+from sim2gp.systems.effects.library import Candidate, InputLag, library
+from sim2gp.systems.effects.perturbed import (
     STRENGTHS,
     InputDelay,
     Perturbed,
@@ -42,15 +35,27 @@ from sim2gp.systems.perturbed import (
     effect,
     perturb,
 )
-from sim2gp.systems.placement import BaseTilt, BaseTiltSide, EncoderOffset, Payload
-from sim2gp.systems.sysid import read_sysid, write_sysid
-from sim2gp.systems.two_link import (
+from sim2gp.systems.effects.placement import (
+    BaseTilt,
+    BaseTiltSide,
+    EncoderOffset,
+    Payload,
+)
+from sim2gp.systems.lag import Lagged, LaggedParams, lagged_means
+from sim2gp.systems.mujoco.sysid import read_sysid, write_sysid
+from sim2gp.systems.mujoco.system import MuJoCo
+from sim2gp.systems.plants.black_box import BlackBox
+from sim2gp.systems.plants.cartpole import CartPole, CartPoleParams
+from sim2gp.systems.plants.functions import ODE
+from sim2gp.systems.plants.furuta import Furuta, FurutaParams
+from sim2gp.systems.plants.two_link import (
     TwoLink,
     TwoLinkParams,
     UniformRodArm,
     UniformRodParams,
 )
-from sim2gp.systems.zeros import Zeroed
+from sim2gp.systems.sensors import Zeroed
+from sim2gp.systems.variants import Configured, alone, configured
 
 __all__ = [
     "ODE",

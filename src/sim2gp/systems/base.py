@@ -24,10 +24,15 @@ from equinox import AbstractVar
 from jaxtyping import Array, Float
 
 from sim2gp import checks
-from sim2gp.configurations import Which
 from sim2gp.errors import InputError, nearest
-from sim2gp.parameters import Parameter, Parameters, parameters_of, unknown_parameter
-from sim2gp.systems.written import check_mechanism, check_returns, names_of
+from sim2gp.inference.parameters import (
+    Parameter,
+    Parameters,
+    parameters_of,
+    unknown_parameter,
+)
+from sim2gp.inference.variants import Which
+from sim2gp.systems.function_checks import check_mechanism, check_returns, names_of
 from sim2gp.types import Action, Scalar, State
 
 #: Of RK4 inside the windows that logs are cut into, s.

@@ -20,8 +20,8 @@ from jaxtyping import Array, Float
 
 from sim2gp import checks
 from sim2gp.errors import InputError
-from sim2gp.parameters import Parameter, Parameters
-from sim2gp.systems.actuator import AbstractInputPath
+from sim2gp.inference.parameters import Parameter, Parameters
+from sim2gp.systems.actuators import AbstractInputPath
 from sim2gp.systems.base import AbstractSystem, index_of
 from sim2gp.types import Action, Scalar, State
 

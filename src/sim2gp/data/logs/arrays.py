@@ -1,0 +1,278 @@
+"""Named arrays of a file become columns: ``q`` of shape (N,), ``state`` (N, k) as
+``state[0]``, ``state[1]``, ... or by the names that the format gives them.
+
+Shapes and dtypes are known before anything is read, so that what cannot be a column is
+refused, and what does not fit in memory is never allocated.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Float, Shaped
+
+from sim2gp.data.logs.budget import Meter
+from sim2gp.data.logs.log import Note
+from sim2gp.data.logs.table import Rows, Table
+from sim2gp.errors import InputError, nearest
+
+MAX_WIDTH = 256  # columns of one array; above, it is a picture or a cloud of points
+EXACT = 2**53  # whole numbers beyond lose digits in float64
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An array of a file that is not read yet, rows first; ``labels`` its columns."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    read: Callable[[], Shaped[np.ndarray, "..."]]
+    labels: tuple[str, ...] = ()
+
+    def names(self, name: str) -> list[str]:
+        """What the columns of the array are called."""
+        if len(self.shape) != 2:
+            return [name]
+        if self.labels:
+            return [f"{name}/{label}" for label in self.labels]
+        return [f"{name}[{i}]" for i in range(min(self.shape[1], MAX_WIDTH))]
+
+    @property
+    def is_numeric(self) -> bool:
+        """Whether its columns are real numbers of at least 32 bits (or integers)."""
+        narrow = self.dtype.kind == "f" and self.dtype.itemsize < 4
+        fits = len(self.shape) == 1 or self.shape[1:2] <= (MAX_WIDTH,)
+        return self.dtype.kind in "fiumM" and not narrow and self.is_flat and fits
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether it is a column or a table of columns."""
+        return len(self.shape) in (1, 2)
+
+
+def table_of(
+    entries: Mapping[str, Entry],
+    source: str,
+    wanted: Sequence[str] | None,
+    *,
+    time: str | None,
+    meter: Meter,
+) -> Table:
+    """Read the wanted columns (None: all that are numbers) as float64.
+
+    Nothing is read of the others. Raises `InputError` E103, E115, E121, E123, E124,
+    E126, E140, E180.
+    """
+    places = {
+        name: (base, k)
+        for base, entry in entries.items()
+        for k, name in enumerate(entry.names(base))
+    }
+    meter.tick()
+    header = tuple(places)
+    if wanted is None:
+        wanted = [n for n, (base, _) in places.items() if entries[base].is_numeric]
+    for name in wanted:
+        if name not in places:
+            raise missing(name, header, source, name == time)
+        _check_kind(entries[places[name][0]], name, source)
+    bases = list(dict.fromkeys(places[name][0] for name in wanted))
+    rows = _count(entries, bases, places[time][0] if time in places else None, source)
+    used = [entries[base] for base in bases]
+    meter.place = ""
+    meter.claim(sum(math.prod(e.shape) * max(e.dtype.itemsize, 8) for e in used))
+    of: dict[str, list[str]] = {base: [] for base in bases}
+    for name in wanted:
+        of[places[name][0]].append(name)
+    columns: dict[str, Float[np.ndarray, " N"]] = {}
+    notes: list[Note] = []
+    for base, names in of.items():
+        meter.place = f"column {base[:60]}"
+        read = entries[base].read()
+        for name in names:
+            raw = read if read.ndim == 1 else read[:, places[name][1]]
+            columns[name], said = _numbers(raw, name, source, name == time)
+            notes += said
+    meter.place = ""
+    table_rows = Rows(source, np.arange(rows), "row")
+    return Table(table_rows, header, columns, notes=tuple(notes))
+
+
+def missing(
+    name: str, header: Sequence[str], source: str, is_time: bool = False
+) -> InputError:
+    """E103 for a column, with the name that was probably meant."""
+    entries = [n for n in header if n.startswith((f"{name}[", f"{name}/"))]
+    close = entries[0] if entries else nearest(name, header)
+    listed = ", ".join(header[:60])
+    fix = f"did you mean {close}" if close else "name a column of the file"
+    return InputError(
+        "E103",
+        f"missing column {name}",
+        where=source,
+        got=(listed if len(listed) <= 120 else listed[:117] + "...") or "no columns",
+        expected=f"a column named {name}",
+        fix=fix + (", or state period (in s)" if is_time else ""),
+    )
+
+
+def distinct(names: Sequence[str], source: str) -> None:
+    """Each column is named once (E104)."""
+    twice = next((n for n, count in Counter(names).items() if count > 1), None)
+    if twice is not None:
+        raise InputError(
+            "E104",
+            f"column {twice} stands twice",
+            where=source,
+            got=f"{names.count(twice)} of this name",
+            expected="each name once",
+            fix="rename one of them",
+        )
+
+
+def _check_kind(entry: Entry, name: str, source: str) -> None:
+    """Real numbers with digits enough, in rows and columns (E121, E123, E124, E140)."""
+    where, kind = f"{source}:column {name}", entry.dtype.kind
+    if kind == "O":
+        raise InputError(
+            "E180",
+            "array of Python objects refused",
+            where=where,
+            got="dtype object",
+            expected="an array of numbers",
+            fix="save it as float64",
+        )
+    if kind in "SUT":
+        raise InputError(
+            "E121",
+            "text in a numeric column",
+            where=where,
+            got=f"dtype {entry.dtype}",
+            expected="numbers",
+            fix="save it as float64",
+        )
+    if kind not in "fiumM":
+        raise InputError(
+            "E123",
+            "truth values, complex numbers or records",
+            where=where,
+            got=f"dtype {entry.dtype}",
+            expected="real numbers",
+            fix="save it as float64",
+        )
+    if kind == "f" and entry.dtype.itemsize < 4:
+        raise InputError(
+            "E124",
+            "too few digits",
+            where=where,
+            got=f"{entry.dtype} (three digits)",
+            expected="float32 or float64",
+            fix="record in float32 or float64",
+        )
+    if not entry.is_flat:
+        raise InputError(
+            "E140",
+            "not a table",
+            where=where,
+            got=f"shape {entry.shape}",
+            expected="rows, or rows by columns",
+            fix="save one array per episode, without further axes",
+        )
+
+
+def _count(
+    entries: Mapping[str, Entry], bases: Sequence[str], time: str | None, source: str
+) -> int:
+    """The number of rows of all arrays (E115, E140)."""
+    shapes = {base: entries[base].shape for base in bases}
+    rows = entries[time].shape[0] if time else max(s[0] for s in shapes.values())
+    if rows == 0:
+        raise InputError(
+            "E115",
+            "no rows",
+            where=source,
+            got="0 rows",
+            expected="at least two",
+            fix="record the log again",
+        )
+    for base, shape in shapes.items():
+        wide = len(shape) == 2 and shape[0] < shape[1]
+        if wide and (time is None or shape[1] == rows):
+            raise InputError(
+                "E140",
+                f"{base} looks transposed",
+                where=source,
+                got=f"{shape[0]} rows of {shape[1]} columns",
+                expected=f"{shape[1]} rows of {shape[0]} columns",
+                fix=f"save {base}.T",
+            )
+    other = next((base for base, shape in shapes.items() if shape[0] != rows), None)
+    if other is None:
+        return rows
+    first = time or next(base for base, shape in shapes.items() if shape[0] == rows)
+    off = " (one more observation than actions is Minari's alone)"
+    raise InputError(
+        "E140",
+        "columns of different lengths",
+        where=source,
+        got=f"{rows} rows of {first}, {shapes[other][0]} of {other}",
+        expected="one row of every column for each time"
+        + (off if abs(rows - shapes[other][0]) == 1 else ""),
+        fix="drop the row without an action, or save what belongs together",
+    )
+
+
+def _numbers(
+    raw: Shaped[np.ndarray, " N"], name: str, source: str, is_time: bool
+) -> tuple[Float[np.ndarray, " N"], list[Note]]:
+    """As float64; dates, and whole numbers too large for it, count from the first."""
+    dated = raw.dtype.kind in "mM"
+    if dated:
+        undated = np.isnat(raw)
+        raw = raw.astype(f"{raw.dtype.kind}8[ns]").astype(np.int64)
+    large = is_time and raw.dtype.kind in "iu" and int(np.max(raw, initial=0)) > EXACT
+    if not (dated or large):
+        return raw.astype(np.float64), []
+    if raw.dtype.kind == "u":
+        raw = raw.astype(np.int64)
+    values = (raw - raw[0]).astype(np.float64)
+    if dated:
+        values = np.where(undated, np.nan, values / 1e9)
+    text = f"{name} in {source} counts from its first row"
+    return values, [Note("W154", text + (", in s" if dated else ""))]
+
+
+def split(table: Table, episode: str) -> list[tuple[int, Table]]:
+    """Cut at the borders of episodes, by their ids in a column (E127)."""
+    ids = table.columns[episode]
+    bad = np.flatnonzero(~(np.isfinite(ids) & (ids == np.round(ids))))
+    if bad.size:
+        raise _episodes(
+            "episode id missing", table.rows.at(int(bad[0])), f"{ids[bad[0]]:g}"
+        )
+    edges = [0, *(np.flatnonzero(np.diff(ids)) + 1).tolist(), len(ids)]
+    pieces: dict[int, Table] = {}
+    for start, end in pairwise(edges):
+        number = int(ids[start])
+        if number in pieces:
+            raise _episodes(
+                "episodes interleaved", table.rows.at(start), f"{number} again"
+            )
+        piece = table.kept(slice(start, end))
+        source = f"{table.rows.source} episode {number}"
+        pieces[number] = replace(piece, rows=replace(piece.rows, source=source))
+    return list(pieces.items())
+
+
+def _episodes(what: str, where: str, got: str) -> InputError:
+    return InputError(
+        "E127",
+        what,
+        where=where,
+        got=got,
+        expected="a whole number in every row, the rows of an episode together",
+        fix="sort the rows by episode, or save one file per episode",
+    )

@@ -1,0 +1,149 @@
+"""One door to the recordings of every format: by suffix, checked by the first bytes.
+
+A recording is one episode: a table for each clock in it. CSV, npz, Parquet and HDF5
+leave the time to a column or a stated period; LeRobot and bags bring their own.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from sim2gp.data.logs.arrays import split
+from sim2gp.data.logs.budget import Budget, Meter, readable
+from sim2gp.data.logs.episodes import read_lerobot, read_minari
+from sim2gp.data.logs.file import kind_of, shown
+from sim2gp.data.logs.hdf5 import read_hdf5
+from sim2gp.data.logs.npz import read_npz
+from sim2gp.data.logs.parquet import read_parquet
+from sim2gp.data.logs.ros import read_bag
+from sim2gp.data.logs.table import Table, read_table
+from sim2gp.errors import InputError
+
+BAGS = ("rosbag1", "rosbag2", "mcap")
+CLOCKS = ("header", "log")  # what ``time`` may be in a bag
+#: What LeRobot numbers its rows by.
+BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+TIME = "time"  # the column of time, where nothing else is said
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One episode: a table for each of its clocks; ``episode`` is its name or empty."""
+
+    episode: str
+    tables: tuple[Table, ...]
+
+
+def recordings(
+    path: Path,
+    wanted: Sequence[str] | None,
+    *,
+    time: str | None = None,
+    period: float | None = None,
+    episode: str | None = None,
+    budget: Budget | None = None,
+) -> tuple[Recording, ...]:
+    """The wanted columns of a file or folder, episode by episode (None: all numbers).
+
+    ``time`` names the column of time, or in a bag the stamps ("header", "log");
+    ``episode`` a column of episode numbers; ``budget`` is what reading may take, 2 GiB
+    and 60 s if None. Raises `InputError` E101 to E140, E180, E182.
+    """
+    kind = kind_of(path)
+    meter = Meter(shown(path), budget or Budget())
+    with readable(meter):
+        return _recordings(path, kind, wanted, time, period, episode, meter)
+
+
+def _recordings(
+    path: Path,
+    kind: str,
+    wanted: Sequence[str] | None,
+    time: str | None,
+    period: float | None,
+    episode: str | None,
+    meter: Meter,
+) -> tuple[Recording, ...]:
+    if kind in BAGS:
+        _check_bag(path, time, period, episode)
+        return (Recording("", tuple(read_bag(path, kind, wanted, time, meter))),)
+    if kind == "lerobot":
+        _check_no_episode(path, episode, kind)
+        stamped = time is None and period is None
+        asked = _with(wanted, time)
+        found = read_lerobot(path, asked, time, stamped, meter)
+        return tuple(Recording(name, (table,)) for name, table in found)
+    clock = None if period is not None else (time or TIME)
+    asked = _with(wanted, clock, episode)
+    if kind == "minari":
+        _check_no_episode(path, episode, kind)
+        pieces = read_minari(path, asked, clock, meter)
+    elif kind == "hdf5":
+        pieces = read_hdf5(path, asked, clock, meter)
+    else:
+        read = {"npz": read_npz, "parquet": read_parquet}.get(kind, read_table)
+        pieces = [("", read(path, asked, clock, meter))]
+    if episode is not None:
+        pieces = [
+            (f"{name} {number}".strip(), part)
+            for name, table in pieces
+            for number, part in split(table, episode)
+        ]
+    return tuple(Recording(name, (table,)) for name, table in pieces)
+
+
+def columns_of(
+    path: Path | str, budget: Budget | None = None
+) -> dict[str, Float[np.ndarray, " _"]]:
+    """Every numeric column of a file or folder by name, of its first episode.
+
+    Columns of streams with clocks of their own have lengths of their own. Raises
+    `InputError`, E126 for a file beyond the ``budget``, 2 GiB and 60 s if None.
+    """
+    tables = recordings(Path(path), None, budget=budget)[0].tables
+    return {name: v for table in tables for name, v in table.columns.items()}
+
+
+def _with(wanted: Sequence[str] | None, *names: str | None) -> list[str] | None:
+    if wanted is None:
+        return None
+    return list(dict.fromkeys([*(n for n in names if n is not None), *wanted]))
+
+
+def _check_bag(
+    path: Path, time: str | None, period: float | None, episode: str | None
+) -> None:
+    if period is not None:
+        raise InputError(
+            "E160",
+            "period for a recording with stamps",
+            where=shown(path),
+            got=f"period = {period:g}",
+            expected="the stamps of the messages",
+            fix=f"write resample = {{period = {period:g}}} instead",
+        )
+    if time is not None and time not in CLOCKS:
+        raise InputError(
+            "E160",
+            "no such clock",
+            where=shown(path),
+            got=f"time = {time!r}",
+            expected='"header" or "log", or nothing',
+            fix="leave time out",
+        )
+    _check_no_episode(path, episode, "bag")
+
+
+def _check_no_episode(path: Path, episode: str | None, kind: str) -> None:
+    if episode is not None:
+        raise InputError(
+            "E160",
+            "column of episodes",
+            where=shown(path),
+            got=f"episode = {episode!r}",
+            expected=f"nothing: a {kind} tells its episodes itself",
+            fix="leave episode out",
+        )

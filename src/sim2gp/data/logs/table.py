@@ -1,0 +1,348 @@
+"""Text to numbers: one CSV file becomes a table of float64 columns, or one clear error.
+
+The first line names the columns, the rest are rows of numbers separated by commas.
+Spaces around names and a byte-order mark are accepted. Only the columns that are asked
+for are parsed, by numpy; a fault is then looked for cell by cell, to name its line.
+Lines are counted as an editor counts them: the header is line 1.
+"""
+
+import csv
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from sim2gp.data.logs.budget import Meter
+from sim2gp.data.logs.file import (
+    COMPRESSED,
+    MAGIC,
+    PICKLED,
+    compressed,
+    pickled,
+    read_bytes,
+    shown,
+)
+from sim2gp.data.logs.log import Note
+from sim2gp.errors import InputError, nearest
+
+_BINARY = (*(m for k, m in MAGIC.items() if k != "npz"), b"\x93NUMPY")
+BLOCK = 20_000  # rows that are parsed at once
+_DATE = re.compile(
+    r"\d{4}-\d\d-\d\d|\d{1,2}:\d\d(:\d\d)?|\d{1,2}[/.]\d{1,2}[/.]\d{2,4}"
+)
+
+
+@dataclass(frozen=True)
+class Rows:
+    """What the rows of a table are called in messages: ``run.csv:line 9``."""
+
+    source: str
+    numbers: Int[np.ndarray, " N"]
+    word: str = "line"
+
+    def at(self, i: int) -> str:
+        """The place of the row at position ``i``."""
+        return f"{self.source}:{self.word} {self.numbers[i]}"
+
+    def kept(self, which: Int[np.ndarray, " K"] | slice) -> "Rows":
+        """Some of the rows, by their positions."""
+        return replace(self, numbers=self.numbers[which])
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns of one clock: ``columns[name]`` (N,), and what their rows are called.
+
+    ``clock`` is in s where the format has stamps of its own, None where a column or the
+    user says the time. ``stream`` names a table among several of one recording.
+    """
+
+    rows: Rows
+    header: tuple[str, ...]
+    columns: dict[str, Float[np.ndarray, " N"]]
+    clock: Float[np.ndarray, " N"] | None = None
+    stream: str = ""
+    notes: tuple[Note, ...] = ()
+
+    def kept(self, which: Int[np.ndarray, " K"] | slice) -> "Table":
+        """Some of the rows, by their positions."""
+        columns = {name: values[which] for name, values in self.columns.items()}
+        clock = None if self.clock is None else self.clock[which]
+        return replace(self, rows=self.rows.kept(which), columns=columns, clock=clock)
+
+
+def decode(content: bytes, where: str) -> str:
+    """Bytes to text: UTF-8 with or without a byte-order mark, no NUL bytes (E120)."""
+    if content.startswith(PICKLED):
+        raise pickled(where, "a pickle")
+    if content.startswith(COMPRESSED):
+        raise compressed(where, content)
+    nul = content.find(b"\x00")
+    faults = [0] if content.startswith(_BINARY) else [nul] if nul >= 0 else []
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        faults.append(error.start)
+    if not faults:
+        return text
+    offset = min(faults)
+    raise InputError(
+        "E120",
+        "not UTF-8 text",
+        where=f"{where}:byte {offset}",
+        got=f"byte 0x{content[offset]:02x}",
+        expected="text in UTF-8",
+        fix="save the file as UTF-8 text, or give it the suffix of its format",
+    )
+
+
+def read_table(
+    path: Path, wanted: Sequence[str] | None, time: str | None, meter: Meter
+) -> Table:
+    """Read the wanted columns of a CSV file as float64; empty cells become NaN.
+
+    None wants every named column whose first cell is a number.
+    """
+    where = shown(path)
+    text = decode(read_bytes(path, meter.budget.bytes), where)
+    lines = text.splitlines()
+    filled = [i for i, line in enumerate(lines) if line and not line.isspace()]
+    if not filled:
+        raise InputError(
+            "E115",
+            "empty file",
+            where=where,
+            got="no text",
+            expected="a header and at least two rows",
+            fix="record the log again",
+        )
+    numbers = np.asarray(filled, dtype=np.int64) + 1
+    header = _header(lines[filled[0]], Rows(where, numbers[:1]))
+    if len(filled) == 1:
+        raise InputError(
+            "E115",
+            "no rows below the header",
+            where=where,
+            got="0 rows",
+            expected="at least two rows",
+            fix="record the log again",
+        )
+    table = Rows(where, numbers[1:])
+    rows = [lines[i] for i in filled[1:]]
+    if wanted is None:
+        wanted = _numeric(header, rows[0], table)
+    places = {name: i for i, name in enumerate(header)}
+    for name in wanted:
+        if name not in places:
+            raise _missing(name, header, where)
+    quoted = '"' in text
+    meter.spend(8 * len(rows) * len(wanted))
+    values = np.empty((len(rows), len(wanted)))
+    _check_widths(rows, header, table, quoted, meter)
+    columns = [places[name] for name in wanted]
+    for i in range(0, len(rows), BLOCK):
+        meter.tick()
+        part = slice(i, i + BLOCK)
+        kept = table.kept(part)
+        values[part] = _parse(rows[part], columns, header, kept, quoted, time)
+    found = {name: values[:, i] for i, name in enumerate(wanted)}
+    return Table(table, header, found)
+
+
+def _fields(lines: Sequence[str], table: Rows) -> Iterator[list[str]]:
+    """The fields of each line; one that Python's parser does not take is E121."""
+    reader = csv.reader(lines, skipinitialspace=True)
+    try:
+        yield from reader
+    except csv.Error as error:
+        i = min(max(reader.line_num, 1), len(lines)) - 1
+        raise InputError(
+            "E121",
+            "line that cannot be split into fields",
+            where=table.at(i),
+            got=f"{error}, in a line of {len(lines[i])} characters",
+            expected=f"fields of at most {csv.field_size_limit()} characters",
+            fix="remove the line, or the quotes in it",
+        ) from error
+
+
+def _header(line: str, table: Rows) -> tuple[str, ...]:
+    where = table.at(0)
+    (found,) = _fields([line], table)
+    names = [name.strip() for name in found]
+    if len(names) == 1:
+        for mark, word in ((";", "semicolons"), ("\t", "tabs"), ("|", "bars")):
+            if mark in line:
+                raise _delimiter(line, where, word)
+    if all(_is_number(name) for name in names if name):
+        raise InputError(
+            "E103",
+            "no header",
+            where=where,
+            got=repr(_cut(line)),
+            expected="a first line with the names of the columns",
+            fix="add the names as the first line",
+        )
+    first: dict[str, int] = {}
+    for i, name in enumerate(names):
+        if name and first.setdefault(name, i) != i:
+            raise InputError(
+                "E104",
+                f"column {name} stands twice",
+                where=where,
+                got=f"columns {first[name] + 1} and {i + 1}",
+                expected="each name once",
+                fix="rename one of them",
+            )
+    return tuple(names)
+
+
+def _numeric(header: tuple[str, ...], row: str, table: Rows) -> list[str]:
+    (found,) = _fields([row], table)
+    cells = [cell.strip() for cell in found]
+    pairs = zip(header, cells, strict=False)
+    return [name for name, cell in pairs if name and (not cell or _is_number(cell))]
+
+
+def _delimiter(line: str, where: str, word: str) -> InputError:
+    return InputError(
+        "E119",
+        "wrong delimiter",
+        where=where,
+        got=f"{word} in {_cut(line)!r}",
+        expected="values separated by commas, decimals by points",
+        fix="save the table with commas and decimal points",
+    )
+
+
+def _missing(name: str, header: tuple[str, ...], where: str) -> InputError:
+    close = nearest(name, header)
+    return InputError(
+        "E103",
+        f"missing column {name}",
+        where=f"{where}:line 1",
+        got=_cut(", ".join(header[:60]), 120),
+        expected=f"a column named {name}",
+        fix=f"did you mean {close}" if close else "name a column of the file",
+    )
+
+
+def _check_widths(
+    rows: list[str],
+    header: tuple[str, ...],
+    table: Rows,
+    quoted: bool,
+    meter: Meter,
+) -> None:
+    """Every row has as many fields as the header (E121), and commas between them."""
+    if quoted:
+        widths = []
+        for fields in _fields(rows, table):
+            meter.tick()
+            widths.append(len(fields))
+        if len(widths) != len(rows):
+            raise InputError(
+                "E121",
+                "quote that never closes",
+                where=table.source,
+                got=f"{len(widths)} records on {len(rows)} lines",
+                expected="one record per line",
+                fix="remove the quotes",
+            )
+    else:
+        widths = [row.count(",") + 1 for row in rows]
+    want = len(header)
+    wrong = np.flatnonzero(np.asarray(widths) != want)
+    if wrong.size == 0:
+        return
+    i = int(wrong[0])
+    place, line = table.at(i), rows[i]
+    if wrong.size == len(rows) and not quoted:
+        if widths[i] == 1 and any(mark in line for mark in ";\t"):
+            raise _delimiter(line, place, "semicolons or tabs")
+        if set(widths) == {2 * want}:
+            raise _delimiter(line, place, "decimal commas")
+    raise InputError(
+        "E121",
+        "ragged row",
+        where=place,
+        got=f"{widths[i]} fields",
+        expected=f"{want} fields",
+        fix=f"mend or delete the line ({wrong.size} such in the file)",
+    )
+
+
+def _parse(
+    rows: list[str],
+    columns: list[int],
+    header: tuple[str, ...],
+    table: Rows,
+    quoted: bool,
+    time: str | None,
+) -> Float[np.ndarray, "N k"]:
+    if not quoted:
+        try:
+            return np.loadtxt(
+                rows,
+                delimiter=",",
+                usecols=columns,
+                ndmin=2,
+                comments=None,
+                dtype=np.float64,
+            )
+        except ValueError:
+            pass  # some cell is not a number: the search below says which
+    out = np.empty((len(rows), len(columns)))
+    lines = _fields(rows, table)
+    for r, fields in enumerate(lines):
+        for c, column in enumerate(columns):
+            cell = fields[column].strip()
+            if not cell:
+                out[r, c] = np.nan
+            elif _is_number(cell):
+                out[r, c] = float(cell)
+            else:
+                name = header[column]
+                place = f"{table.at(r)}, column {name}"
+                raise _not_a_number(cell, place, name == time)
+    return out
+
+
+def _not_a_number(cell: str, place: str, is_time: bool) -> InputError:
+    code, what, expected = "E121", "text in a numeric column", "a number"
+    fix = "mend the cell, or leave it empty and set drop_nonfinite"
+    if is_time and _DATE.search(cell):
+        code, what = "E114", "time written as a date or clock"
+        expected = "seconds as a number, such as 12.345"
+        fix = "write the time as seconds since the start"
+    elif cell.lower() in ("true", "false") or _is_complex(cell):
+        code, what, expected = "E123", "truth value or complex number", "a real number"
+        fix = "write real numbers"
+    elif "," in cell:
+        fix = "write numbers without thousands separators, such as 1234"
+    return InputError(
+        code, what, where=place, got=repr(_cut(cell)), expected=expected, fix=fix
+    )
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return "_" not in cell
+
+
+def _is_complex(cell: str) -> bool:
+    try:
+        complex(cell.replace("i", "j"))
+    except ValueError:
+        return False
+    return True
+
+
+def _cut(text: str, width: int = 40) -> str:
+    return text if len(text) <= width else text[: width - 3] + "..."

@@ -1,0 +1,155 @@
+"""The corrected intervals of a fit: of its windows, and of what its simulator may lack.
+
+Every effect of the machine's library that is no constant in disguise becomes one more
+unknown beside the machine's own, at nothing where the fit stands. The windows are
+linearised there, `sim2gp.identification.intervals.scatter` says where all of them lie,
+and they are linearised there again, until the centre stays: physics that is missing may
+have taken the fit far from it. The noise stays the fit's, which has the misfit in it:
+that makes intervals rather too wide than too narrow.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from sim2gp.data.windows import Windows, WindowsBelief, compile_linearise
+from sim2gp.identification.intervals.pulls import (
+    Pulls,
+    cost_of_rows,
+    pulls_of_rows,
+    rows_of,
+)
+from sim2gp.identification.intervals.scatter import Corrected, corrected
+from sim2gp.identification.missing_physics.score import sine_to
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.systems.base import AbstractSystem
+from sim2gp.systems.effects.base import AbstractEffect
+from sim2gp.systems.effects.library import smooth_effects, with_effects
+from sim2gp.types import in_float64
+
+#: Sine of the angle to the constants' span below which an effect is one of them in
+#: another shape, such as dry friction's with another width.
+DISGUISE = 0.02
+TRUSTED = 1.0  # nats that a centre may cost beyond what the linear misfit says
+GAINED = 0.5  # of a gain that the linear misfit promises: what may fail to come
+HALVINGS = 6
+ROUNDS = 6  # linearisations
+SETTLED = 0.1  # of its sd: what no constant's centre moves by any more
+
+
+def compile_corrected(system: AbstractSystem, cut: Windows) -> None:
+    """Start to compile what `corrected_windows` will ask, while a fit goes on.
+
+    The machine's own linearisation, which others ask, too, comes first.
+    """
+    compile_linearise(system, cut)
+    effects = smooth_effects(system)
+    if effects:
+        compile_linearise(with_effects(system, effects), cut)
+
+
+@in_float64
+def corrected_windows(
+    belief: WindowsBelief,
+    cut: Windows,
+    group: Int[np.ndarray, " W"],
+    effects: Sequence[AbstractEffect] | None = None,
+) -> Corrected:
+    """The corrected posterior of a fit's constants, checked with the simulator itself.
+
+    ``effects`` are what it may lack, with their prior sd: None is its library, which a
+    model of the user's own does not have. Raises `NotFinite` E203.
+    """
+    p = belief.prior.mean.size
+    given = smooth_effects(belief.system) if effects is None else tuple(effects)
+    whole, own = _with(belief, given)
+    at = np.asarray(whole.posterior.mean)
+    rows = rows_of(whole, cut, whole.posterior.mean)
+    pulls = pulls_of_rows(rows, cut, group)
+    order = np.concatenate([own, _told_apart(pulls, own)])
+    lacking = np.arange(len(order)) >= p
+    prior = Gaussian(whole.prior.mean[order], whole.prior.scale[np.ix_(order, order)])
+    for _ in range(ROUNDS):
+        here = Gaussian(jnp.asarray(at[order]), prior.scale)
+        found = corrected(prior, here, pulls.of(order), lacking)
+        if not found.enough:
+            return replace(found, posterior=belief.posterior)
+        to = at.copy()
+        to[order] = np.asarray(found.posterior.mean)
+        to, rows = _trusted(whole, cut, rows, pulls, at, to, found.inflation)
+        moved = np.abs(to - at)[order] / np.asarray(found.posterior.sd())
+        at = to
+        if len(order) == p or np.max(moved) <= SETTLED:
+            break
+        pulls = pulls_of_rows(rows, cut, group)
+    both = Gaussian(jnp.asarray(at[order]), found.posterior.scale)
+    if len(order) == p:
+        return replace(found, posterior=both)
+    mine = Gaussian(both.mean[:p], both.scale[:p]).triangular()
+    names = whole.system.parameters.names
+    return replace(
+        found,
+        posterior=Gaussian(both.mean[:p], mine),
+        effects=tuple(names[j] for j in order[p:]),
+        lacking=Gaussian(both.mean[p:], both.scale[p:]),
+    )
+
+
+def _with(
+    belief: WindowsBelief, effects: Sequence[AbstractEffect]
+) -> tuple[WindowsBelief, Int[np.ndarray, " p"]]:
+    """The belief of the machine with effects, all at nothing; its own constants."""
+    if not effects:
+        return belief, np.arange(belief.prior.mean.size)
+    system = with_effects(belief.system, effects)
+    names, prior = system.parameters.names, system.parameters.prior()
+    own = np.asarray([names.index(name) for name in belief.system.parameters.names])
+    scale = prior.scale.at[np.ix_(own, own)].set(belief.prior.scale)
+    whole = replace(
+        belief,
+        system=system,
+        prior=Gaussian(prior.mean.at[own].set(belief.prior.mean), scale),
+        posterior=Gaussian(prior.mean.at[own].set(belief.posterior.mean), scale),
+        information=jnp.zeros_like(scale),  # of another machine
+    )
+    return whole, own
+
+
+def _told_apart(pulls: Pulls, own: Int[np.ndarray, " p"]) -> Int[np.ndarray, " k"]:
+    """The other columns that show, and that no constants of the machine mimic."""
+    A = np.asarray(np.linalg.qr(np.concatenate(list(pulls.factors)), mode="r"))
+    others = np.setdiff1d(np.arange(A.shape[1]), own)
+    kept = [j for j in others if sine_to(A[:, own], A[:, j])[0] > DISGUISE]
+    return np.asarray(kept, int)
+
+
+def _trusted(
+    belief: WindowsBelief,
+    cut: Windows,
+    rows: Float[np.ndarray, "W k npr"],
+    pulls: Pulls,
+    at: Float[np.ndarray, " p"],
+    to: Float[np.ndarray, " p"],
+    inflation: float,
+) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "W k npr"]]:
+    """As far towards ``to`` as the linear misfit may be believed, and the rows there.
+
+    Near a bound the machine is not linear in ``z``, and a centre far from the MAP is
+    one that no data suggest. So halfway back, and again, until the misfit there is no
+    more than the linear one, to `TRUSTED` nats of data that count as often as they
+    should, or half of what is gained.
+    """
+    dz = np.linalg.solve(np.asarray(belief.prior.scale), to - at)
+    score, F = pulls.scores.sum(axis=0), pulls.fisher.sum(axis=0)
+    before = cost_of_rows(rows, cut)
+    for share in 0.5 ** np.arange(HALVINGS):
+        there = at + share * (to - at)
+        found = rows_of(belief, cut, jnp.asarray(there))
+        told = share * dz @ (score + 0.5 * share * F @ dz)
+        slack = TRUSTED * max(inflation, 1.0) + GAINED * max(-told, 0.0)
+        if cost_of_rows(found, cut) - before - told <= slack:
+            return there, found
+    return at, rows

@@ -1,0 +1,98 @@
+"""What every window of a fit says of the constants alone: its pulls.
+
+The windows' rows ``[J_e J_z r]``, whitened by prior and noise, the start state ``e``
+eliminated by a QR of each window's own. `sim2gp.identification.intervals.scatter` asks
+how far the pulls scatter.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from sim2gp.data.windows import Windows, WindowsBelief, linearise
+from sim2gp.identification.misfit.tests import must_be_finite
+from sim2gp.types import in_float64
+
+
+@dataclass(frozen=True)
+class Pulls:
+    """What each window says of ``z`` alone, whitened by prior and noise.
+
+    ``factors`` are square roots of ``F_w``, ``scores`` the gradients ``u_w`` of the
+    cost where it was linearised, ``group`` numbers the recordings: windows of one
+    follow each other.
+    """
+
+    factors: Float[np.ndarray, "W k p"]
+    scores: Float[np.ndarray, "W p"]
+    group: Int[np.ndarray, " W"]
+
+    @property
+    def fisher(self) -> Float[np.ndarray, "W p p"]:
+        """``F_w``."""
+        return np.swapaxes(self.factors, 1, 2) @ self.factors
+
+    def of(self, which: Int[np.ndarray, " q"]) -> "Pulls":
+        """Those of some constants, the others held."""
+        return Pulls(self.factors[..., which], self.scores[:, which], self.group)
+
+    def at(self, dz: Float[np.ndarray, " p"]) -> "Pulls":
+        """Where the constants are ``dz`` further, of a machine that is linear."""
+        return Pulls(self.factors, self.scores + self.fisher @ dz, self.group)
+
+
+@in_float64
+def pulls_of_windows(
+    belief: WindowsBelief, cut: Windows, group: Int[np.ndarray, " W"]
+) -> Pulls:
+    """Of a fit and its windows, start states eliminated; ``group`` numbers their logs.
+
+    Raises `NotFinite` E203.
+    """
+    return pulls_of_rows(rows_of(belief, cut, belief.posterior.mean), cut, group)
+
+
+def pulls_of_rows(
+    rows: Float[np.ndarray, "W k npr"], cut: Windows, group: Int[np.ndarray, " W"]
+) -> Pulls:
+    """Of rows `rows_of`; raises `NotFinite` E203."""
+    must_be_finite("derivatives or residuals", rows, "the intervals")
+    n = cut.start.shape[1]
+    R = np.asarray(np.linalg.qr(rows, mode="r"))[:, n:, n:]
+    scores = np.einsum("wkp,wk->wp", R[..., :-1], R[..., -1])
+    return Pulls(R[..., :-1], scores, np.asarray(group))
+
+
+def cost_of_rows(rows: Float[np.ndarray, "W k npr"], cut: Windows) -> float:
+    """Half the windows' squared misfit of rows `rows_of`, each from its best start.
+
+    Starts follow by one Gauss-Newton step from where the fit has put them. Infinite
+    where the simulation is not finite.
+    """
+    if not np.isfinite(rows).all():
+        return math.inf
+    n = cut.start.shape[1]
+    both = np.concatenate([rows[..., :n], rows[..., -1:]], axis=-1)
+    R = np.asarray(np.linalg.qr(both, mode="r"))
+    return 0.5 * float(np.sum(R[:, n:, n] ** 2))
+
+
+def rows_of(
+    belief: WindowsBelief, cut: Windows, tt: Array
+) -> Float[np.ndarray, "W k npr"]:
+    """Of each window ``[J_e J_z r]``, whitened, the start's prior in its last rows."""
+    p, n = belief.prior.mean.size, cut.start.shape[1]
+    found = linearise(belief, cut, tt)
+    weight = np.sqrt(np.asarray(belief.weights))[:, None, None]
+    scale = weight / np.asarray(belief.noise)
+    r, J = np.asarray(found.residual) * scale, np.asarray(found.jacobian)
+    J = J * scale[..., None]
+    sd = np.asarray(cut.start_sd)
+    away = np.asarray(belief.starts) - np.asarray(cut.start)
+    e = np.divide(away, sd, out=np.zeros_like(away), where=sd > 0.0)
+    rows = np.concatenate([J[..., p:], J[..., :p], r[..., None]], axis=-1)
+    own = np.zeros((len(e), n, n + p + 1))
+    own[..., :n], own[..., -1] = np.eye(n), e
+    return np.concatenate([rows.reshape(len(e), -1, n + p + 1), own], axis=1)

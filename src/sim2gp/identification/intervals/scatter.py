@@ -1,0 +1,314 @@
+"""Intervals that hold where residuals are coloured: how far do windows really scatter?
+
+Laplace's posterior counts every sample as new. Of a real machine they never are, and
+its 95 % intervals then hold the truth in a half of all cases or fewer. What the errors
+of windows do to the constants shows in how the windows pull them, whatever is wrong
+with the samples inside. In whitened coordinates (``tt = mu0 + L0 z``), with every
+window's start state eliminated,
+
+    u_w = J_w^T r_w,    F_w = J_w^T J_w,    F = sum F_w,    R^T R = F + I,
+    v_w = R^-T u_w,     P_w = R^-T F_w R^-1.
+
+If the noise is white and the prior right, the sum of ``v_w`` over any set ``s`` of
+windows has covariance ``P_s (I - P_s)``. So, over all runs ``s`` of ``b`` successive
+windows,
+
+    G = 1/b sum_s R^T q_s q_s^T R,       q_s = (I - P_s)^-1/2 v_s,       E G = F,
+
+exactly: it is the Bartlett (Newey-West) estimate of the covariance of the whole score,
+without its bias of small samples. ``b`` follows from how alike successive pulls are
+(Andrews 1991, with one correlation for all directions). In the coordinates in which
+``F = I`` the eigenvalues ``lambda`` of G say how many samples count as one. A window
+more or less matters to a matrix, so G is drawn towards one number for all directions,
+
+    G <- (nu G + k kappa^2 F) / (nu + k),   kappa^2 = tr(F^-1 G) / p,   k = p (p + 1),
+
+with ``nu`` its degrees of freedom, ``lambda >= 1``, and as wide as Student's t is with
+``nu``. The intervals are those of the prior and of data that count as often as that,
+
+    N(z_c, (F_c + I)^-1),     F_c = F G^-1 F,     z_c = (F_c + I)^-1 F_c z_data,
+
+which is the posterior itself if G = F and the prior where F = 0; it is never narrower
+than the first and never wider than the second. All in square roots. (The sandwich:
+Huber 1967, White 1982; F G^-1 F: Godambe 1960; in a posterior: Ribatet, Cooley and
+Davison 2012, arXiv 0911.5357; (I - P)^-1/2: Bell and McCaffrey 2002.)
+
+A bias that is the same in all windows does not show in their scatter. So some entries
+of ``z`` may be magnitudes ``x`` of effects that the simulator may lack, and which are
+nothing to all who use it: a discrepancy (Kennedy and O'Hagan 2001) of physical shape.
+Their sd is ``tau`` times that of the library, one ``tau`` for all, which is zero with
+probability `NOTHING` and each of `SHARES` alike with the rest. In the data's form above
+each ``tau`` has a Gaussian posterior and an evidence,
+
+    log p(tau) = 1/2 |Q_1^T d|^2 - log |T|,    [F_c^1/2 D; I] = Q T,  D = diag(1, tau),
+
+and what is told of the constants is their mixture's mean and covariance: what the data
+leave open of the effects widens the intervals, what they say of them moves the centre.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from sim2gp.identification.intervals.pulls import Pulls
+from sim2gp.identification.misfit.tests import must_be_finite
+from sim2gp.identification.words import digits
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.least_squares import RANK_TOLERANCE
+from sim2gp.types import in_float64
+
+#: Below so many degrees of freedom nothing is said about the windows' scatter.
+FEWEST = 4.0
+#: Of Bartlett's weights: ``1.5 W / b`` degrees of freedom (Priestley 1981).
+BARTLETT = 1.5
+#: Probability that the simulator lacks nothing, before the data; sd of the effects that
+#: it may lack otherwise, in those of the library.
+NOTHING, SHARES = 0.5, tuple(2.0**-k for k in range(6))
+LIKE_WHITE = 1.3  # times as wide: small samples alone make so much of white noise
+MUCH = 3.0  # times as wide: a summary says why, wherever it names the interval
+
+
+@dataclass(frozen=True)
+class Corrected:
+    """The corrected posterior, or the plain one where windows are too few to tell.
+
+    ``inflation`` is ``kappa^2``, the samples that count as one; ``lag`` the ``b``
+    successive windows taken together; ``freedom`` the degrees of freedom ``nu``;
+    ``missing`` the probability that the simulator lacks something, ``lacking`` the
+    magnitudes of those of its ``effects``.
+    """
+
+    posterior: Gaussian
+    inflation: float
+    lag: int
+    freedom: float
+    enough: bool
+    missing: float = 0.0
+    effects: tuple[str, ...] = ()
+    lacking: Gaussian | None = None
+
+
+@in_float64
+def corrected(
+    prior: Gaussian,
+    plain: Gaussian,
+    pulls: Pulls,
+    effects: Bool[np.ndarray, " p"] | None = None,
+) -> Corrected:
+    """The posterior as wide as the windows' pulls scatter, about the data's centre.
+
+    ``plain`` has the point where the pulls were linearised, and is what is told of too
+    few windows; ``effects`` marks what the simulator may lack, believed with the
+    library's own sd. Raises `NotFinite` E203 for a pull that is not a number.
+    """
+    for what in (pulls.factors, pulls.scores):
+        must_be_finite("pulls of windows", what, "the intervals")
+    L0, mu0 = np.asarray(prior.scale), np.asarray(prior.mean)
+    z, p = np.linalg.solve(L0, np.asarray(plain.mean) - mu0), len(mu0)
+    A = np.concatenate(list(pulls.factors))
+    R = np.asarray(np.linalg.qr(np.concatenate([A, np.eye(p)]), mode="r"))
+    # From here to the MAP of what is linear: nothing where this is the MAP.
+    down = np.linalg.solve(R.T, z + pulls.scores.sum(axis=0))
+    step = -np.linalg.solve(R, down)
+    z, pulls = z + step, pulls.at(step)
+    _, s, Vt = np.linalg.svd(A, full_matrices=False)
+    seen = ~(s <= RANK_TOLERANCE * s.max(initial=0.0))
+    s, Vt = s[seen], Vt[seen]
+    v, P = _whitened(pulls, R)
+    onto = (Vt @ R.T) / s[:, None]  # from v to the coordinates in which F = I
+    W = _effective(P)
+    b = _lag(v @ onto.T, W, pulls.group)
+    nu = min(W, BARTLETT * W / b)
+    if len(s) == 0 or nu < FEWEST:
+        return Corrected(plain, math.nan, b, nu, False)
+    root, kappa2 = _shrunk(_scatter(v, P, pulls.group, b) @ onto.T, nu)
+    _, size, U = np.linalg.svd(root, full_matrices=False)
+    spread = np.maximum(size, 1.0) * math.sqrt(nu / (nu - 2.0))
+    # F z_data = (F + I) z at the MAP, where the scores add up to -z.
+    data = s * (Vt @ z) - (Vt @ pulls.scores.sum(axis=0)) / s
+    weight = U / spread[:, None]
+    free = np.zeros(p, bool) if effects is None else np.asarray(effects)
+    centre, scale, missing = _averaged(weight @ (s[:, None] * Vt), weight @ data, free)
+    found = Gaussian(jnp.asarray(mu0 + L0 @ centre), jnp.asarray(L0 @ scale))
+    return Corrected(found, kappa2, b, nu, True, missing)
+
+
+def _averaged(
+    root: Float[np.ndarray, "q p"],
+    data: Float[np.ndarray, " q"],
+    effects: Bool[np.ndarray, " p"],
+) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p p"], float]:
+    """Mean and scale of ``z`` given ``|root z - data|^2 / 2``, and P(something).
+
+    Prior N(0, 1), of the effects N(0, tau^2).
+    """
+    p, q = len(effects), len(data)
+    shares = (0.0, *SHARES) if effects.any() else (0.0,)
+    logs, means, scales = [], [], []
+    for share in shares:
+        D = np.where(effects, share, 1.0)
+        Q, T = np.linalg.qr(np.concatenate([root * D, np.eye(p)]))
+        onto = Q[:q].T @ data
+        means.append(D * np.linalg.solve(T, onto))
+        scales.append(np.linalg.solve(T.T, np.diag(D)).T)
+        log_det = float(np.sum(np.log(np.abs(np.diag(T)))))
+        logs.append(0.5 * float(onto @ onto) - log_det)
+    if len(shares) == 1:
+        return means[0], scales[0], 0.0
+    prior = [NOTHING, *([(1.0 - NOTHING) / len(SHARES)] * len(SHARES))]
+    weights = np.asarray(prior) * np.exp(np.asarray(logs) - max(logs))
+    weights = weights / weights.sum()
+    mean = weights @ np.asarray(means)
+    rows = [
+        math.sqrt(w) * np.concatenate([C.T, [m - mean]])
+        for w, m, C in zip(weights, means, scales, strict=True)
+    ]
+    scale = np.asarray(np.linalg.qr(np.concatenate(rows), mode="r")).T
+    return mean, scale, 1.0 - float(weights[0])
+
+
+def words(found: Corrected, widened: Sequence[float], windows: int) -> str:
+    """Which intervals are told and why, in some sentences."""
+    if not found.enough:
+        return (
+            f"Intervals count every sample as new: {windows} windows are too few to "
+            "tell whether errors are coloured, and of a real machine they are."
+        )
+    scatter, most = math.sqrt(found.inflation), max(widened, default=1.0)
+    lacks = found.missing > NOTHING
+    if most < LIKE_WHITE and not lacks:
+        return (
+            f"The errors of {windows} windows pull the constants {digits(scatter, 2)} "
+            "times as far as white noise would: intervals are those of independent "
+            f"samples, times {digits(most, 3)} at most. {_allowed(found)}"
+        )
+    text = f"Intervals are {_times(widened)} times as wide as if every sample were new"
+    if not lacks or scatter > LIKE_WHITE:
+        text += f": {_coloured(found, windows)}"
+    return f"{text}. {_allowed(found)}"
+
+
+def why(found: Corrected, widened: Sequence[float], windows: int) -> str | None:
+    """In one sentence, where corrected and plain sd differ by more than `MUCH`.
+
+    The reasons are those that the correction has: samples that repeat each other, and
+    physics that is missing. None of them is a sum of the others.
+    """
+    if not found.enough or max(widened, default=1.0) <= MUCH:
+        return None
+    reasons = []
+    if math.sqrt(found.inflation) > LIKE_WHITE:
+        reasons.append(_coloured(found, windows))
+    if found.missing > NOTHING:
+        reasons.append(
+            f"the simulator is missing physics with a probability of {_sure(found)}, "
+            f"which the parameters make up for"
+        )
+    reason = ", and ".join(reasons) or "windows are few"
+    return (
+        f"The corrected intervals are {_times(widened)} times as wide as the plain "
+        f"ones: {reason}."
+    )
+
+
+def _times(widened: Sequence[float]) -> str:
+    ends = [digits(f(widened, default=1.0), 2) for f in (min, max)]
+    return ends[0] if ends[0] == ends[1] else " to ".join(ends)
+
+
+def _coloured(found: Corrected, windows: int) -> str:
+    return (
+        f"the errors of {windows} windows are coloured and pull the constants "
+        f"{digits(math.sqrt(found.inflation), 2)} times as far as white noise would"
+    )
+
+
+def _sure(found: Corrected) -> str:
+    percent = f"{100.0 * found.missing:.0f} %"
+    return "more than 99 %" if found.missing >= 0.995 else percent
+
+
+def _allowed(found: Corrected) -> str:
+    """Whether physics that is missing is in the intervals."""
+    if not found.effects:
+        return (
+            "This covers errors that come and go, not physics that the model lacks "
+            "(sim2gp explain)."
+        )
+    if found.missing > NOTHING:
+        return (
+            f"The model lacks physics with a probability of {_sure(found)}: intervals "
+            f"allow for {len(found.effects)} effects of its library (friction, "
+            "springs, drag and the like), and constants lie where they would with "
+            "them. sim2gp explain tries the effects one by one."
+        )
+    return (
+        f"That the model lacks some of {len(found.effects)} effects of its library has "
+        f"a probability of {_sure(found)} and is allowed for; of other physics "
+        "intervals know nothing."
+    )
+
+
+def _whitened(
+    pulls: Pulls, R: Float[np.ndarray, "p p"]
+) -> tuple[Float[np.ndarray, "W p"], Float[np.ndarray, "W p p"]]:
+    """``v_w`` and ``P_w``."""
+    v = np.linalg.solve(R.T, pulls.scores.T).T
+    C = np.linalg.solve(R.T, np.swapaxes(pulls.factors, 1, 2))
+    return v, C @ np.swapaxes(C, 1, 2)
+
+
+def _effective(P: Float[np.ndarray, "W p p"]) -> float:
+    """The number of windows, each counted by its share of the information."""
+    share = np.trace(P, axis1=1, axis2=2)
+    return float(share.sum() ** 2 / max(float(np.sum(share**2)), 1e-300))
+
+
+def _lag(y: Float[np.ndarray, "W q"], W: float, group: Int[np.ndarray, " W"]) -> int:
+    """Andrews' lag for Bartlett's weights; at most a quarter of the windows."""
+    pair = group[1:] == group[:-1]
+    shared = float(np.sum((y[1:] * y[:-1])[pair]))
+    rho = shared / max(float(np.sum(y[:-1][pair] ** 2)), 1e-300)
+    rho = float(np.clip(rho, -0.95, 0.95))
+    alpha = 4.0 * rho**2 / (1.0 - rho**2) ** 2
+    return max(1, min(round(1.1447 * (alpha * W) ** (1 / 3)), int(W) // 4))
+
+
+def _scatter(
+    v: Float[np.ndarray, "W p"],
+    P: Float[np.ndarray, "W p p"],
+    group: Int[np.ndarray, " W"],
+    b: int,
+) -> Float[np.ndarray, "S p"]:
+    """Rows ``q_s / sqrt(b)`` of all runs of ``b`` windows, ends of recordings too."""
+    found = []
+    for k in dict.fromkeys(group.tolist()):
+        own = group == k
+        runs = _running(v[own], b), _running(P[own], b)
+        left, Q = np.linalg.eigh(np.eye(v.shape[1]) - runs[1])
+        inner = np.einsum("sij,si->sj", Q, runs[0]) / np.sqrt(np.maximum(left, 1e-12))
+        found.append(np.einsum("sij,sj->si", Q, inner) / math.sqrt(b))
+    return np.concatenate(found)
+
+
+def _running(x: Float[np.ndarray, "W *p"], b: int) -> Float[np.ndarray, "S *p"]:
+    """Sums of ``b`` successive entries, with nothing before and after them."""
+    pad = np.zeros((b, *x.shape[1:]))
+    total = np.cumsum(np.concatenate([pad, x, pad[1:]]), axis=0)
+    return total[b:] - total[:-b]
+
+
+def _shrunk(
+    rows: Float[np.ndarray, "S q"], nu: float
+) -> tuple[Float[np.ndarray, "T q"], float]:
+    """A root of G drawn towards one number for all directions, and that number."""
+    q = rows.shape[1]
+    kappa2 = float(np.sum(rows**2)) / q
+    k = q * (q + 1)
+    own, common = nu / (nu + k), k / (nu + k)
+    even = math.sqrt(common * max(kappa2, 1.0)) * np.eye(q)
+    return np.concatenate([math.sqrt(own) * rows, even]), kappa2

@@ -1,0 +1,129 @@
+"""The misfit tests of a fit: its residuals at the MAP, and what they might depend on.
+
+One-step fits leave one row for each transition. Windows of real logs leave one row for
+each sample, and each window its own start state, whose part is projected out; within a
+window rows are tested for correlation, between windows they are not. An open-loop
+simulation whose model errs at all drifts, so that on real machines these tests
+raise the alarm as a rule: that is right, the posterior counts every sample as new.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from sim2gp.data.transitions import Transitions
+from sim2gp.data.windows import Windows, WindowsBelief, linearise
+from sim2gp.identification.misfit.tests import Misfit, misfit
+from sim2gp.inference.linearized import jacobian_by_columns
+from sim2gp.models.sim2gp import Sim2GPBelief
+from sim2gp.systems.base import Channel
+from sim2gp.types import in_float64
+
+PAST = 3  # earlier inputs that are tried beside the present one: a delay shows there
+
+
+@in_float64
+def misfit_of_transitions(belief: Sim2GPBelief, data: Transitions) -> Misfit:
+    """Of a one-step fit and the transitions it was fitted to.
+
+    An episode goes on where a row starts in the state in which the last one ended.
+    """
+    system, N = belief.system, data.count
+    exact = jax.tree.map(jnp.asarray, data)
+    r, J = (np.asarray(x)[:N] for x in _one_step(belief, exact))
+    sd = np.asarray(belief.noise)
+    s, a, s2 = (np.asarray(x)[:N] for x in (data.state, data.action, data.next_state))
+    episode = _episodes(s, s2)
+    states = system.physical_states
+    return misfit(
+        r / sd,
+        np.concatenate([encoded(s[:, : len(states)], states), a], axis=1),
+        jacobian=J / sd[:, None],
+        past=earlier(a, episode),
+        group=episode,
+        channels=[channel.name for channel in states],
+    )
+
+
+@in_float64
+def misfit_of_windows(belief: WindowsBelief, cut: Windows) -> Misfit:
+    """Of a fit and its windows.
+
+    One-step windows have no start state of their own, and are tested as transitions.
+    """
+    system = belief.system
+    found = linearise(belief, cut, belief.posterior.mean)
+    r, J, s, a = (np.asarray(x).reshape(-1, *x.shape[2:]) for x in found)
+    weight = np.sqrt(np.repeat(np.asarray(belief.weights), cut.mask.shape[1]))
+    scale = weight[:, None] / np.asarray(belief.noise)
+    mask = np.asarray(cut.mask).reshape(r.shape)
+    kept = mask.any(axis=1)
+    p = belief.prior.mean.size
+    free = bool(np.any(np.asarray(cut.start_sd) > 0.0))
+    number = np.arange(len(cut)) if free else _successive(cut)
+    group = np.repeat(number, cut.mask.shape[1])[kept]
+    J = (J * scale[..., None])[kept]
+    states = system.physical_states
+    return misfit(
+        (r * scale)[kept],
+        np.concatenate([encoded(s, states), a], axis=1)[kept],
+        jacobian=J[..., :p],
+        nuisance=J[..., p:] if free else None,
+        group=group,
+        mask=mask[kept],
+        channels=[states[i].name for i in cut.outputs],
+        rows="samples",
+    )
+
+
+def encoded(
+    x: Float[np.ndarray, "N n"], channels: tuple[Channel, ...]
+) -> Float[np.ndarray, "N k"]:
+    """The columns, angles as sine and cosine."""
+    columns = [
+        f(x[:, i])
+        for i, channel in enumerate(channels)
+        for f in ((np.sin, np.cos) if channel.angle else (np.asarray,))
+    ]
+    return np.stack(columns, axis=1)
+
+
+def earlier(
+    a: Float[np.ndarray, "N m"], episode: Int[np.ndarray, " N"]
+) -> Float[np.ndarray, "N l"]:
+    """The `PAST` inputs before each row; before an episode, its first one."""
+    N = len(a)
+    first = np.searchsorted(episode, episode)
+    rows = [np.maximum(np.arange(N) - k, first) for k in range(1, PAST + 1)]
+    return np.concatenate([a[row] for row in rows], axis=1)
+
+
+def _successive(cut: Windows) -> Int[np.ndarray, " W"]:
+    """One number for one-step windows each of which starts where the last one ended."""
+    end = np.sum(np.asarray(cut.y), axis=1, where=np.asarray(cut.mask))
+    start = np.asarray(cut.start)[:, list(cut.outputs)]
+    return _episodes(start, end)
+
+
+def _episodes(
+    start: Float[np.ndarray, "N n"], end: Float[np.ndarray, "N n"]
+) -> Int[np.ndarray, " N"]:
+    breaks = np.any(start[1:] != end[:-1], axis=1)
+    return np.concatenate([np.zeros(min(len(start), 1), int), np.cumsum(breaks)])
+
+
+@eqx.filter_jit
+def _one_step(belief: Sim2GPBelief, data: Transitions) -> tuple[Array, Array]:
+    """Residuals ``f - s'`` and their Jacobian, per prior standard deviation."""
+    system, prior, d = belief.system, belief.prior, belief.noise.size
+
+    def residual(z: Array) -> tuple[Array]:
+        tt = belief.posterior.mean + prior.scale @ z
+        f = jax.vmap(lambda s, a, c: system.transition(tt, s, a, belief.dt, c))
+        found = f(data.state, data.action, data.configuration)
+        return ((found - data.next_state)[:, :d],)
+
+    J, (r,) = jacobian_by_columns(residual, jnp.zeros_like(prior.mean))
+    return r, J

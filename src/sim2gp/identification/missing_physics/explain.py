@@ -1,0 +1,62 @@
+"""Three answers told apart: nothing is missing, this effect is, or none of these.
+
+An effect is missing when its evidence makes "nothing" improbable (`missing.search`);
+whether the library holds the truth is asked of what the best fit leaves over
+(`misfit`). Evidence alone would always name somebody: the least bad candidate of a
+library that does not hold the truth gains as much as a true one.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from sim2gp.identification.misfit.tests import Misfit
+from sim2gp.identification.missing_physics.data import AbstractData
+from sim2gp.identification.missing_physics.search import REFITS, Search, search
+from sim2gp.systems.effects.library import Candidate
+
+Answer = Literal["nothing missing", "missing", "none of these"]
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """A search for missing physics and its answer.
+
+    ``misfit`` is that of the ``bare`` machine and of the ``best`` fit (the bare one
+    where no effect gains enough); None where the data have no such test.
+    """
+
+    search: Search
+    bare: Misfit | None
+    best: Misfit | None
+
+    @property
+    def answer(self) -> Answer:
+        """What to do about the simulator."""
+        if self.best is not None and self.best.alarm:
+            return "none of these"
+        return "nothing missing" if self.search.best is None else "missing"
+
+    @property
+    def effect(self) -> str | None:
+        """The missing effect, if the answer names one."""
+        best = self.search.best
+        named = self.answer == "missing" and best is not None
+        return best.scored.candidate.name if named and best is not None else None
+
+
+def explain(
+    data: AbstractData,
+    candidates: Sequence[Candidate] | None = None,
+    *,
+    refits: int = REFITS,
+    on_step: Callable[[str], None] = lambda _: None,
+) -> Explanation:
+    """Search the library of the data's machine, and test what is left over.
+
+    ``candidates`` take the library's place. Raises what the bare machine's fit raises.
+    """
+    found = search(data, candidates, refits=refits, on_step=on_step)
+    bare = data.misfit(found.bare)
+    best = bare if found.best is None else data.misfit(found.best.fitted)
+    return Explanation(found, bare, best)

@@ -1,0 +1,281 @@
+"""Score tests: what would each effect of a library be worth, by one linearisation?
+
+With the bare machine at its MAP, each candidate's magnitude ``x`` is one more unknown.
+Linearised there (at ``x = 0``, or at a few magnitudes where nothing is not smooth), the
+likelihood of constants, nuisances and ``x`` is linear least squares, whose evidence, EM
+for the noise included, costs a QR of small factors: at fixed noise its gain is that of
+the efficient score test with the prior,
+
+    log B = 1/2 c_x^2 - log R_xx,      [R c] the factor of data and prior, x last,
+
+half the squared score over its information, what the other constants can explain
+projected out, minus Occam's price of one more constant.
+
+Errors of real logs are not independent from sample to sample. With several clusters of
+windows the data's part of a gain is divided by the inflation of the magnitude's
+variance (a sandwich over clusters): the likelihood is tempered to what rows are worth.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from sim2gp.identification.missing_physics.data import AbstractData, Fitted, scores_of
+from sim2gp.inference.arrowhead import Blocks, Noise, eliminate
+from sim2gp.inference.expectation_maximisation import expectation
+from sim2gp.inference.levenberg_marquardt import AbstractLikelihood, Fit, multi_start
+from sim2gp.inference.linalg import triangular
+from sim2gp.systems.base import AbstractSystem
+from sim2gp.systems.effects.base import AbstractEffect
+from sim2gp.systems.effects.library import Candidate, with_effects
+from sim2gp.types import Scalar, in_float64
+
+ROUNDS = 5  # EM for the noise, of a linearised fit
+ALIAS = 1e-5  # sine of the angle to the others' span below which nothing can tell
+SHARED = 0.3  # of a column: a constant that explains so much of it is named
+FARTHEST = 3.0  # prior sd, of a refit's start
+
+
+@dataclass(frozen=True)
+class Scored:
+    """A candidate beside the bare machine, by one linearisation.
+
+    ``gain`` is the evidence that it is worth, nats; ``sine`` the part of its effect
+    that no constant of the machine can mimic, ``partners`` those that mimic the rest.
+    ``starts`` are where a fit of ``system`` should start, whitened by its prior, the
+    best first.
+    """
+
+    candidate: Candidate
+    system: AbstractSystem
+    gain: float
+    sine: float
+    partners: tuple[str, ...]
+    starts: Float[np.ndarray, "S p"]
+
+    @property
+    def alias(self) -> bool:
+        """Whether the effect is one of the machine's own constants in disguise."""
+        return self.sine < ALIAS
+
+
+@in_float64
+def score(
+    data: AbstractData, bare: Fitted, candidates: Sequence[Candidate]
+) -> list[Scored]:
+    """Every candidate by its linearisation at the bare machine's MAP."""
+    names, n = bare.system.parameters.names, bare.nuisances.shape[1]
+    effects = [c.effect for c in candidates if c.smooth]
+    smooth = [e for e in effects if isinstance(e, AbstractEffect)]
+    # One machine with all of these: one compilation, one simulation.
+    whole = with_effects(bare.system, smooth)
+    z = _extended(bare, whole, {e.name: 0.0 for e in smooth})
+    every = np.asarray(data.blocks(whole, z[None], bare.nuisances)[0])
+    plain = _columns(every, whole, [*names, None], n)
+    without = _linear(data, bare, plain, np.append(np.asarray(bare.whitened()), 0.0))
+    out = []
+    for candidate in candidates:
+        system = candidate.freed(bare.system, period=data.period)
+        order = [*names, candidate.name]
+        z = np.stack(
+            [_extended(bare, system, {candidate.name: x}) for x in candidate.grid]
+        )
+        if candidate.smooth:
+            found = _columns(every, whole, order, n)[None]
+        else:
+            each = np.asarray(data.blocks(system, z, bare.nuisances))
+            found = np.stack([_columns(b, system, order, n) for b in each])
+        own = [system.parameters.names.index(name) for name in order]
+        fits = [
+            _linear(data, bare, b, x) for b, x in zip(found, z[:, own], strict=True)
+        ]
+        gains = [
+            tempered(f.evidence - without.evidence, f.inflation, f.sd) for f in fits
+        ]
+        ranked = np.argsort(-np.asarray(gains), kind="stable")
+        steps = np.stack([fit.z for fit in fits])[ranked]
+        steps[:, -1] = np.clip(steps[:, -1], -FARTHEST, FARTHEST)
+        # Where the linearisation is poor, its points are better starts than its MAPs.
+        starts = np.zeros((2 * len(z), len(own)))
+        starts[:, own] = np.concatenate([steps, z[ranked][:, own]])
+        best = int(ranked[0])
+        sine, partners = _alias(found[best], bare)
+        near = tuple(names[j] for j in partners)
+        out.append(Scored(candidate, system, gains[best], sine, near, starts))
+    return out
+
+
+@dataclass(frozen=True)
+class _Linearised:
+    """Log evidence, MAP, and the last unknown's sd and inflation."""
+
+    evidence: float
+    z: Float[np.ndarray, " p"]
+    sd: float
+    inflation: float
+
+
+def _linear(
+    data: AbstractData, bare: Fitted, blocks: np.ndarray, z: np.ndarray
+) -> _Linearised:
+    """The fit of a likelihood that is linear around ``z``."""
+    rows = bare.system.parameters.known(bare.prior, bare.whitened())
+    rows = jnp.insert(rows, -1, 0.0, axis=1)  # no sum has the candidate in it
+    fit, noise, value = _linear_fit(
+        _Linear(jnp.asarray(blocks), jnp.asarray(z), bare.nuisances, rows),
+        bare.noise,
+        jnp.asarray(data.count),
+        jnp.asarray(data.floor),
+        jnp.asarray(data.freedom),
+    )
+    root = np.asarray(fit.scale())
+    row = root @ root[-1]
+    inflation = inflation_of(scores_of(fit, noise), data.cluster, row, -1)
+    return _Linearised(float(value), np.array(fit.z), math.sqrt(row[-1]), inflation)
+
+
+class _Linear(AbstractLikelihood):
+    """A likelihood that is its own linearisation at ``(z0, e0)``."""
+
+    base: Blocks
+    z0: Float[Array, " p"]
+    e0: Float[Array, "W n"]
+    rows: Float[Array, "q p1"]  # of what was weighed
+
+    def known(self, z: Float[Array, " p"]) -> Float[Array, "q p1"]:
+        return self.rows.at[:, -1].add(self.rows[:, :-1] @ (z - self.z0))
+
+    def blocks(self, z: Float[Array, " p"], e: Float[Array, "W n"]) -> Blocks:
+        away = jnp.broadcast_to(z - self.z0, (len(e), z.size))
+        step = jnp.concatenate([e - self.e0, away], axis=1)
+        moved = jnp.einsum("wckj,wj->wck", self.base[..., :-1], step)
+        return self.base.at[..., -1].add(moved)
+
+    def curvature(
+        self, z: Float[Array, " p"], gradient: Float[Array, " p"]
+    ) -> Float[Array, "p p"]:
+        return jnp.zeros((z.size, z.size))
+
+
+@eqx.filter_jit
+def _linear_fit(
+    likelihood: _Linear,
+    noise: Noise,
+    count: Float[Array, "W c"],
+    floor: Float[Array, " c"],
+    freedom: Scalar,
+) -> tuple[Fit, Noise, Scalar]:
+    fit, noise, _ = multi_start(
+        likelihood,
+        likelihood.z0[None],
+        likelihood.e0,
+        noise,
+        expectation(count, floor, freedom),
+        rounds=ROUNDS,
+    )
+    return fit, noise, fit.log_evidence(noise, count)
+
+
+def _alias(blocks: np.ndarray, bare: Fitted) -> tuple[float, list[int]]:
+    """Sine between the last column and the others' span, and who lies closest."""
+    noise, e = bare.noise, bare.nuisances
+    R = np.asarray(eliminate(jnp.asarray(blocks), e, noise).data)[:, :-1]
+    left, share = sine_to(R[:, :-1], R[:, -1])
+    order = np.argsort(-np.abs(share))
+    return left, [int(j) for j in order[:3] if abs(share[j]) > SHARED]
+
+
+def sine_to(
+    others: Float[np.ndarray, "k p"], column: Float[np.ndarray, " k"]
+) -> tuple[float, Float[np.ndarray, " p"]]:
+    """Sine of a column's angle to the others' span, and their shares of it.
+
+    All at unit length; zeros for a column that is nothing.
+    """
+    length = np.linalg.norm(column)
+    if length == 0.0:
+        return 0.0, np.zeros(others.shape[1])
+    size = np.maximum(np.linalg.norm(others, axis=0), 1e-300)
+    share, *_ = np.linalg.lstsq(others / size, column / length, rcond=1e-10)
+    return float(np.linalg.norm(column / length - others / size @ share)), share
+
+
+def inflation_of(
+    scores: Float[np.ndarray, "W p"],
+    cluster: Int[np.ndarray, " W"],
+    row: Float[np.ndarray, " p"],
+    j: int,
+) -> float:
+    """Variance of unknown ``j`` with errors correlated in clusters, over the model's.
+
+    The sandwich ``H^-1 G H^-1`` with ``G`` the outer products of the clusters' scores
+    and ``row`` that of ``H^-1``; 1 for one cluster (its rows are independent), and
+    never less than 1.
+    """
+    clusters = np.unique(cluster)
+    if len(clusters) < 2:
+        return 1.0
+    each = np.stack([scores[cluster == k].sum(axis=0) for k in clusters])
+    each = each - each.mean(axis=0)
+    lost = len(clusters) / (len(clusters) - 1.0)  # to their own mean
+    return max(1.0, lost * float(np.sum((each @ row) ** 2) / row[j]))
+
+
+def tempered(gain: float, inflation: float, sd: float) -> float:
+    """The gain in evidence when the data count for less by ``inflation`` (k).
+
+    With the magnitude's ``sd`` in prior sd, the data's information is
+    ``I = 1 / sd^2 - 1``, Occam's price ``1/2 log(1 + I)``, and the rest of a gain
+    ``1/2 m^2 I^2 / (1 + I)``; ``I / k`` takes the place of ``I`` in both. A gain that
+    is not a number is none at all.
+    """
+    if not math.isfinite(gain):
+        return -math.inf
+    information = max(1.0 / sd**2 - 1.0, 0.0)
+    less = information / inflation
+    fit = gain + 0.5 * math.log1p(information)
+    share = (1.0 + information) / (inflation**2 * (1.0 + less))
+    return fit * share - 0.5 * math.log1p(less)
+
+
+def widened(inflation: float, sd: float) -> float:
+    """How many times ``sd`` (in prior sd) the magnitude is uncertain by then."""
+    information = max(1.0 / sd**2 - 1.0, 0.0)
+    return math.sqrt((1.0 + information) / (1.0 + information / inflation))
+
+
+def _extended(
+    bare: Fitted, system: AbstractSystem, added: dict[str, float]
+) -> Float[np.ndarray, " p"]:
+    """The bare MAP and physical values of what is added, whitened by the prior."""
+    own = np.asarray(bare.whitened()).tolist()
+    known = dict(zip(bare.system.parameters.names, own, strict=True))
+    table = system.parameters
+    for name, x in added.items():
+        known[name] = (table[name].unconstrain(x) - table[name].mean) / table[name].sd
+    return np.asarray([known[name] for name in table.names])
+
+
+def _columns(
+    blocks: np.ndarray, system: AbstractSystem, names: Sequence[str | None], n: int
+) -> np.ndarray:
+    """The factors of some constants' columns, in this order; None is an empty one.
+
+    The ``n`` nuisances stay before them, the residuals behind.
+    """
+    known = system.parameters.names
+    parts = [blocks[..., :n]]
+    for name in names:
+        at = None if name is None else n + known.index(name)
+        parts.append(np.zeros_like(blocks[..., :1]) if at is None else
+                     blocks[..., at : at + 1])  # fmt: skip
+    kept = np.concatenate([*parts, blocks[..., -1:]], axis=-1)
+    flat = jnp.asarray(kept.reshape(-1, *kept.shape[-2:]))
+    k = kept.shape[-1]
+    return np.asarray(jax.vmap(triangular)(flat)[:, :k]).reshape(*kept.shape[:-2], k, k)

@@ -1,0 +1,132 @@
+"""What physics is missing: every effect of a library scored, the best few fitted.
+
+The score tests (`score`) rank by one linearisation; the best are fitted in earnest. An
+effect whose column lies in the span of the machine's own constants can never be told
+from them and is not ranked.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sim2gp.errors import NotConverged, NotFinite
+from sim2gp.identification.missing_physics.data import AbstractData, Fitted
+from sim2gp.identification.missing_physics.score import (
+    Scored,
+    inflation_of,
+    score,
+    tempered,
+    widened,
+)
+from sim2gp.systems.effects.library import Candidate, library
+from sim2gp.types import in_float64
+
+REFITS = 3
+ODDS = 19.0  # "nothing missing" must be as improbable as 1 in 20
+
+
+@dataclass(frozen=True)
+class Refitted:
+    """A candidate fitted in earnest; ``gain`` in nats, ``value`` and ``sd`` physical.
+
+    ``inflation`` is how much larger the variance of the magnitude is when errors may be
+    correlated within clusters of windows; the data's part of the gain is divided by it.
+    """
+
+    scored: Scored
+    fitted: Fitted
+    gain: float
+    value: float
+    sd: float
+    inflation: float
+
+    @property
+    def physical(self) -> bool:
+        """Whether the sign is one that the effect can have."""
+        return self.scored.candidate.sign * self.value >= 0.0
+
+
+@dataclass(frozen=True)
+class Search:
+    """Everything that was tried; refits by falling gain."""
+
+    bare: Fitted
+    scored: tuple[Scored, ...]
+    refitted: tuple[Refitted, ...]
+    failed: tuple[str, ...] = field(default=())
+
+    @property
+    def threshold(self) -> float:
+        """Gain from which "nothing" is improbable; the library shares half the odds."""
+        ranked = sum(not s.alias for s in self.scored)
+        return math.log(ODDS * max(ranked, 1))
+
+    @property
+    def best(self) -> Refitted | None:
+        """The best candidate that gains enough and has a possible sign."""
+        for refit in self.refitted:
+            if refit.gain > self.threshold and refit.physical:
+                return refit
+        return None
+
+    @property
+    def tied(self) -> tuple[Refitted, ...]:
+        """Candidates that the evidence does not put behind the best (20 to 1)."""
+        best = self.best
+        if best is None:
+            return ()
+        near = best.gain - math.log(ODDS)
+        return tuple(
+            r for r in self.refitted if r is not best and r.physical and r.gain > near
+        )
+
+
+@in_float64
+def search(
+    data: AbstractData,
+    candidates: Sequence[Candidate] | None = None,
+    *,
+    refits: int = REFITS,
+    on_step: Callable[[str], None] = lambda _: None,
+) -> Search:
+    """Fit the bare machine, score every candidate, fit the best few.
+
+    Raises what the fit of the bare machine raises; a candidate's failure is kept in
+    ``failed``.
+    """
+    if candidates is None:
+        candidates = library(data.system, windows=not data.period)
+    bare = data.fit()
+    on_step("the machine as it is")
+    scored = score(data, bare, candidates)
+    ranked = sorted((s for s in scored if not s.alias), key=lambda s: -s.gain)
+    on_step(f"{len(scored)} effects scored")
+    found, failed = [], []
+    for one in ranked[:refits]:
+        try:
+            found.append(_refit(data, bare, one))
+            on_step(f"fitted with {one.candidate.name}")
+        except (NotConverged, NotFinite):
+            failed.append(one.candidate.name)
+            on_step(f"no fit with {one.candidate.name}")
+    found.sort(key=lambda refit: -refit.gain)
+    return Search(bare, tuple(scored), tuple(found), tuple(failed))
+
+
+def _refit(data: AbstractData, bare: Fitted, scored: Scored) -> Refitted:
+    fitted = data.refit(scored.system, scored.starts, bare)
+    table, name = scored.system.parameters, scored.candidate.name
+    j = table.names.index(name)
+    mean, sd = fitted.posterior.mean, float(fitted.posterior.sd()[j])
+    middle = table[name].constrain(float(mean[j]))
+    ends = [table[name].constrain(float(mean[j]) + k * sd) for k in (-1.0, 1.0)]
+    white = np.linalg.solve(fitted.prior.scale, fitted.posterior.scale)
+    assert fitted.scores is not None
+    inflation = inflation_of(fitted.scores, data.cluster, white @ white[j], j)
+    raw = fitted.log_evidence - bare.log_evidence
+    relative = sd / table[name].sd
+    gain = tempered(raw, inflation, relative)
+    half = 0.5 * (ends[1] - ends[0]) * widened(inflation, relative)
+    return Refitted(scored, fitted, gain, middle, half, inflation)

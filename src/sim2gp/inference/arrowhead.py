@@ -1,0 +1,70 @@
+"""Least squares with nuisance unknowns, which are eliminated window by window.
+
+Windows ``w`` of data share the whitened unknowns ``z`` (p); each has its own ``e_w``
+(n, possibly none) with a standard normal prior; each channel has its noise. All that is
+needed of the data at a point are the triangular factors of every window's and channel's
+``[J_e J_z r]`` (`Blocks`): noise and weights only scale them. The nuisances are the
+arrows of the arrowhead,
+
+    [ J_e  J_z  r ]       [ R11  R12  c1 ]
+    [ I    0    e ]  = Q  [ 0    R22  c2 ]
+
+and the ``[R22 c2]`` of all windows stack into the factor of ``z`` alone: exactly the
+Schur complement, without forming it.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sim2gp.inference.least_squares import Factor
+from sim2gp.inference.linalg import solve_triangular, triangular
+from sim2gp.types import Scalar
+
+#: Triangular factors of ``[J_e J_z r]`` per window and channel; k = n + p + 1.
+Blocks = Float[Array, "W c k k"]
+
+
+class Noise(eqx.Module):
+    """What a descent holds fixed: each channel's sd, and each window's weight."""
+
+    sd: Float[Array, " c"]
+    weights: Float[Array, " W"]
+
+    def scale(self, blocks: Blocks) -> Blocks:
+        """The blocks of whitened residuals."""
+        return (
+            blocks
+            * jnp.sqrt(self.weights)[:, None, None, None]
+            / self.sd[None, :, None, None]
+        )
+
+
+class Elimination(eqx.Module):
+    """What remains without the nuisances; ``slope`` is ``R11^-1 [R12 c1]``."""
+
+    data: Factor
+    R11: Float[Array, "W n n"]
+    slope: Float[Array, "W n p1"]
+
+
+def eliminate(
+    blocks: Blocks,
+    e: Float[Array, "W n"],
+    noise: Noise,
+    damping: float | Scalar = 0.0,
+) -> Elimination:
+    """The QR of the module's equation in every window; all ``R22`` stacked."""
+    (W, n), k = e.shape, blocks.shape[-1]
+
+    def one(block: Array, e: Array) -> Array:
+        identity = jnp.eye(n, k, dtype=block.dtype)
+        prior = identity.at[:, -1].set(e)
+        damped = jnp.sqrt(damping) * identity
+        return triangular(jnp.concatenate([block.reshape(-1, k), prior, damped]))
+
+    R = jax.vmap(one)(noise.scale(blocks), e)
+    R11 = R[:, :n, :n]
+    data = triangular(R[:, n:, n:].reshape(W * (k - n), k - n))
+    return Elimination(data, R11, jax.vmap(solve_triangular)(R11, R[:, :n, n:]))

@@ -1,0 +1,383 @@
+"""Physical constants as random variables: prior, bounds, unit and meaning on one line.
+
+Every Gaussian lives on an unconstrained *virtual* value ``tt`` (the paper's theta
+tilde), mapped one by one onto the physical constant ``theta``
+(`sim2gp.inference.bijections`).
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from statistics import NormalDist
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sim2gp import checks
+from sim2gp.errors import InputError, nearest
+from sim2gp.inference import bijections
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.linear_measurements import Weighed, residuals
+from sim2gp.inference.variants import Configuration, Which, valued
+from sim2gp.types import Scalar
+
+#: Standard deviation of a boxed parameter's virtual value: the box is nearly uniform
+#: and the sigmoid stays out of saturation.
+BOX_SD = 1.5
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One constant: its name, unit, meaning, map, bounds, and virtual prior.
+
+    ``mean`` and ``sd`` describe the virtual value; ``nominal`` is the published
+    physical value, where there is one.
+
+    Raises `InputError` E141 for an unknown map and for bounds that the map cannot have,
+    E144 for a prior's mean or sd that cannot be, E148 for a nominal value that is not
+    finite.
+    """
+
+    name: str
+    unit: str
+    meaning: str
+    map: str = "box"
+    low: float = -math.inf
+    high: float = math.inf
+    mean: float = 0.0
+    sd: float = BOX_SD
+    nominal: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.map not in bijections.MAPS:
+            raise InputError(
+                "E141",
+                f"unknown map of parameter {self.name}",
+                got=self.map,
+                expected=f"one of {', '.join(bijections.MAPS)}",
+            )
+        boxed = self.map in ("box", "log_box")
+        where = self.name or "a parameter"
+        checks.bounds(where, self.low, self.high, unbounded=not boxed)
+        if self.map == "softplus" and not math.isfinite(self.low):
+            expected = "a finite bound to be above"
+            got = f"{self.low:g}"
+            raise InputError(
+                "E141", f"lower bound of {where}", got=got, expected=expected
+            )
+        if self.map == "log_box" and self.low <= 0.0:
+            raise InputError(
+                "E141",
+                f"lower bound of {self.name}",
+                got=f"{self.low:g}",
+                expected="a positive bound for a logarithmic box",
+            )
+        checks.moments(f"the prior of {where}", self.mean, self.sd)
+        checks.finite(where, nominal=self.nominal)
+
+    def constrain(self, tt: float) -> float:
+        """Physical value of a virtual one (host-side scalar)."""
+        with jax.enable_x64(True):
+            return float(Parameters((self,)).constrain(jnp.asarray([tt], float))[0])
+
+    def unconstrain(self, theta: float) -> float:
+        """Virtual value of a physical one (host-side scalar)."""
+        with jax.enable_x64(True):
+            table = Parameters((self,))
+            return float(table.unconstrain(jnp.asarray([theta], float))[0])
+
+    def quantile(self, q: float) -> float:
+        """Physical prior quantile; the maps are monotone, so they commute with it."""
+        return self.constrain(self.mean + self.sd * NormalDist().inv_cdf(q))
+
+
+def bounded(
+    low: float, high: float, unit: str, meaning: str, *, nominal: float | None = None
+) -> Any:
+    """Field of a record: a constant in the box ``[low, high]``, nearly uniform."""
+    return _field(Parameter("", unit, meaning, "box", low, high, nominal=nominal))
+
+
+def log_bounded(
+    low: float, high: float, unit: str, meaning: str, *, nominal: float | None = None
+) -> Any:
+    """Field of a record: a constant whose logarithm is nearly uniform in a box."""
+    return _field(Parameter("", unit, meaning, "log_box", low, high, nominal=nominal))
+
+
+def positive(
+    mean: float, sd: float, unit: str, meaning: str, *, nominal: float | None = None
+) -> Any:
+    """Field of a record: a log-normal constant of the given physical mean and sd."""
+    blank = Parameter("", unit, meaning, "log", 0.0, nominal=nominal)
+    return _field(prior_from_moments(blank, mean, sd))
+
+
+def signed(
+    mean: float, sd: float, unit: str, meaning: str, *, nominal: float | None = None
+) -> Any:
+    """Field of a record: a Gaussian constant of any sign."""
+    return _field(
+        Parameter("", unit, meaning, "identity", mean=mean, sd=sd, nominal=nominal)
+    )
+
+
+def _field(parameter: Parameter) -> Any:
+    return eqx.field(metadata={"parameter": parameter})
+
+
+def prior_from_moments(
+    parameter: Parameter,
+    mean: float,
+    sd: float,
+    low: float | None = None,
+    high: float | None = None,
+) -> Parameter:
+    """The parameter with a prior of the given *physical* mean and sd.
+
+    With bounds, the virtual prior is matched in that box's map by quadrature; without,
+    it is log-normal where the constant is positive and Gaussian where it has a sign.
+    Raises `InputError` E142 where no such prior exists, E144 for a sd that is not
+    positive.
+    """
+    checks.moments(f"the prior of {parameter.name or 'a parameter'}", mean, sd)
+    if low is not None or high is not None:
+        low = parameter.low if low is None else low
+        high = parameter.high if high is None else high
+        logarithmic = parameter.map in ("log", "log_box") and low > 0.0
+        boxed = dataclasses.replace(
+            parameter, map="log_box" if logarithmic else "box", low=low, high=high
+        )
+        return _match_in_box(boxed, mean, sd)
+    if parameter.low >= 0.0:
+        if mean <= 0.0:
+            raise _impossible(parameter, mean, sd, "a positive mean")
+        variance = math.log1p((sd / mean) ** 2)
+        return dataclasses.replace(
+            parameter,
+            map="log",
+            low=0.0,
+            high=math.inf,
+            mean=math.log(mean) - 0.5 * variance,
+            sd=math.sqrt(variance),
+        )
+    return dataclasses.replace(
+        parameter, map="identity", low=-math.inf, high=math.inf, mean=mean, sd=sd
+    )
+
+
+def _match_in_box(boxed: Parameter, mean: float, sd: float) -> Parameter:
+    """Virtual mean and sd whose push-forward has the given physical moments."""
+    import scipy.optimize  # an eighth of the time that a command takes to start
+
+    low, high = boxed.low, boxed.high
+    # No distribution in a box has more spread than the two-point one at its ends.
+    if not low < mean < high or sd**2 >= (mean - low) * (high - mean):
+        raise _impossible(boxed, mean, sd, f"moments that fit into [{low:g}, {high:g}]")
+    z = np.linspace(-9.0, 9.0, 4001)
+    weight = np.exp(-0.5 * z**2)
+    weight /= weight.sum()
+    table = Parameters((boxed,))
+
+    @jax.jit
+    def physical(tt: Array) -> Array:
+        return jax.vmap(lambda t: table.constrain(t[None])[0])(tt)
+
+    def moments(guess: np.ndarray) -> np.ndarray:
+        theta = np.asarray(physical(jnp.asarray(guess[0] + math.exp(guess[1]) * z)))
+        m = weight @ theta
+        s = math.sqrt(weight @ (theta - m) ** 2)
+        return np.array([(m - mean) / sd, math.log(s / sd)])
+
+    with jax.enable_x64(True):
+        centre = boxed.unconstrain(mean)
+        step = 0.1 * min(mean - low, high - mean)
+        slope = boxed.unconstrain(mean + step) - boxed.unconstrain(mean - step)
+        start = [centre, math.log(sd * slope / (2.0 * step))]
+        fit = scipy.optimize.least_squares(moments, start, xtol=1e-14, ftol=1e-14)
+    if float(np.abs(fit.fun).max()) > 1e-6:
+        raise _impossible(boxed, mean, sd, "moments that this map can reach")
+    mean, sd = float(fit.x[0]), math.exp(fit.x[1])
+    return dataclasses.replace(boxed, mean=mean, sd=sd)
+
+
+def _impossible(p: Parameter, mean: float, sd: float, expected: str) -> InputError:
+    return InputError(
+        "E142",
+        f"prior of {p.name or 'a parameter'}",
+        got=f"mean = {mean:g}, sd = {sd:g}",
+        expected=expected,
+        fix="widen the bounds or lower the sd",
+    )
+
+
+class Parameters(eqx.Module):
+    """The table of a system's constants: those to be learned, and those held fixed.
+
+    Of a machine in several ``configurations``, the columns of all of them: ``mass`` for
+    those that share it, ``mass @ payload`` where a configuration has its own. Sums of
+    constants that were ``weighed`` are part of every fit. Raises `InputError` E148 for
+    a value held fixed that is not finite.
+    """
+
+    free: tuple[Parameter, ...] = eqx.field(static=True)
+    fixed: tuple[tuple[str, float], ...] = eqx.field(static=True, default=())
+    configurations: tuple[Configuration, ...] = eqx.field(static=True, default=())
+    weighed: tuple[Weighed, ...] = eqx.field(static=True, default=())
+
+    def __check_init__(self) -> None:
+        checks.finite("the constants held fixed", **dict(self.fixed))
+
+    def __len__(self) -> int:
+        return len(self.free)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the free constants, in the order of the virtual vector."""
+        return tuple(p.name for p in self.free)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Units of the free constants."""
+        return tuple(p.unit for p in self.free)
+
+    def __getitem__(self, name: str) -> Parameter:
+        return self.free[self.names.index(name)]
+
+    def constrain(self, tt: Float[Array, " p"]) -> Float[Array, " p"]:
+        """Physical values of virtual ones, always inside the bounds."""
+        out = []
+        for kind, index, low, high in self._groups(tt.dtype):
+            out.append(bijections.constrain(kind, tt[index], low, high))
+        return bijections.scatter(out, self._groups(tt.dtype), tt)
+
+    def unconstrain(self, theta: Float[Array, " p"]) -> Float[Array, " p"]:
+        """Virtual values of physical ones; a value on a bound maps just inside it."""
+        out = []
+        for kind, index, low, high in self._groups(theta.dtype):
+            out.append(bijections.unconstrain(kind, theta[index], low, high))
+        return bijections.scatter(out, self._groups(theta.dtype), theta)
+
+    def curvature(
+        self, prior: Gaussian, z: Float[Array, " p"], gradient: Float[Array, " p"]
+    ) -> Float[Array, "p p"]:
+        """What the bounded maps add to the Hessian of a function of ``theta``.
+
+        At ``tt = mu0 + L0 z``, with the function's ``gradient`` in ``z``. Each map
+        contributes ``dF/dtt map''/map'``: at a bound, as much as it takes to push the
+        constant there.
+        """
+
+        def slope(tt: Array) -> Array:
+            return jax.jvp(self.constrain, (tt,), (jnp.ones_like(tt),))[1]
+
+        tt = prior.mean + prior.scale @ z
+        first, second = jax.jvp(slope, (tt,), (jnp.ones_like(tt),))
+        bend = jnp.where(first > 0.0, second / first, 0.0)
+        by_tt = jnp.linalg.solve(prior.scale.T, gradient)
+        return prior.scale.T @ ((by_tt * bend)[:, None] * prior.scale)
+
+    def values(
+        self, tt: Float[Array, " p"], configuration: Which = None
+    ) -> dict[str, Scalar]:
+        """Every constant by name, in physical units: the free ones and the fixed.
+
+        ``configuration`` is an index; only a table that has several needs it (E152).
+        """
+        return valued(self._columns(tt), self.configurations, configuration)
+
+    def known(self, prior: Gaussian, z: Float[Array, " p"]) -> Float[Array, "q p1"]:
+        """Rows ``[K r]`` of what was weighed, in its sd, at ``tt = mu0 + L0 z``."""
+
+        def r(z: Array) -> Array:
+            values = self._columns(prior.mean + prior.scale @ z)
+            return residuals(self.weighed, values, z)
+
+        return jnp.concatenate([jax.jacfwd(r)(z), r(z)[:, None]], axis=1)
+
+    def _columns(self, tt: Float[Array, " p"]) -> dict[str, Scalar]:
+        """Every column, and every fixed value."""
+        theta = self.constrain(tt)
+        values = {name: jnp.asarray(v, tt.dtype) for name, v in self.fixed}
+        return values | {p.name: theta[i] for i, p in enumerate(self.free)}
+
+    def prior(self) -> Gaussian:
+        """The independent Gaussian over virtual values; call it under `in_float64`."""
+        mean = jnp.asarray([p.mean for p in self.free], float)
+        return Gaussian(mean, jnp.diag(jnp.asarray([p.sd for p in self.free], float)))
+
+    def nominal(self) -> dict[str, float]:
+        """Published values; the prior median where none was published."""
+        given = {p.name: p.nominal for p in self.free}
+        nominal = {
+            p.name: p.constrain(p.mean) if given[p.name] is None else given[p.name]
+            for p in self.free
+        }
+        return dict(self.fixed) | nominal  # type: ignore[return-value]
+
+    def replace(self, **changes: "Parameter | float") -> "Parameters":
+        """Give some constants another prior, or fix them at a number.
+
+        Raises `InputError` E145 for a name that the system does not have.
+        """
+        known = {p.name for p in self.free} | {name for name, _ in self.fixed}
+        for name in changes:
+            if name not in known:
+                raise unknown_parameter(name, known)
+        free, fixed = [], []
+        specs: Mapping[str, Parameter | float] = dict(self.fixed) | {
+            p.name: p for p in self.free
+        }
+        order = [*self.names, *(name for name, _ in self.fixed)]
+        for name in order:
+            value = changes.get(name, specs[name])
+            if isinstance(value, Parameter):
+                free.append(dataclasses.replace(value, name=name))
+            else:
+                fixed.append((name, float(value)))
+        return dataclasses.replace(self, free=tuple(free), fixed=tuple(fixed))
+
+    def merge(self, other: "Parameters") -> "Parameters":
+        """Both tables as one, this one's constants first."""
+        mine, more = (
+            (x.free, x.fixed, x.configurations, x.weighed) for x in (self, other)
+        )
+        return Parameters(*(a + b for a, b in zip(mine, more, strict=True)))  # type: ignore[arg-type]
+
+    def _groups(self, dtype: Any) -> list[tuple[str, np.ndarray, Any, Any]]:
+        """Free constants grouped by map, so that each map is one vector operation."""
+        groups = []
+        for kind in bijections.MAPS:
+            index = [i for i, p in enumerate(self.free) if p.map == kind]
+            if index:
+                low = np.asarray([self.free[i].low for i in index], dtype)
+                high = np.asarray([self.free[i].high for i in index], dtype)
+                groups.append((kind, np.asarray(index), low, high))
+        return groups
+
+
+def parameters_of(record: type) -> Parameters:
+    """The table declared by a record's fields."""
+    free = []
+    for field in dataclasses.fields(record):
+        if "parameter" in field.metadata:
+            parameter = field.metadata["parameter"]
+            free.append(dataclasses.replace(parameter, name=field.name))
+    return Parameters(tuple(free))
+
+
+def unknown_parameter(name: str, known: Any) -> InputError:
+    """E145, with the name that was probably meant."""
+    close = nearest(name, known)
+    return InputError(
+        "E145",
+        "unknown parameter",
+        got=name,
+        expected=f"one of {', '.join(sorted(known))}",
+        fix=f"did you mean {close}?" if close else "",
+    )

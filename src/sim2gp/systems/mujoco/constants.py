@@ -1,0 +1,306 @@
+"""Constants of a MuJoCo model by path: what can be learned, and how it is set.
+
+| path                      | unit         | what is set                              |
+|---------------------------|--------------|------------------------------------------|
+| `joint/NAME/damping`      | N m s/rad    | viscous friction (of a slide, N s/m)     |
+| `joint/NAME/armature`     | kg m^2, kg   | inertia of the rotor                     |
+| `joint/NAME/frictionloss` | N m, N       | dry friction                             |
+| `joint/NAME/stiffness`    | N m/rad, N/m | spring                                   |
+| `body/NAME/mass`          | kg           | mass, and the inertia in proportion      |
+| `body/NAME/com_x` (y, z)  | m            | centre of mass in the body's frame       |
+| `body/NAME/inertia`       | 1, m         | all of it: ten numbers, zero in the file |
+| `body/NAME/length`        | m            | distance from the parent's frame         |
+| `actuator/NAME/gain`      | its own      | force for an input of one, of a motor    |
+| `actuator/NAME/kp`, `kv`  | its own      | gains of a servo                         |
+| `actuator/NAME/gear`      | 1            | gear ratio                               |
+| `geom/NAME/friction`      | 1            | sliding friction of a contact            |
+| `option/gravity`          | m/s^2        | strength, in the model's direction       |
+
+`NAME` may be a pattern (`joint/*/damping`). The ten numbers of `body/NAME/inertia`,
+`body/NAME/inertia/alpha` and so on, are those of `sim2gp.systems.mujoco.inertia`.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import Any
+
+import numpy as np
+
+from sim2gp.errors import InputError, nearest
+from sim2gp.systems.mujoco.inertia import NAMES as INERTIA
+from sim2gp.systems.mujoco.inertia import BodyInertia, unframe
+
+#: Quantities that MuJoCo derives others from when it compiles a model.
+DERIVED = frozenset({"mass", "com_x", "com_y", "com_z", "length", "armature", "gear"})
+DERIVED |= frozenset(INERTIA)
+_HINGE = {
+    "damping": "N m s/rad",
+    "armature": "kg m^2",
+    "frictionloss": "N m",
+    "stiffness": "N m/rad",
+}
+_SLIDE = {
+    "damping": "N s/m",
+    "armature": "kg",
+    "frictionloss": "N",
+    "stiffness": "N/m",
+}
+_MEANING = {
+    "damping": "viscous friction of {}",
+    "armature": "rotor inertia of {}",
+    "frictionloss": "dry friction of {}",
+    "stiffness": "spring of {}",
+    "mass": "mass of {}, its inertia in proportion",
+    "com_x": "centre of mass of {}, x",
+    "com_y": "centre of mass of {}, y",
+    "com_z": "centre of mass of {}, z",
+    "length": "distance of {} from its parent",
+    "gain": "gain of {}",
+    "kp": "position gain of {}",
+    "kv": "velocity gain of {}",
+    "gear": "gear ratio of {}",
+    "friction": "sliding friction of {}",
+}
+#: Quantities that may be negative.
+SIGNED = frozenset({"com_x", "com_y", "com_z"})
+#: Other names of what the ten numbers of an inertia are.
+OF_INERTIA = SIGNED | {"mass"}
+#: Those that move a body's centre of mass, or turn its principal axes.
+CENTRED = SIGNED | frozenset(INERTIA)
+
+
+@dataclass(frozen=True)
+class Constant:
+    """One number of a model: its path, unit and meaning, how it is read and set."""
+
+    path: str
+    index: int  # of the object in the model
+    unit: str
+    meaning: str
+    get: Callable[[Any], float]
+    put: Callable[[Any, float], None]
+    block: BodyInertia | None = None  # sets several of them at once
+
+    @property
+    def kind(self) -> str:
+        return self.path.split("/", 1)[0]
+
+    @property
+    def quantity(self) -> str:
+        return self.path.rsplit("/", 1)[-1]
+
+
+def constants_of(model: Any) -> dict[str, Constant]:
+    """Every constant of a compiled model that can be learned, by path.
+
+    What is set in proportion is so to the numbers of this model, however often it is.
+    """
+    found = [
+        *_joints(model),
+        *_bodies(model),
+        *_actuators(model),
+        *_geoms(model),
+        *([_gravity(model)] if np.any(model.opt.gravity) else []),
+    ]
+    return {c.path: c for c in found}
+
+
+def matching(known: dict[str, Constant], pattern: str) -> list[Constant]:
+    """The constants that a path or pattern names; E170 where there is none."""
+    found = [
+        c
+        for path, c in known.items()
+        if fnmatchcase(path, pattern)
+        or (c.block is not None and fnmatchcase(path.rsplit("/", 1)[0], pattern))
+    ]
+    if not found:
+        close = nearest(pattern, known)
+        raise InputError(
+            "E170",
+            "unknown constant of the model",
+            got=pattern,
+            expected=_kinds(known),
+            fix=f"did you mean {close}?" if close else "",
+        )
+    return found
+
+
+def set_constants(model: Any, pairs: Iterable[tuple[Constant, float]]) -> None:
+    """Give constants values, as they stand; `mujoco.mj_setConst` derives the rest."""
+    blocks: dict[BodyInertia, dict[str, float]] = {}
+    for constant, value in pairs:
+        if constant.block is None:
+            constant.put(model, value)
+        else:
+            blocks.setdefault(constant.block, {})[constant.quantity] = value
+    for block, values in blocks.items():
+        block.put(model, values)
+
+
+def name_of(model: Any, kind: str, index: int) -> str:
+    """An object's name; `joint2` and so on where it has none."""
+    return str(getattr(model, kind)(index).name) or f"{kind}{index}"
+
+
+def _kinds(known: dict[str, Constant]) -> str:
+    kinds = sorted({f"{p.split('/')[0]}/.../{p.split('/')[-1]}" for p in known})
+    return ", ".join(kinds)
+
+
+def _constant(
+    model: Any, kind: str, i: int, quantity: str, unit: str, how: Any
+) -> Constant:
+    name = name_of(model, kind, i)
+    meaning = _MEANING[quantity].format(name)
+    return Constant(f"{kind}/{name}/{quantity}", i, unit, meaning, **how)
+
+
+def _cell(field: str, *index: int) -> dict[str, Callable[..., Any]]:
+    """Reading and setting of one number in an array of the model."""
+
+    def get(model: Any) -> float:
+        return float(getattr(model, field)[index])
+
+    def put(model: Any, value: float) -> None:
+        getattr(model, field)[index] = value
+
+    return {"get": get, "put": put}
+
+
+def _joints(model: Any) -> list[Constant]:
+    found = []
+    for j in range(model.njnt):
+        kind, dof = int(model.jnt_type[j]), int(model.jnt_dofadr[j])
+        if kind not in (2, 3):  # slide and hinge have one degree of freedom
+            continue
+        for quantity, unit in (_SLIDE, _HINGE)[kind - 2].items():
+            spring = quantity == "stiffness"
+            how = _cell("jnt_stiffness", j) if spring else _cell(f"dof_{quantity}", dof)
+            found.append(_constant(model, "joint", j, quantity, unit, how))
+    return found
+
+
+def _bodies(model: Any) -> list[Constant]:
+    found = []
+    for b in range(1, model.nbody):
+        if model.body_mass[b] > 0.0:
+            found.append(_constant(model, "body", b, "mass", "kg", _mass(model, b)))
+            for axis, quantity in enumerate(("com_x", "com_y", "com_z")):
+                how = _centre(b, axis)
+                found.append(_constant(model, "body", b, quantity, "m", how))
+            found += _inertia(model, b)
+        if np.any(model.body_pos[b]):
+            found.append(_constant(model, "body", b, "length", "m", _length(model, b)))
+    return found
+
+
+def _actuators(model: Any) -> list[Constant]:
+    found = []
+    for i in range(model.nu):
+        affine = model.actuator_biastype[i] != 0
+        how = [
+            (quantity, _servo(model, i, column))
+            for quantity, column in (("kp", 1), ("kv", 2))
+            if affine and model.actuator_biasprm[i, column] != 0.0
+        ]
+        how = how or [("gain", _cell("actuator_gainprm", i, 0))]
+        how.append(("gear", _cell("actuator_gear", i, 0)))
+        found += [_constant(model, "actuator", i, q, "1", access) for q, access in how]
+    return found
+
+
+def _geoms(model: Any) -> list[Constant]:
+    touching = np.flatnonzero(model.geom_contype | model.geom_conaffinity)
+    return [
+        _constant(model, "geom", g, "friction", "1", _cell("geom_friction", g, 0))
+        for g in touching.tolist()
+    ]
+
+
+def _gravity(model: Any) -> Constant:
+    pull = model.opt.gravity.copy()
+    strength = float(np.linalg.norm(pull))
+
+    def get(model: Any) -> float:
+        return float(np.linalg.norm(model.opt.gravity))
+
+    def put(model: Any, value: float) -> None:
+        model.opt.gravity[:] = pull * (value / strength)
+
+    return Constant("option/gravity", 0, "m/s^2", "gravity", get, put)
+
+
+def _mass(model: Any, b: int) -> dict[str, Callable[..., Any]]:
+    """A body of another density: its inertia is in proportion to its mass."""
+    mass, inertia = float(model.body_mass[b]), model.body_inertia[b].copy()
+
+    def get(model: Any) -> float:
+        return float(model.body_mass[b])
+
+    def put(model: Any, value: float) -> None:
+        model.body_mass[b] = value
+        model.body_inertia[b] = inertia * (value / mass)
+
+    return {"get": get, "put": put}
+
+
+def _centre(b: int, axis: int) -> dict[str, Callable[..., Any]]:
+    cell = _cell("body_ipos", b, axis)
+
+    def put(model: Any, value: float) -> None:
+        cell["put"](model, value)
+        unframe(model, b)
+
+    return {"get": cell["get"], "put": put}
+
+
+def _inertia(model: Any, b: int) -> list[Constant]:
+    """The ten numbers, of a body whose inertia is that of matter."""
+    block, name = BodyInertia(model, b), name_of(model, "body", b)
+    if np.linalg.eigvalsh(block.own)[0] <= 0.0:
+        return []
+    found = []
+    for place, quantity in enumerate(INERTIA):
+
+        def get(model: Any, place: int = place) -> float:
+            return float(block.get(model)[place])
+
+        def put(model: Any, value: float, place: int = place) -> None:
+            values = block.get(model)
+            values[place] = value
+            block.put(model, dict(zip(INERTIA, values.tolist(), strict=True)))
+
+        path, unit = f"body/{name}/inertia/{quantity}", "m" if place > 6 else "1"
+        meaning = f"inertia of {name}, {quantity}"
+        found.append(Constant(path, b, unit, meaning, get, put, block))
+    return found
+
+
+def _length(model: Any, b: int) -> dict[str, Callable[..., Any]]:
+    place = model.body_pos[b].copy()
+    length = float(np.linalg.norm(place))
+
+    def get(model: Any) -> float:
+        return float(np.linalg.norm(model.body_pos[b]))
+
+    def put(model: Any, value: float) -> None:
+        model.body_pos[b] = place * (value / length)
+
+    return {"get": get, "put": put}
+
+
+def _servo(model: Any, i: int, column: int) -> dict[str, Callable[..., Any]]:
+    """``force = gain u + bias . (1, length, velocity)``, a bias being ``-gain``."""
+    gain, bias = model.actuator_gainprm[i, 0], model.actuator_biasprm[i, column]
+    follows = bool(gain == -bias)
+
+    def get(model: Any) -> float:
+        return -float(model.actuator_biasprm[i, column])
+
+    def put(model: Any, value: float) -> None:
+        model.actuator_biasprm[i, column] = -value
+        if follows:
+            model.actuator_gainprm[i, 0] = value
+
+    return {"get": get, "put": put}

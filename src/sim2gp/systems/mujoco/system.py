@@ -1,0 +1,318 @@
+"""Any MuJoCo model as a system: C MuJoCo steps it, constants are found by path.
+
+The state is ``(qpos, qvel, act)`` of hinges and slides; a substep is MuJoCo's own, no
+longer than the model's time step. Derivatives are central differences
+(`sim2gp.systems.plants.external`): every feature of MuJoCo can be used, nothing is
+compiled. What MuJoCo derives from masses and lengths when it compiles a model is
+derived anew for every value that they take.
+"""
+
+import copy
+import dataclasses
+import math
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sim2gp.errors import InputError
+from sim2gp.inference.parameters import Parameter, Parameters
+from sim2gp.systems.actuators import LONGEST_MEAN
+from sim2gp.systems.base import AbstractPlant, Channel
+from sim2gp.systems.mujoco.constants import (
+    OF_INERTIA,
+    SIGNED,
+    Constant,
+    constants_of,
+    matching,
+    name_of,
+)
+from sim2gp.systems.mujoco.engine import Engine
+from sim2gp.systems.mujoco.load import compiled
+from sim2gp.systems.mujoco.mjx import MJXEngine, mjx_flow
+from sim2gp.systems.mujoco.model_file import ModelFile
+from sim2gp.systems.plants.external import flow
+from sim2gp.types import Action, Scalar, State
+
+#: Without a stated prior a constant is within this factor of the model's number.
+FACTOR = 3.0
+#: Sd of the ten numbers of an inertia; of its shifts, in radii of gyration.
+SHARE = 0.2
+
+
+class MuJoCo(AbstractPlant):
+    """A MuJoCo model whose constants are named by path
+    (`sim2gp.systems.mujoco.constants`).
+
+    Its joints are the states, ``<joint>`` and ``<joint>.velocity``, then activations of
+    actuators; its actuators are the inputs. ``constants`` are paths or patterns; where
+    it is None, dampings, armatures, dry frictions, masses and gains of servos that are
+    not zero in the model. Those in one inner sequence are tied: one number, under the
+    first one's name. Priors are within a factor of 3 of the model's number; ``priors``
+    replaces them by name, or fixes the constant. ``root`` is the folder that the
+    model's files must lie in, its own if None; ``source`` the file that a compiled
+    model was made of.
+
+    Raises `InputError` E130, E170 and E171 for a file that is no model, E170 for what
+    the model does not have, E142 for a constant that is zero in the model and has no
+    prior, E172 for joints with quaternions.
+    """
+
+    engine: Engine = eqx.field(static=True)
+    mjx: MJXEngine | None = eqx.field(static=True)
+    parameters: Parameters = eqx.field(static=True)
+    channels: tuple[Channel, ...] = eqx.field(static=True)
+    inputs: tuple[Channel, ...] = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)
+    source: Path | None = eqx.field(static=True)
+
+    def __init__(
+        self,
+        model: Any,
+        constants: Sequence[str | Sequence[str]] | None = None,
+        priors: Mapping[str, Parameter | float] | None = None,
+        *,
+        root: Path | None = None,
+        source: Path | None = None,
+        engine: Literal["c", "mjx"] = "c",
+    ) -> None:
+        named = isinstance(model, str | os.PathLike)
+        self.source = Path(model) if named else source
+        model = loaded(model, root)
+        known = constants_of(model)
+        groups = _groups(model, known, constants)
+        priors = dict(priors or {})
+        table = Parameters(tuple(_prior(g[0], model, priors) for g in groups))
+        self.parameters = table.replace(**_described(table, priors))
+        self.names = tuple(group[0].path for group in groups)
+        self.channels = _states(model)
+        self.inputs = _inputs(model)
+        self.engine = Engine(model, groups, self.parameters)
+        self.mjx = MJXEngine(model, groups) if engine == "mjx" else None
+
+    def check_functions(self) -> None:
+        """The engine is no function of the user's."""
+
+    @property
+    def states(self) -> tuple[Channel, ...]:
+        return self.channels
+
+    @property
+    def actions(self) -> tuple[Channel, ...]:
+        return self.inputs
+
+    def by_path(self, values: Mapping[str, float]) -> dict[str, float]:
+        """Values by name as those of every constant: what is tied has the same."""
+        groups = zip(self.names, self.engine.constants, strict=True)
+        known = ((values[n], group) for n, group in groups if n in values)
+        return {c.path: float(value) for value, group in known for c in group}
+
+    def file(self, *, mjcf: bool = False) -> ModelFile:
+        """The model's file, to be written with other constants (``mjcf``: as MJCF).
+
+        Raises `InputError` E170 where there is no file.
+        """
+        if self.source is None:
+            fix = "give the path of its file instead of a compiled model"
+            raise InputError("E170", "a model without a file", fix=fix)
+        return ModelFile(self.source, self.engine.model, mjcf=mjcf)
+
+    @property
+    def max_substep(self) -> float:
+        return math.inf  # the engine divides by its own time step
+
+    @property
+    def window_substep(self) -> float:
+        # A delayed input is averaged over no more; but a coarser model is stepped as
+        # it is: half of its step is another simulator.
+        return max(LONGEST_MEAN, float(self.engine.model.opt.timestep))
+
+    def record(self, values: Mapping[str, Scalar]) -> Float[Array, " p"]:
+        """Values in the order of the engine's constants."""
+        return jnp.stack([jnp.asarray(values[name]) for name in self.names])
+
+    def flow(
+        self, params: Float[Array, " p"], s: State, a: Action, h: float | Scalar
+    ) -> State:
+        theta = params.astype(s.dtype)
+        span = jnp.asarray(h, s.dtype)
+        if self.mjx is not None:
+            return mjx_flow(self.mjx, theta, s, a.astype(s.dtype), span)
+        return flow(self.engine, theta, s, a.astype(s.dtype), span)
+
+
+def loaded(model: Any, root: Path | None = None) -> Any:
+    """A compiled model, of a file or of one that is compiled already.
+
+    Raises `InputError` as `compiled` does, E170 where a number is not finite, E172
+    where a joint has a quaternion, or an actuator or a sensor a delay of its own.
+    """
+    is_file = isinstance(model, str | os.PathLike)
+    found = compiled(Path(model), root) if is_file else copy.copy(model)
+    _check_finite(found)
+    _check_delays(found)
+    for j in range(found.njnt):
+        if found.jnt_type[j] not in (2, 3):
+            raise InputError(
+                "E172",
+                "joint with a quaternion",
+                got=name_of(found, "joint", j),
+                expected="hinges and slides",
+                fix="fix the base, or replace a free joint by slides and hinges",
+            )
+    return found
+
+
+def _check_finite(model: Any) -> None:
+    """A file's own numbers are: this is for products of them, and models from code."""
+    arrays = ((n, getattr(model, n, None)) for n in dir(model) if n[0] != "_")
+    for name, value in arrays:
+        if isinstance(value, np.ndarray) and value.dtype.kind == "f":
+            wrong = value[~np.isfinite(value)]
+            if wrong.size:
+                raise InputError(
+                    "E170",
+                    "a number of the compiled model is not finite",
+                    got=f"{wrong[0]} in {name}",
+                    expected="finite numbers",
+                    fix="see what in the model is too large",
+                )
+
+
+def _check_delays(model: Any) -> None:
+    """Past inputs and readings would be part of the state (MuJoCo 3.5 or newer)."""
+    for kind, fix in (
+        ("actuator", "delete the two; in a project [actuators.NAME] has a delay"),
+        ("sensor", "delete the two; a sensor's delay moves nothing"),
+    ):
+        samples = getattr(model, f"{kind}_history", None)
+        for i in np.flatnonzero(() if samples is None else np.any(samples, axis=-1)):
+            name = name_of(model, kind, int(i))
+            raise InputError(
+                "E172",
+                f"{kind} with a delay of its own",
+                got=f"delay or nsample of {name}",
+                expected="a state of joints and activations",
+                fix=fix.replace("NAME", f'"{name}"'),
+            )
+
+
+def _groups(
+    model: Any,
+    known: dict[str, Constant],
+    constants: Sequence[str | Sequence[str]] | None,
+) -> list[list[Constant]]:
+    """The open constants; each inner list is one number."""
+    if constants is None:
+        # No motor's gain: where it is free, so is the scale of all masses and forces.
+        usual = ("damping", "armature", "frictionloss", "mass", "kp", "kv")
+        found = [c for c in known.values() if c.quantity in usual]
+        return [[c] for c in found if c.get(model) != 0.0]
+    groups: list[list[Constant]] = []
+    for entry in constants:
+        if isinstance(entry, str):
+            groups += [[c] for c in matching(known, entry)]
+        else:
+            groups.append([c for path in entry for c in matching(known, path)])
+    paths = [c.path for group in groups for c in group]
+    for path in paths:
+        if paths.count(path) > 1:
+            fix = "let one path or pattern name it"
+            raise InputError("E145", "a constant named twice", got=path, fix=fix)
+    own = {c.index for group in groups for c in group if c.block is not None}
+    for c in (c for group in groups for c in group):
+        if c.index in own and c.quantity in OF_INERTIA:
+            fix = "open one of the two"
+            got = f"{c.path}, and the body's inertia"
+            raise InputError("E145", "a constant named twice", got=got, fix=fix)
+    return groups
+
+
+def default_prior(constant: Constant, model: Any) -> Parameter | None:
+    """Within a factor of the model's own number; None where that is not positive.
+
+    Of the ten numbers of an inertia, Gaussian about the model's own body.
+    """
+    value = constant.get(model)
+    if constant.block is not None:
+        size = constant.block.radius if constant.unit == "m" else 1.0
+        sd = SHARE * size
+        about = constant.path, constant.unit, constant.meaning
+        return Parameter(*about, "identity", mean=0.0, sd=sd, nominal=0.0)
+    if value <= 0.0 or constant.quantity in SIGNED:
+        return None
+    about = constant.path, constant.unit, constant.meaning
+    return Parameter(*about, "log_box", value / FACTOR, value * FACTOR, nominal=value)
+
+
+def _prior(
+    constant: Constant, model: Any, given: Mapping[str, Parameter | float]
+) -> Parameter:
+    """The default, or room for the one that is given."""
+    default = default_prior(constant, model)
+    if default is not None:
+        return default
+    if constant.path in given:
+        return Parameter(constant.path, constant.unit, constant.meaning, "identity")
+    raise InputError(
+        "E142",
+        f"no prior for {constant.path}",
+        got=f"{constant.get(model):g} in the model",
+        expected="a positive number to start from",
+        fix="give its prior: mean and sd, or low and high",
+    )
+
+
+def _described(
+    table: Parameters, priors: Mapping[str, Parameter | float]
+) -> dict[str, Parameter | float]:
+    """The priors; one that names no unit has the constant's, and its meaning."""
+    known = {p.name: p for p in table.free}
+    return {
+        name: dataclasses.replace(p, unit=known[name].unit, meaning=known[name].meaning)
+        if isinstance(p, Parameter) and not p.unit and name in known
+        else p
+        for name, p in priors.items()
+    }
+
+
+def _states(model: Any) -> tuple[Channel, ...]:
+    positions, velocities = [], []
+    for j in range(model.njnt):
+        name, hinge = name_of(model, "joint", j), model.jnt_type[j] == 3
+        unit, free = ("rad" if hinge else "m"), not model.jnt_limited[j]
+        low, high = (-math.inf, math.inf) if free else model.jnt_range[j].tolist()
+        turns = bool(hinge and free)
+        positions.append(Channel(name, unit, angle=turns, low=low, high=high))
+        velocities.append(Channel(f"{name}.velocity", f"{unit}/s"))
+    order = np.argsort(model.jnt_qposadr)
+    acts = [
+        Channel(f"{name_of(model, 'actuator', i)}.activation", "1")
+        for i in range(model.nu)
+        if model.actuator_actnum[i]
+    ]
+    return (
+        *(positions[j] for j in order),
+        *(velocities[j] for j in order),
+        *acts,
+    )
+
+
+def _inputs(model: Any) -> tuple[Channel, ...]:
+    joints = [name_of(model, "joint", j) for j in range(model.njnt)]
+    found = []
+    for i in range(model.nu):
+        limited = model.actuator_ctrllimited[i]
+        low, high = (
+            model.actuator_ctrlrange[i].tolist() if limited else (-math.inf, math.inf)
+        )
+        name = name_of(model, "actuator", i)
+        if name in joints:
+            name += ".control"  # a joint has the name already
+        found.append(Channel(name, "1", low=low, high=high))
+    return tuple(found)
