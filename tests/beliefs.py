@@ -5,7 +5,7 @@ import json
 import jax
 import jax.numpy as jnp
 
-from sim2gp.identification import summary as diagnose
+from sim2gp.identification import diagnose
 from sim2gp.identification.identifiability.table import verdicts
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.least_squares import triangular

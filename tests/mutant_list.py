@@ -42,7 +42,7 @@ class Mutant:
 LS, SIM, LIN = (
     "inference/least_squares.py",
     "models/sim2gp.py",
-    "inference/linearized.py",
+    "models/draws.py",
 )
 TABLE, GAUSS, MAPS = (
     "inference/parameters.py",

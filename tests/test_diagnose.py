@@ -10,8 +10,7 @@ import pytest
 import scipy.stats
 
 from beliefs import believe, named, study, words_of
-from sim2gp.identification import summary as diagnose
-from sim2gp.identification import words
+from sim2gp.identification import diagnose, words
 from sim2gp.identification.identifiability import conflicts
 from sim2gp.identification.identifiability.table import physical_moments
 from sim2gp.inference.gaussian import Gaussian

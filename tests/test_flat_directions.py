@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from beliefs import believe, named, rows_of, study
-from sim2gp.identification import summary as diagnose
+from sim2gp.identification import diagnose
 from sim2gp.inference.parameters import Parameter, Parameters, parameters_of
 from sim2gp.systems.plants.two_link import TwoLink, UniformRodArm, UniformRodParams
 

@@ -12,7 +12,7 @@ import mjcf
 from sim2gp import systems as sy
 from sim2gp.data.transitions import Transitions
 from sim2gp.errors import InputError
-from sim2gp.identification import summary as diagnose
+from sim2gp.identification import diagnose
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.parameters import Parameter
 from sim2gp.models import Sim2GP

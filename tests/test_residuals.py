@@ -17,13 +17,13 @@ from sim2gp.data.windows import (
     compile_linearise,
     linearise,
 )
+from sim2gp.identification.diagnose import misfit
 from sim2gp.identification.misfit.residuals import (
     earlier,
     encoded,
     misfit_of_transitions,
     misfit_of_windows,
 )
-from sim2gp.identification.summary import misfit
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.models import Sim2GP
 from sim2gp.systems import Channel, Furuta

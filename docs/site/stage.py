@@ -87,7 +87,7 @@ def modules() -> dict[str, list[str]]:
         if parts[-1] == "__main__" or parts == ("__init__",):
             continue
         if parts[-1] == "__init__":
-            pages[parts[0]] = [f"sim2gp.{parts[0]}", *pages.get(parts[0], [])]
+            pages.setdefault(parts[0], []).append(".".join(("sim2gp", *parts[:-1])))
         else:
             page = parts[0] if len(parts) > 1 else CORE
             pages.setdefault(page, []).append(".".join(("sim2gp", *parts)))
@@ -138,7 +138,7 @@ def reference() -> dict[str, str]:
 def heading(page: str, found: list[str]) -> str:
     """A page's content in a sentence."""
     if page == CORE:
-        return "Shapes, Gaussians, parameters, inference, tasks and loops."
+        return "Types, errors and checks, compilation, and what every belief offers."
     return first_sentence(found[0], found[0])
 
 

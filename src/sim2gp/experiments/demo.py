@@ -17,7 +17,7 @@ import numpy as np
 
 from sim2gp.belief import AbstractModel
 from sim2gp.experiments.record import provenance
-from sim2gp.identification import summary as diagnose
+from sim2gp.identification import diagnose
 from sim2gp.identification.misfit.residuals import misfit_of_transitions
 from sim2gp.models import PointEstimate, PriorMean, Sim2GP, Sim2GPBelief
 from sim2gp.planning import MPC

@@ -34,7 +34,7 @@ from sim2gp.experiments.prediction import (
 from sim2gp.experiments.record import command, provenance
 from sim2gp.experiments.told_intervals import lacking_table, told_intervals
 from sim2gp.experiments.unseen import Unseen, unseen
-from sim2gp.identification import summary as diagnose
+from sim2gp.identification import diagnose
 from sim2gp.identification.exact_posterior.importance import check_windows
 from sim2gp.identification.exact_posterior.nuts import sample_windows, sampler
 from sim2gp.identification.forecast import Band, compile_forecast, fit_band

@@ -29,7 +29,7 @@ from sim2gp.experiments.two_link_study import (
     learn,
     nominal_truth,
 )
-from sim2gp.identification import summary as diagnose
+from sim2gp.identification import diagnose
 from sim2gp.models import Sim2GPBelief
 from sim2gp.runs import Progress, new_run
 from sim2gp.types import Action, Dynamics, Key, State, in_float64

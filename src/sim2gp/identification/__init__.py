@@ -1,6 +1,6 @@
 """Which parameters do logs determine, how well, and what do they leave open."""
 
 from sim2gp.data.windows import fit_windows
-from sim2gp.identification import summary as diagnose
+from sim2gp.identification import diagnose
 
 __all__ = ["diagnose", "fit_windows"]

@@ -1,0 +1,1 @@
+"""Gaussian inference by square roots; knows no robot."""

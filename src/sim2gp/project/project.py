@@ -255,7 +255,7 @@ def system_class(name: str) -> "type[AbstractSystem]":
     """The class behind a name of `SYSTEMS`."""
     module, kind = SYSTEMS[name]
     found: type[AbstractSystem] = getattr(
-        importlib.import_module(f"sim2gp.systems.{module}"), kind
+        importlib.import_module(f"sim2gp.systems.plants.{module}"), kind
     )
     return found
 

@@ -1,0 +1,1 @@
+"""The exact posterior: importance weights and Hamiltonian Monte Carlo."""

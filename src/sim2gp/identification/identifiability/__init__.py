@@ -1,0 +1,1 @@
+"""Which parameters and combinations of them do the data determine?"""

@@ -1,0 +1,1 @@
+"""Intervals that hold where the simulator or the noise model is wrong."""

@@ -1,0 +1,1 @@
+"""Four tests of what a fit leaves over, and their findings in words."""

@@ -1,0 +1,1 @@
+"""Which effect does a simulator lack?"""

@@ -1,0 +1,1 @@
+"""Physics that a machine may have and its plant lacks, one file for each kind."""

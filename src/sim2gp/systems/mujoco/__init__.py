@@ -1,0 +1,1 @@
+"""MuJoCo models as plants: read, simulated, written back, drawn."""

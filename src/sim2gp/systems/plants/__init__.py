@@ -1,0 +1,1 @@
+"""Plants: three bundled machines, a user's equation, a simulator on the host."""
