@@ -39,6 +39,7 @@ class Mutant:
         path.write_text(changed)
 
 
+JACOBIAN = "inference/linearized.py"
 LS, SIM, LIN = (
     "inference/least_squares.py",
     "models/sim2gp.py",
@@ -115,7 +116,7 @@ MUTANTS = (
     ),
     Mutant(
         "Jacobian transposed",
-        LIN,
+        JACOBIAN,
         "    return value, J\n",
         "    return value, J.T\n",
         MODEL,
@@ -129,7 +130,7 @@ MUTANTS = (
     ),
     Mutant(
         "posterior factor transposed",
-        LIN,
+        JACOBIAN,
         "J @ posterior.scale)",
         "J @ posterior.scale.T)",
         MODEL,

@@ -4,7 +4,7 @@ A compiler that crashes or runs away on somebody's file ends the child and not w
 asked. Files that a model names must lie in its own folder or below, or in ``root``:
 they are read here (`sim2gp.systems.mujoco.sources`), and the child opens no others.
 A URDF has no actuators: every hinge and slide gets a motor, ``<joint>.motor``
-(`sim2gp.systems.mujoco.child`).
+(`sim2gp.systems.mujoco.compile_child`).
 """
 
 import json
@@ -21,14 +21,14 @@ from typing import Any
 
 from sim2gp import cleanup
 from sim2gp.errors import InputError, missing_extra, warn
+from sim2gp.systems.mujoco.elements import UNREAD
 from sim2gp.systems.mujoco.sources import Sources, read_sources
-from sim2gp.systems.mujoco.xml import UNREAD
 
 SECONDS = 60  # that a model may take to compile
 #: MuJoCo's words for masses and inertias; not for a mesh that encloses no volume.
 _IMPOSSIBLE = re.compile(r"mass and inertia|inertia must|mass, inertia or density")
 _LINE = re.compile(r"\bline (\d+)\b")
-_CHILD = os.path.join(os.path.dirname(__file__), "mjcf_child.py")
+_CHILD = os.path.join(os.path.dirname(__file__), "compile_child.py")
 
 
 def compiled(path: Path, root: Path | None = None) -> Any:

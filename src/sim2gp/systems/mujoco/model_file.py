@@ -1,7 +1,7 @@
 """A model's files with other constants in them, and the proof that they say them.
 
-The source's own text is edited (`sim2gp.systems.mujoco.text`), so that a reader sees in
-a diff what was learned and nothing else. What was written is compiled again and
+The source's own text is edited (`sim2gp.systems.mujoco.text_edits`), so that a reader
+sees in a diff what was learned and nothing else. What was written is compiled again and
 compared with what was wanted, number by number, before anybody gets to see it.
 """
 
@@ -18,7 +18,7 @@ from sim2gp.errors import InputError
 from sim2gp.systems.mujoco.constants import Constant, constants_of, set_constants
 from sim2gp.systems.mujoco.inertia import inertia_matrix
 from sim2gp.systems.mujoco.load import as_mjcf
-from sim2gp.systems.mujoco.text import Document, Edits, Element, read_files
+from sim2gp.systems.mujoco.text_edits import Document, Edits, Element, read_files
 from sim2gp.systems.mujoco.write_back import MJCF
 from sim2gp.systems.mujoco.write_urdf import URDF
 

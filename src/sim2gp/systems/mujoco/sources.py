@@ -3,7 +3,8 @@
 A model names meshes, textures, parts of its text and other models. Each name is
 resolved here in every way in which the compiler may, and must lead below the model's
 folder, links followed. The bytes that were read here are what the compiler gets, under
-the names that it asks for; it opens no file itself (`sim2gp.systems.mujoco.child`).
+the names that it asks for; it opens no file itself
+(`sim2gp.systems.mujoco.compile_child`).
 
 Where the compiler looks: a part in the main file's folder, then in that of the part
 that includes it; meshes, heights and skins in the `compiler`'s `meshdir`, textures in
@@ -19,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from sim2gp.errors import InputError
-from sim2gp.systems.mujoco.xml import bare, elements, parsed, place
+from sim2gp.systems.mujoco.elements import bare, elements, parsed, place
 
 _BYTES = 1 << 30  # of all files of a model
 _PARTS = 200  # files of text

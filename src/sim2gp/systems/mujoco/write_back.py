@@ -15,7 +15,7 @@ from sim2gp.errors import InputError
 from sim2gp.systems.mujoco.constants import Constant
 from sim2gp.systems.mujoco.inertia import NAMES as INERTIA
 from sim2gp.systems.mujoco.inertia import inertia_matrix
-from sim2gp.systems.mujoco.text import Edits, Element, number
+from sim2gp.systems.mujoco.text_edits import Edits, Element, number
 
 _AXES = ("com_x", "com_y", "com_z")
 _ORIENTATIONS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")

@@ -13,7 +13,7 @@ from sim2gp.errors import InputError
 from sim2gp.systems.mujoco.constants import Constant
 from sim2gp.systems.mujoco.inertia import NAMES as INERTIA
 from sim2gp.systems.mujoco.inertia import inertia_matrix
-from sim2gp.systems.mujoco.text import Edits, Element, number
+from sim2gp.systems.mujoco.text_edits import Edits, Element, number
 from sim2gp.systems.mujoco.write_back import say_gravity, scale, words
 
 _DYNAMICS = {"damping": "damping", "frictionloss": "friction"}
