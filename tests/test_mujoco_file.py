@@ -11,7 +11,7 @@ import pytest
 
 from sim2gp import systems as sy
 from sim2gp.errors import InputError, Sim2GPWarning
-from sim2gp.systems.mujoco import child as mjcf_child
+from sim2gp.systems.mujoco import compile_child as mjcf_child
 from sim2gp.systems.mujoco import load as mjcf_load
 
 mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is not installed")
@@ -176,7 +176,7 @@ def test_what_mujocos_compiler_warns_of_is_a_warning(tmp_path: Path) -> None:
 def test_a_warning_names_the_line_that_mujoco_names(tmp_path: Path, monkeypatch):
     """Whatever way MuJoCo takes to say it."""
     child = tmp_path / "child.py"
-    own = Path(mjcf_load.__file__).with_name("mjcf_child.py").read_text()
+    own = Path(mjcf_load.__file__).with_name("compile_child.py").read_text()
     more = (
         "    import warnings as w\n"
         "    w.warn('soft\\nElement geom, line 7')\n"

@@ -71,7 +71,7 @@ def compiled_anyway(found: list[Hostile], model: Path, way: str) -> list[list[fl
         )
         for each in found
     ]
-    child = str(Path(mjcf_load.__file__).with_name("mjcf_child.py"))
+    child = str(Path(mjcf_load.__file__).with_name("compile_child.py"))
     done = subprocess.run(
         [sys.executable, "-I", str(CHILD), child, str(model), way],
         input="\n".join(lines),

@@ -1,6 +1,6 @@
 """The child process that compiles models: run as a script, in isolation.
 
-    python -I mjcf_child.py SECONDS FOLDER mjb|xml COUNT
+    python -I compile_child.py SECONDS FOLDER mjb|xml COUNT
 
 Model 0 is FOLDER/0.json, which says its kind and the files that it needs, and so on.
 Each model is compiled and kept in FOLDER, as ``0.mjb`` and so on, or in MuJoCo's own
