@@ -10,7 +10,7 @@ from jax import Array
 
 import lagrangians
 from sim2gp import systems as sy
-from sim2gp.systems import AbstractMechanism, AbstractSystem
+from sim2gp.systems import AbstractMechanism, AbstractSystem, Machine
 
 SPEEDS = {"rad": 8.0, "m": 1.5}
 
@@ -33,14 +33,10 @@ def every() -> dict[str, AbstractSystem]:
     systems: dict[str, AbstractSystem] = dict(bare())
     for name in ("furuta", "cartpole"):
         effects = [sy.effect(name, what, "strong") for what in sy.catalogue(name)]
-        systems[f"{name}/all"] = sy.perturb(bare()[name], effects)
+        systems[f"{name}/all"] = sy.with_parts(bare()[name], effects, period=0.02)
     arm = bare()["two_link"]
-    free = {
-        f"{c.name}.{q}": sy.actuator_prior(c, q)
-        for c in arm.actions
-        for q in ("gain", "offset", "delay")
-    }
-    return systems | {"two_link/actuated": sy.Actuated(arm, free, delay_max=0.02)}
+    free = sy.free_parts(arm, sy.neutral_actuators(arm.actions), period=0.02)
+    return systems | {"two_link/actuated": free}
 
 
 def points(system: AbstractSystem, count: int, seed: int) -> Iterator[tuple[Any, ...]]:
@@ -87,17 +83,36 @@ def close(got: Any, expected: Any, rtol: float = 1e-11) -> None:
 def against(machine: str, effect: Any, lagrangian: Any, forces: Any) -> None:
     """Accelerations of a machine with an effect against Euler-Lagrange."""
     plain = bare()[machine]
-    system = sy.Perturbed(plain, [effect])
+    system = Machine(plain, [effect])
 
     def both(tt: Array, s: Array, a: Array) -> tuple[Array, Array]:
         p = params_at(plain, tt)
         q, v = s[:2], s[2:]
-        got = system.ode(system.with_effects(p), s, a)[2:]
+        got = ode(system, with_parts(system, p), s, a)[2:]
         return got, lagrangians.acceleration(lagrangian(p), forces(p, v, a), q, v)
 
     got, expected = jax.jit(jax.vmap(both))(*batch(plain, 100, 4))
     for row, oracle in zip(got, expected, strict=True):
         close(row, oracle)
+
+
+def with_parts(machine: Machine, params: Any) -> sy.MachineParams:
+    """A record of the plant with every part at its own magnitude."""
+    like = jax.tree.leaves(params)[0].dtype
+    parts = {part.name: jnp.asarray(part.magnitude, like) for part in machine.parts}
+    return sy.MachineParams(params, parts)
+
+
+def equations(machine: Machine, params: Any, q: Array, v: Array, a: Array) -> Any:
+    """Inertia and forces of a machine with effects; the input is what arrives."""
+    assert isinstance(machine.plant, AbstractMechanism)
+    return machine.plant.equations(params.plant, machine.acting(params), q, v, a)
+
+
+def ode(machine: Machine, params: Any, s: Array, a: Array) -> Array:
+    """Time derivative of a machine with effects on its joints."""
+    assert isinstance(machine.plant, AbstractMechanism)
+    return machine.plant.ode_with(params.plant, machine.acting(params), s, a)
 
 
 def nominal(system: AbstractSystem, **changes: float) -> Any:
@@ -113,7 +128,7 @@ def jitted(system: AbstractSystem, dt: float) -> Any:
 
 def _feasible(system: AbstractSystem, tt: Array) -> Array:
     """Independent constants of an arm may give it a negative inertia: replace those."""
-    machine = getattr(system, "system", system)
+    machine = sy.plant_of(system)
     if not isinstance(machine, sy.TwoLink):
         return tt
 

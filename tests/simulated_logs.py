@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.integrate
 
+import machines
 from sim2gp.data.logs import Log
-from sim2gp.systems import AbstractEffect, Furuta, Perturbed
+from sim2gp.systems import AbstractEffect, Furuta, Machine
 
 NAMES = ("theta", "alpha", "theta.velocity", "alpha.velocity")
 FREE = ("arm_damping", "motor_constant", "pendulum_length")
@@ -35,11 +36,11 @@ def simulated(
     count = int(seconds / 0.002)
     time = 0.002 * np.arange(count) + jitter * rng.uniform(0.0, 0.002, count)
     held = np.repeat(rng.uniform(-4.0, 4.0, count // 20 + 1), 20)[:count]
-    system = Perturbed(Furuta(), effects)
+    system = Machine(Furuta(), effects)
     with jax.enable_x64(True):
         values = system.parameters.nominal() | (changes or {})
         params = system.record({k: jnp.asarray(v) for k, v in values.items()})
-        ode = jax.jit(lambda s, a: system.ode(params, s, a))
+        ode = jax.jit(lambda s, a: machines.ode(system, params, s, a))
 
         def rate(t: float, s: np.ndarray) -> np.ndarray:
             k = max(int(np.searchsorted(time, t - delay, side="right")) - 1, 0)

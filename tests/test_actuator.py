@@ -1,5 +1,7 @@
 """Gain, offset and delay of the inputs; the identities that a delay must satisfy."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,12 +26,11 @@ def run(system, params, inputs, s):
     return jnp.stack(path)
 
 
-def furuta(delay, history=0.06):
-    """(actuated system, its record) with a free delay of this value."""
-    prior = sy.actuator_prior(sy.Furuta().actions[0], "delay", 0.06)
-    system = sy.Actuated(
-        sy.Furuta(), {"voltage.delay": prior}, delay_max=history, period=DT
-    )
+def furuta(delay):
+    """(machine, its record) with a free delay of this value."""
+    inputs = sy.neutral_actuators(sy.Furuta().actions)
+    system = sy.with_parts(sy.Furuta(), inputs, period=DT)
+    system = sy.free_parts(system, [sy.Delay("voltage", 0.06)])
     return system, machines.nominal(system, **{"voltage.delay": delay})
 
 
@@ -57,7 +58,7 @@ def test_half_a_step_of_delay_switches_in_the_middle():
     s = system.step(p, jnp.concatenate([START, old, jnp.zeros(2)]), new, DT)
     x = START
     for u in (old, new):
-        x = sy.rk4(lambda x, u: bare.ode(p.system, x, u), x, u, 0.01)
+        x = sy.rk4(lambda x, u: bare.ode(p.plant, x, u), x, u, 0.01)
     np.testing.assert_allclose(s[:4], x, rtol=1e-13)
     np.testing.assert_allclose(s[4:], [-1.0, 2.0, 0.0])
 
@@ -112,7 +113,8 @@ def test_gain_and_offset_act_on_each_input():
     arm = sy.TwoLink(gravity=9.81)
     p = arm.nominal()
     fixed = {"torque1.gain": 0.9, "torque2.offset": 0.3, "torque2.gain": 1.2}
-    system = sy.Actuated(arm, fixed)
+    inputs = sy.neutral_actuators(arm.actions)
+    system = sy.Machine(arm, actuators=inputs, parameters=fixed)
     assert system.parameters.free == arm.parameters.free
     s, a = jnp.array([0.1, 2.0, -0.3, 0.4]), jnp.array([1.0, -2.0])
     u = jnp.array([0.9, 1.2 * -2.0 + 0.3])
@@ -120,15 +122,16 @@ def test_gain_and_offset_act_on_each_input():
     np.testing.assert_allclose(got, arm.flow(p, s, u, DT / 4), rtol=1e-12)
     got = system.step(system.nominal(), s, a, DT)
     np.testing.assert_allclose(got, arm.step(p, s, u, DT), rtol=1e-12)
+    neutral = machines.with_parts(system, p)
     np.testing.assert_allclose(
-        system.step(system.neutral(p), s, a, DT), arm.step(p, s, a, DT), rtol=1e-12
+        system.step(neutral, s, a, DT), arm.step(p, s, a, DT), rtol=1e-12
     )
 
 
 def test_every_input_has_its_own_delay():
     arm = sy.UniformRodArm()
-    fixed = {"torque1.delay": 0.02, "torque2.delay": 0.04}
-    system = sy.Actuated(arm, fixed, delay_max=0.04, period=DT)
+    late = [sy.Delay("torque1", 0.02), sy.Delay("torque2", 0.04)]
+    system = sy.Machine(arm, actuators=late, period=DT)
     inputs = jax.random.normal(jax.random.key(5), (8, 2))
     path = run(system, system.nominal(), inputs, jnp.append(START, jnp.zeros(4)))
     one, two = jnp.zeros((1, 1)), jnp.zeros((2, 1))
@@ -158,15 +161,15 @@ def test_channels_and_tables():
     after = system.transition(tt, s, jnp.ones(1), DT)
     assert after.shape == (7,)
     table = system.parameters.replace(**{"voltage.gain": 1.1})
-    again = sy.Actuated(sy.Furuta(), parameters=table, delay_max=0.06, period=DT)
+    again = dataclasses.replace(system, parameters=table)
     assert dict(again.parameters.fixed)["voltage.gain"] == 1.1
     assert again.parameters.names == system.parameters.names
 
 
-def test_actuators_around_perturbed_physics():
-    effects = [sy.Coulomb("theta", 2e-3), sy.InputDelay("voltage", 0.02)]
-    system = sy.perturb(sy.Furuta(), effects)
-    bare = sy.Perturbed(sy.Furuta(), effects[:1])
+def test_actuators_and_effects():
+    effects = [sy.Coulomb("theta", 2e-3), sy.Delay("voltage", 0.02)]
+    system = sy.with_parts(sy.Furuta(), effects, period=DT)
+    bare = sy.Machine(sy.Furuta(), effects[:1])
     path = run(system, system.nominal(), INPUTS, jnp.append(START, 0.0))
     shifted = jnp.concatenate([jnp.zeros((1, 1)), INPUTS[:-1]])
     plain = run(bare, bare.nominal(), shifted, START)
@@ -174,18 +177,34 @@ def test_actuators_around_perturbed_physics():
     assert system.max_substep == bare.max_substep == 0.0025
 
 
+def test_inputs_with_a_delay_and_with_a_lag():
+    """Of two inputs one is late, the other is filtered."""
+    arm = sy.UniformRodArm()
+    late = [sy.Delay("torque1", 0.02), sy.Lag("torque2", 0.004)]
+    system = sy.Machine(arm, actuators=late, period=DT)
+    assert system.history == 1
+    held = jnp.array([[1.0, 2.0], [-3.0, 4.0]])
+    means = system.mean_inputs(system.nominal(), held, DT, 2)
+    lag = sy.lagged_means(held[:, 1], DT, jnp.asarray(0.004), 2)
+    np.testing.assert_allclose(means, jnp.stack([held[[1, 1], 0], lag], 1), rtol=1e-12)
+
+
 def test_mistakes_are_named():
-    bare = sy.Furuta()
-    prior = sy.actuator_prior(bare.actions[0], "delay", 0.02)
-    without_history = sy.Actuated(bare, {"voltage.delay": prior})
+    bare, delay = sy.Furuta(), sy.Delay("voltage", 0.02)
+    without_history = sy.free_parts(bare, [delay])
     with pytest.raises(InputError, match=r"E113.*0\.02 s"):
         without_history.step(without_history.nominal(), START, jnp.ones(1), DT)
-    short = sy.Actuated(bare, {"voltage.delay": prior}, delay_max=0.02, period=DT)
+    short = sy.free_parts(bare, [delay], period=DT)
     with pytest.raises(InputError, match="E113"):
         short.step(short.nominal(), jnp.append(START, 0.0), jnp.ones(1), 0.01)
     with pytest.raises(InputError, match=r"E145.*voltage\.delay"):
-        sy.Actuated(bare, {"voltge.delay": prior})
+        sy.Machine(bare, actuators=[delay], parameters={"voltge.delay": 0.01})
+    with pytest.raises(InputError, match=r"E145.*voltage\.delay"):
+        table = dataclasses.replace(short.parameters, fixed=(("voltge.gain", 1.0),))
+        sy.Machine(bare, actuators=[delay], parameters=table)
     with pytest.raises(InputError, match="E141"):
-        sy.Actuated(bare, {"voltage.delay": -0.01})
-    with pytest.raises(InputError, match="E145"):
-        sy.Actuated(short)
+        sy.Machine(bare, actuators=[delay], parameters={"voltage.delay": -0.01})
+    with pytest.raises(InputError, match=r"E145 two parts of one name.*voltage\.delay"):
+        sy.Machine(bare, actuators=[delay, delay])
+    with pytest.raises(InputError, match=r"E103.*did you mean voltage"):
+        sy.Machine(bare, actuators=[sy.Gain("voltge")])

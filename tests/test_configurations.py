@@ -22,29 +22,29 @@ from sim2gp.inference.arrowhead import Noise
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.levenberg_marquardt import Fit, minimise
 from sim2gp.inference.parameters import Parameter
-from sim2gp.inference.variants import Configuration
 from sim2gp.models import Sim2GP
 from sim2gp.systems import (
     ODE,
     AbstractSystem,
-    Actuated,
     BlackBox,
     Channel,
-    alone,
-    configured,
+    Delay,
+    Variant,
+    free_parts,
+    one_variant,
+    with_variants,
 )
-from sim2gp.systems.actuators import actuator_prior
 from sim2gp.systems.variants import own_table
 from sim2gp.types import in_float64
 
 KEY = jax.random.key(0)
-BARE = Configuration("bare", fixed=(("payload", 0.0),))
-LOADED = Configuration("loaded", own=("payload",))
+BARE = Variant("bare", fixed=(("payload", 0.0),))
+LOADED = Variant("loaded", own=("payload",))
 SHARED = ("inertia", "weight", "damping")
 
 
-def joint(*configurations: Configuration) -> Any:
-    return configured(arm(), configurations)
+def joint(*configurations: Variant) -> Any:
+    return with_variants(arm(), configurations)
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +67,7 @@ def test_columns_are_the_shared_ones_and_each_own() -> None:
     table = joint(BARE, LOADED).parameters
     assert table.names == (*SHARED, "payload @ loaded")
     assert table["payload @ loaded"].meaning == "mass at the tip"
-    both = (Configuration("a", own=("weight",)), Configuration("b"))
+    both = (Variant("a", own=("weight",)), Variant("b"))
     assert joint(*both).parameters.names == (
         "inertia",
         "weight @ a",
@@ -79,8 +79,9 @@ def test_columns_are_the_shared_ones_and_each_own() -> None:
 
 @in_float64
 def test_each_configuration_has_its_constants() -> None:
-    third = Configuration("third", fixed=(("damping", 0.7),))
-    table = joint(BARE, LOADED, third).parameters
+    third = Variant("third", fixed=(("damping", 0.7),))
+    system = joint(BARE, LOADED, third)
+    table = system.parameters
     names = ("inertia", "weight", "damping", "payload @ loaded", "payload")
     assert table.names == names
     tt = jnp.asarray([0.1, 0.2, 0.3, 0.4, 0.5])
@@ -92,14 +93,14 @@ def test_each_configuration_has_its_constants() -> None:
         {"damping": damping, "payload": theta["payload @ loaded"]},
         {"damping": 0.7, "payload": theta["payload"]},
     )
-    traced = jax.jit(lambda i: table.values(tt, i))
+    traced = jax.jit(lambda i: system.values(tt, i))
     for i, alone_ in enumerate(expected):
-        for found in (table.values(tt, i), traced(i)):
+        for found in (system.values(tt, i), traced(i)):
             assert {k: float(v) for k, v in found.items()} == pytest.approx(
                 {k: float(v) for k, v in (shared | alone_).items()}, rel=1e-14
             )
     with pytest.raises(InputError, match=r"E152 which configuration.*bare, loaded"):
-        table.values(tt)
+        system.values(tt)
 
 
 def test_a_configuration_alone_is_an_ordinary_machine(float64: None) -> None:
@@ -107,7 +108,7 @@ def test_a_configuration_alone_is_an_ordinary_machine(float64: None) -> None:
     rng = np.random.default_rng(0)
     belief = Gaussian(jnp.arange(4.0), jnp.asarray(rng.normal(size=(4, 6))))
     for name, places in (("bare", [0, 1, 2]), ("loaded", [0, 1, 2, 3])):
-        machine, own = alone(system, belief, name)
+        machine, own = one_variant(system, belief, name)
         table = machine.parameters
         free = [n for n in arm().parameters.names if n != "payload" or len(places) > 3]
         assert table.names == tuple(free)
@@ -116,7 +117,7 @@ def test_a_configuration_alone_is_an_ordinary_machine(float64: None) -> None:
         np.testing.assert_allclose(np.asarray(own.covariance()), whole, atol=1e-12)
         assert own.scale.shape == (len(places), len(places))
         values = table.values(own.mean)
-        joint_values = system.parameters.values(
+        joint_values = system.values(
             belief.mean, ("bare", "loaded").index(name)
         )
         assert {k: float(v) for k, v in values.items()} == pytest.approx(
@@ -129,19 +130,19 @@ def test_a_configuration_alone_is_an_ordinary_machine(float64: None) -> None:
             system.transition(belief.mean, s, a, 0.01, index),
         )
     with pytest.raises(InputError, match=r"E152 unknown configuration.*loaded"):
-        own_table(system.parameters, "load")
+        own_table(system.parameters, system.variants, "load")
 
 
 def test_what_makes_no_sense_is_refused() -> None:
-    def refused(*found: Configuration, **priors: Parameter) -> str:
+    def refused(*found: Variant, **priors: Parameter) -> str:
         with pytest.raises(InputError) as caught:
-            configured(arm(), found, priors)
+            with_variants(arm(), found, priors)
         return str(caught.value)
 
     assert "E145 unknown parameter: got paylod" in refused(
-        Configuration("a", own=("paylod",))
+        Variant("a", own=("paylod",))
     )
-    twice = Configuration("a", (("payload", 0.1),), ("payload",))
+    twice = Variant("a", (("payload", 0.1),), ("payload",))
     assert "E145 a constant stated twice" in refused(twice)
     assert "two configurations of one name" in refused(BARE, BARE)
     unknown = refused(BARE, LOADED, **{"payload @ bare": arm().parameters["payload"]})
@@ -149,20 +150,18 @@ def test_what_makes_no_sense_is_refused() -> None:
     held = arm().parameters.replace(payload=0.2)
     machine = ODE(arm().function, held, arm().channels, arm().inputs)
     with pytest.raises(InputError, match=r"E145 a fixed .* got payload = 0\.2"):
-        configured(machine, [LOADED])
+        with_variants(machine, [LOADED])
 
 
 def test_no_delay_is_longer_than_inputs_are_kept() -> None:
-    machine = Actuated(
-        arm(), {"torque.delay": actuator_prior(arm().actions[0], "delay")}
-    )
-    configured(machine, [Configuration("a", (("torque.delay", 0.02),))])
+    machine = free_parts(arm(), [Delay("torque")])
+    with_variants(machine, [Variant("a", (("torque.delay", 0.02),))])
     for wrong in (0.021, -0.001):
         with pytest.raises(InputError, match=r"E141 torque\.delay of one"):
-            configured(machine, [Configuration("a", (("torque.delay", wrong),))])
+            with_variants(machine, [Variant("a", (("torque.delay", wrong),))])
     long = {"torque.delay @ a": Parameter("", "", "", "box", 0.0, 0.03)}
     with pytest.raises(InputError, match=r"from 0 to 0\.03 s"):
-        configured(machine, [Configuration("a", own=("torque.delay",))], long)
+        with_variants(machine, [Variant("a", own=("torque.delay",))], long)
 
 
 # The fit.
@@ -172,9 +171,9 @@ def test_a_linear_machine_has_the_closed_form() -> None:
     """A dense regression: shared columns, own ones, known values on the right."""
     rng = np.random.default_rng(3)
     bare = linear(3, 2)
-    a = Configuration("a", (("k2", 0.5),), ("k1",))
+    a = Variant("a", (("k2", 0.5),), ("k1",))
     prior = {"k1 @ b": Parameter("", "", "", "identity", mean=1.5, sd=0.3)}
-    system = configured(bare, [a, Configuration("b", own=("k1",))], prior)
+    system = with_variants(bare, [a, Variant("b", own=("k1",))], prior)
     assert system.parameters.names == ("k0", "k1 @ a", "k1 @ b", "k2")
     truth = {"k0": 1.0, "k1 @ a": -1.0, "k1 @ b": 2.0, "k2": 0.3}
     N, d = 40, 2
@@ -220,7 +219,7 @@ def descend(system: AbstractSystem, windows: Windows) -> Fit:
 def test_sharing_nothing_is_two_fits(logs: tuple[Log, Log]) -> None:
     machine = arm()
     every = machine.parameters.names
-    system = joint(*(Configuration(n, own=every) for n in ("a", "b")))
+    system = joint(*(Variant(n, own=every) for n in ("a", "b")))
     whole, _ = cut(logs, system, window=0.2)
     both = descend(system, jax.tree.map(jnp.asarray, whole))
     order = [[f"{n} @ {c}" for n in every] for c in ("a", "b")]
@@ -280,7 +279,7 @@ def test_a_value_that_is_wrong_is_seen(
     """0.15 kg were there; 0.05 are stated. The bare log says what the arm is."""
     belief, windows = joined
     assert not misfit_of_windows(belief, windows).alarm
-    known = Configuration("loaded", fixed=(("payload", 0.05),))
+    known = Variant("loaded", fixed=(("payload", 0.05),))
     wrong = fit_windows(joint(BARE, known), windows, key=KEY)
     assert wrong.system.parameters.names == SHARED
     assert float(wrong.log_evidence) < float(belief.log_evidence) - 50.0
@@ -299,10 +298,10 @@ def test_the_program_does_not_grow_with_configurations(
         return arm().function(k, s, a)
 
     machine = ODE(counted, arm().parameters, arm().channels, arm().inputs)
-    third = Configuration("third", own=("weight",))
+    third = Variant("third", own=("weight",))
     windows, _ = cut(logs, machine, window=0.2)
     counts = []
-    for system in (machine, configured(machine, [BARE, LOADED, third])):
+    for system in (machine, with_variants(machine, [BARE, LOADED, third])):
         prior = system.parameters.prior()
         model = likelihood.likelihood(system, prior, jax.tree.map(jnp.asarray, windows))
         nothing = jnp.zeros(prior.mean.size), jnp.zeros_like(windows.start)
@@ -315,8 +314,8 @@ def test_the_program_does_not_grow_with_configurations(
 @in_float64
 def test_one_step_is_fitted_jointly_as_well(getkey: Any) -> None:
     """Of a linear machine: regression by configuration, rows in any order."""
-    a = Configuration("a", (("k1", 0.5),))
-    system = configured(linear(2, 1), [a, Configuration("b", own=("k1",))])
+    a = Variant("a", (("k1", 0.5),))
+    system = with_variants(linear(2, 1), [a, Variant("b", own=("k1",))])
     assert system.parameters.names == ("k0", "k1 @ b")
     rng = np.random.default_rng(5)
     A, group = rng.normal(size=(30, 1, 2)), rng.integers(0, 2, 30)
@@ -350,8 +349,8 @@ def test_rows_on_the_host_have_constants_of_their_own() -> None:
 
     channel = Channel("x", "m")
     machine = BlackBox(step, [inside], [channel], [Channel("u", "1")], batched=True)
-    known = Configuration("a", (("k", 5.0),))
-    system = configured(machine, [known, Configuration("b")])
+    known = Variant("a", (("k", 5.0),))
+    system = with_variants(machine, [known, Variant("b")])
 
     @in_float64
     def slopes() -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,6 @@ from machines import against, close
 from sim2gp import systems as sy
 from sim2gp.errors import InputError
 from sim2gp.inference.parameters import Parameter
-from sim2gp.systems import actuators as actuator
 from test_systems import cartpole_forces, furuta_forces
 
 pytestmark = pytest.mark.usefixtures("float64")
@@ -85,36 +84,30 @@ def test_payload_is_a_point_at_the_end():
 
 
 @pytest.mark.parametrize("machine", ["furuta", "cartpole", "two_link"])
-@pytest.mark.parametrize("joint", [0, 1])
-def test_an_encoders_offset_moves_the_machine_not_its_equations(machine, joint):
+def test_an_encoders_offset_moves_the_machine_not_its_equations(machine):
+    """The flow is that at the true position, whatever the actuators are."""
     bare = machines.bare()[machine]
-    name = bare.states[joint].name
-    system = sy.Perturbed(bare, [sy.EncoderOffset(name, 0.2)])
-    for tt, s, a in machines.points(bare, 20, 5):
+    one, two = (channel.name for channel in bare.states[:2])
+    sensors = [sy.EncoderOffset(one, 0.2), sy.EncoderOffset(two, -0.3)]
+    system = sy.Machine(bare, sensors=sensors)
+    offset = jnp.array([0.2, -0.3, 0.0, 0.0])
+    for tt, s, a in machines.points(bare, 5, 5):
         p = machines.params_at(bare, tt)
-        got = system.ode(system.with_effects(p), s, a)
-        close(got, bare.ode(p, s.at[joint].add(0.2), a))
+        got = system.flow(machines.with_parts(system, p), s, a, 0.002)
+        close(got, bare.flow(p, s + offset, a, 0.002) - offset)
 
 
-def test_zeroed_is_the_effect_of_an_offset_on_any_machine():
-    """Two ways to the same: the whole flow shifted, and the equations."""
+def test_an_encoders_offset_is_a_constant():
     bare = sy.Furuta()
-    offset = Parameter("alpha.encoder", "rad", "", "identity", mean=0.0, sd=0.1)
-    system = sy.Zeroed(bare, {"alpha": offset, "theta": -0.3})
+    system = sy.free_parts(bare, [sy.EncoderOffset("alpha", 0.1)])
     assert system.parameters.names == (*bare.parameters.names, "alpha.encoder")
-    effects = [sy.EncoderOffset("alpha", 0.2), sy.EncoderOffset("theta", -0.3)]
-    other = sy.Perturbed(bare, effects)
-    values = bare.parameters.nominal()
-    values |= {"alpha.encoder": 0.2, "theta.encoder": -0.3}
-    params = system.record({k: jnp.asarray(v, float) for k, v in values.items()})
-    s, a = jnp.array([0.4, 1.1, -2.0, 5.0]), jnp.array([3.0])
-    known = other.with_effects(bare.nominal())
-    close(system.flow(params, s, a, 0.002), other.flow(known, s, a, 0.002))
-    assert actuator.bare(sy.Actuated(system)) is bare
+    assert system.parameters["alpha.encoder"].sd == 0.1
+    assert sy.EncoderOffset("alpha").parameter(bare).sd == 0.05
+    assert sy.plant_of(system) is bare
     with pytest.raises(InputError, match="E145 encoder of"):
-        sy.Zeroed(bare, {"alpha.velocity": 0.1})
+        sy.Machine(bare, sensors=[sy.EncoderOffset("alpha.velocity", 0.1)])
     with pytest.raises(InputError, match=r"E103.*did you mean alpha"):
-        sy.Zeroed(bare, {"alfa": 0.1})
+        sy.Machine(bare, sensors=[sy.EncoderOffset("alfa", 0.1)])
 
 
 def test_friction_formulas():
@@ -127,14 +120,15 @@ def test_friction_formulas():
             [2e-3 * (1.0 + np.exp(-(0.75**2))), 0.0],
         ),
         (sy.Stribeck("alpha", 4e-3, width=0.4), [0.0, -2e-3 * (1 + np.exp(-0.16))]),
-        (sy.BackEmf("theta", 1e-3), [1.5e-3, 0.0]),
+        (sy.Viscous("theta", 1e-3), [1.5e-3, 0.0]),
     ):
-        system = sy.Perturbed(furuta, [effect])
-        f = system.forces(system.with_effects(p), q, v, a) - furuta.forces(p, q, v, a)
+        system = sy.Machine(furuta, [effect])
+        known = machines.with_parts(system, p)
+        f = machines.equations(system, known, q, v, a)[1] - furuta.forces(p, q, v, a)
         expected = np.array(expected) * [1.0, np.tanh(1.0) if expected[0] == 0 else 1.0]
         np.testing.assert_allclose(f, expected, rtol=1e-9, atol=1e-15)
     assert sy.Stribeck("theta", 1.0).unit(furuta) == "N m"
-    assert sy.BackEmf("theta", 1.0).unit(furuta) == "N m s/rad"
+    assert sy.Viscous("theta", 1.0).unit(furuta) == "N m s/rad"
 
 
 def test_friction_only_takes_energy():
@@ -144,13 +138,14 @@ def test_friction_only_takes_energy():
     energy = lagrangians.energy
     L = lagrangians.furuta(p)
     none = jnp.zeros(1)
-    for effect in (sy.Stribeck("theta", 4e-3), sy.BackEmf("alpha", 1e-4)):
-        system = sy.Perturbed(furuta, [effect])
+    for effect in (sy.Stribeck("theta", 4e-3), sy.Viscous("alpha", 1e-4)):
+        system = sy.Machine(furuta, [effect])
 
         @jax.jit
         def rates(s, system=system):
             """Of the energy, with the effect and without."""
-            moves = system.ode(system.with_effects(p), s, none), furuta.ode(p, s, none)
+            known = machines.with_parts(system, p)
+            moves = machines.ode(system, known, s, none), furuta.ode(p, s, none)
             return [
                 jax.jvp(lambda q, v: energy(L, q, v), (s[:2], s[2:]), (s[2:], ds[2:]))[
                     1
@@ -193,13 +188,13 @@ def test_a_lag_of_a_constant_is_the_constant_and_no_lag_the_newest():
 
 def test_lagged_machine_carries_what_still_matters():
     furuta = sy.Furuta()
-    system = sy.Lagged(furuta, "voltage", 0.01, period=0.02)
+    system = sy.Machine(furuta, actuators=[sy.Lag("voltage", 0.01)], period=0.02)
     assert system.history == 3  # 50 ms in steps of 20
     assert len(system.states) == 7
     p = system.record(system.parameters.values(jnp.zeros(8)))
     s = jnp.array([0.1, 0.4, 0.3, -0.2, 2.0, 2.0, 2.0])
     got = system.step(p, s, jnp.array([2.0]), 0.02)
-    plain = furuta.step(p.system, s[:4], jnp.array([2.0]), 0.02)
+    plain = furuta.step(p.plant, s[:4], jnp.array([2.0]), 0.02)
     np.testing.assert_allclose(got[:4], plain, rtol=1e-12)
     later = system.step(p, s, jnp.array([-1.0]), 0.02)
     np.testing.assert_allclose(later[4:], [-1.0, 2.0, 2.0])
@@ -207,38 +202,37 @@ def test_lagged_machine_carries_what_still_matters():
 
 
 def test_mistakes_of_lag_and_payload_are_named():
+    def lagged(*parts):
+        return sy.Machine(sy.Furuta(), actuators=parts, period=0.02)
+
     with pytest.raises(InputError, match=r"E103.*voltage"):
-        sy.Lagged(sy.Furuta(), "volage", 0.01)
+        lagged(sy.Lag("volage", 0.01))
     with pytest.raises(InputError, match="E141"):
-        sy.Lagged(sy.Furuta(), "voltage", 0.0)
-    box = Parameter("voltage.delay", "s", "", "box", 0.0, 0.02)
-    delayed = sy.Actuated(sy.Furuta(), {"voltage.delay": box}, delay_max=0.02)
+        lagged(sy.Lag("voltage", 0.0))
     with pytest.raises(InputError, match=r"E145.*delayed"):
-        sy.Lagged(delayed, "voltage", 0.01)
-    system = sy.Lagged(sy.Furuta(), "voltage", 0.01)
+        lagged(sy.Delay("voltage", 0.02), sy.Lag("voltage", 0.01))
+    system = lagged(sy.Lag("voltage", 0.01))
     with pytest.raises(InputError, match=r"E145.*windows.*use a delay"):
         system.delays(system.nominal())
     with pytest.raises(InputError, match=r"E145.*TwoLink"):
-        sy.Perturbed(sy.TwoLink(), [sy.Payload("q2", 0.1)])
+        sy.Machine(sy.TwoLink(), [sy.Payload("q2", 0.1)])
     with pytest.raises(InputError, match=r"E145.*CartPole"):
-        sy.Perturbed(sy.CartPole(), [sy.BaseTilt(where="theta")])
+        sy.Machine(sy.CartPole(), [sy.BaseTilt(where="theta")])
 
 
 def test_library_offers_what_the_machine_has_not():
     furuta = sy.Furuta()
-    names = [c.name for c in sy.library(furuta)]
+    names = [c.name for c in sy.candidates(furuta)]
     assert len(set(names)) == len(names)
     assert {"theta.coulomb", "voltage.delay", "voltage.lag"} <= {*names}
-    held = sy.Actuated(
-        sy.Perturbed(furuta, [sy.Coulomb("theta", 1e-3)]),
-        {"voltage.delay": sy.actuator_prior(furuta.actions[0], "delay")},
-    )
-    rest = [c.name for c in sy.library(held, windows=True)]
+    held = sy.with_parts(furuta, [sy.Coulomb("theta", 1e-3)])
+    held = sy.free_parts(held, [sy.Delay("voltage")])
+    rest = [c.name for c in sy.candidates(held, windows=True)]
     gone = {"theta.coulomb", "voltage.delay", "voltage.lag"}
     assert {*names} - {*rest} == gone
     for machine in ("furuta", "cartpole", "two_link", "six"):
         bare = machines.bare()[machine]
-        for candidate in sy.library(bare):
-            free = candidate.freed(bare, period=0.02)
+        for candidate in sy.candidates(bare):
+            free = sy.free_parts(bare, [candidate.effect], period=0.02)
             assert free.parameters.names.count(candidate.name) == 1
             assert len(free.parameters) == len(bare.parameters) + 1

@@ -20,26 +20,24 @@ from sim2gp.identification.intervals.discrepancy import corrected_windows
 from sim2gp.identification.missing_physics.data import WindowData
 from sim2gp.identification.missing_physics.score import score
 from sim2gp.inference.linear_measurements import Weighed
-from sim2gp.inference.variants import Configuration
 from sim2gp.models import sim2gp
-from sim2gp.systems.effects.library import Candidate, library
-from sim2gp.systems.variants import with_weighed
+from sim2gp.systems.assemble import with_weighed
 from sim2gp.types import in_float64
 
 
 def stepped() -> dict[str, sg.AbstractSystem]:
     """Every kind of machine: bare, with effects, with actuators, with offset zeros."""
     furuta = sy.Furuta()
-    lagged = sy.Lagged(furuta, "voltage", 0.01, period=0.02)
-    zeroed = sy.Zeroed(furuta, {"alpha": 0.03})
+    lagged = sy.Machine(furuta, actuators=[sy.Lag("voltage", 0.01)], period=0.02)
+    zeroed = sy.Machine(furuta, sensors=[sy.EncoderOffset("alpha", 0.03)])
     return machines.every() | {"lagged": lagged, "zeroed": zeroed}
 
 
 def one_step() -> dict[str, sg.AbstractSystem]:
     """Machines that are fitted to exact states."""
     furuta = sy.Furuta()
-    freed = Candidate(sy.Coulomb("theta", 2e-3)).freed(furuta)
-    delayed = Candidate(sy.InputDelay("voltage", 0.03)).freed(furuta, period=0.02)
+    freed = sy.free_parts(furuta, [sy.Coulomb("theta", 2e-3)])
+    delayed = sy.free_parts(furuta, [sy.Delay("voltage", 0.03)], period=0.02)
     arm = sy.UniformRodArm()
     return {
         "furuta": furuta,
@@ -53,21 +51,17 @@ def one_step() -> dict[str, sg.AbstractSystem]:
 def windowed() -> dict[str, tuple[sg.AbstractSystem, list[Any], dict[str, Any]]]:
     """Machines that are fitted to logs, with the logs, and options of the fit."""
     bare = simulated_logs.pendulum()
-    free = {
-        f"voltage.{q}": sy.actuator_prior(bare.actions[0], q)
-        for q in ("gain", "offset", "delay")
-    }
-    actuated = sy.Actuated(bare, free)
+    actuated = sy.free_parts(bare, sy.neutral_actuators(bare.actions))
     late = simulated_logs.simulated(seconds=2.0, seed=2, delay=0.006, noise=1e-3)
     exact = simulated_logs.simulated(
         seconds=0.6, seed=3, noise=1e-3, velocities=True, jitter=0.1
     )
     arm = payload_arm.arm()
-    both = sy.configured(
+    both = sy.with_variants(
         arm,
         [
-            Configuration("bare", fixed=(("payload", 0.0),)),
-            Configuration("loaded", own=("payload",)),
+            sy.Variant("bare", fixed=(("payload", 0.0),)),
+            sy.Variant("loaded", own=("payload",)),
         ],
     )
     known = with_weighed(arm, [Weighed(("weight", "payload"), (1.0, 9.81), 2.0, 0.05)])
@@ -120,8 +114,9 @@ def gains(machine: Any, logs: Sequence[Any]) -> dict[str, float]:
     _, places = cut(logs, machine, window=0.2)
     of = np.asarray([k for k, _ in places])
     data = WindowData(machine, lambda m: cut(logs, m, window=0.2)[0], of)
-    scored = score(data, data.fit(), library(machine, windows=True))
-    return {one.candidate.name: one.gain for one in scored}
+    scored = score(data, data.fit(), sy.candidates(machine, windows=True))
+    names = {one.candidate.name: one.gain for one in scored}
+    return {n.replace("viscous", "back_emf"): gain for n, gain in names.items()}
 
 
 def learners(machine: Any) -> dict[str, sg.AbstractModel]:

@@ -4,7 +4,7 @@ A model of one step, ``s' = f(s, a)``, cannot read a log directly: its rows come
 log's own stamps, velocities are not measured, inputs change within a step. Here a state
 is found every ``period`` seconds from the 50 ms of samples around it, and the input of
 a step is the mean of the held one. A delay stays in the machine: the state then carries
-the inputs of past steps (`Actuated`). The windows to be judged by are those of
+the inputs of past steps (`carrying_inputs`). The windows to be judged by are those of
 `sim2gp.data.grid`, and start as those do, from the past alone.
 
 The parabola through 50 ms of a fast swing is off by its third derivative, which a model
@@ -25,30 +25,11 @@ from sim2gp.data.logs import Log
 from sim2gp.data.split_log import inputs_since, knots_of, measured_states
 from sim2gp.data.transitions import Transitions
 from sim2gp.data.windows import Windows
-from sim2gp.systems.actuators import Actuated
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.simulate import simulate
-from sim2gp.systems.variants import Configured
 from sim2gp.types import in_float64
 
 PASSES = 3  # simulations behind a smoothed state
-
-
-def stepping(system: AbstractSystem, period: float) -> AbstractSystem:
-    """The machine as its one-step map needs it: delayed inputs are carried along.
-
-    Its constants are the same, in the same order.
-    """
-    if isinstance(system, Configured):
-        return Configured(stepping(system.system, period), system.parameters)
-    if not (isinstance(system, Actuated) and system.longest_delay > 0.0):
-        return system
-    return Actuated(
-        system.system,
-        parameters=system.parameters,
-        delay_max=system.longest_delay,
-        period=period,
-    )
 
 
 class Steps(eqx.Module):
@@ -94,7 +75,7 @@ class Samples(eqx.Module):
 def samples_of(logs: Sequence[Log], stepper: AbstractSystem, period: float) -> Samples:
     """All states and steps of the logs for which no sample of their 50 ms is masked.
 
-    ``stepper`` is what `stepping` returns.
+    ``stepper`` is what `carrying_inputs` returns.
     """
     names = [channel.name for channel in stepper.physical_states]
     actions = [channel.name for channel in stepper.actions]

@@ -123,7 +123,7 @@ class _Windowed(AbstractLikelihood):
         """``prediction - y`` of one window at ``x = (z, e)``, zero where masked."""
         p = self.prior.mean.size
         tt = self.prior.mean + self.prior.scale @ x[:p]
-        values = self.system.parameters.values(tt, window.configuration)
+        values = self.system.values(tt, window.configuration)
         params = self.system.record(values)
         x0 = window.start + window.start_sd * x[p:]
         states = simulate(self.system, params, window, x0)
@@ -266,7 +266,7 @@ def _linearise(
         own = tt + prior.scale @ x[:-n]
 
         def one(window: Windows, start: Array) -> tuple[Array, ...]:
-            values = system.parameters.values(own, window.configuration)
+            values = system.values(own, window.configuration)
             params = system.record(values)
             states = simulate(system, params, window, start + window.start_sd * x[-n:])
             r = states[:, np.asarray(window.outputs)] - window.y

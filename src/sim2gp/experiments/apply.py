@@ -24,7 +24,7 @@ from sim2gp.project.project import is_model
 from sim2gp.runs import Progress, load_run
 from sim2gp.runs.store import Run, check_absent
 from sim2gp.systems import MuJoCo
-from sim2gp.systems.actuators import bare
+from sim2gp.systems.machine import plant_of
 from sim2gp.systems.mujoco.constants import matching
 from sim2gp.systems.mujoco.load import compiled_all
 from sim2gp.systems.mujoco.model_file import Edited, ModelFile
@@ -58,7 +58,7 @@ def run(
         check_absent(out)
     stored = load_run(run)
     project = _project(run, stored, model)
-    system = bare(project.system)
+    system = plant_of(project.system)
     assert isinstance(system, MuJoCo)
     values, apart = _values(stored, project, system, configuration, posterior)
     progress.say(f"editing {system.source}")
@@ -104,7 +104,7 @@ def _values(
 ) -> tuple[dict[str, float], dict[str, str]]:
     """The model's constants by name, and why the run's other ones are none."""
     joint = project.system.parameters
-    table, places = own_table(joint, configuration)
+    table, places = own_table(joint, project.system.variants, configuration)
     own = modes(stored, joint, posterior)[list(places)]
     found = dict(zip(table.names, own.tolist(), strict=True))
     values = dict(table.fixed) | found

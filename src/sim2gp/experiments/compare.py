@@ -26,7 +26,6 @@ from sim2gp.data.one_step_log import (
     Steps,
     samples_of,
     smoothed_states,
-    stepping,
     steps_of_grid,
     stride_of,
     transitions,
@@ -46,6 +45,7 @@ from sim2gp.models.auto import log_scores
 from sim2gp.models.ensemble import ensemble
 from sim2gp.project import Project
 from sim2gp.runs import Progress, new_run
+from sim2gp.systems.assemble import carrying_inputs
 from sim2gp.systems.base import AbstractSystem
 
 HORIZONS = (0.2, 0.5)  # s
@@ -158,7 +158,7 @@ def prepare(
     longest = max(horizons)
     grid = windows_for(logs, project, longest, longest)
     windows, of = cut_logs(project, logs)
-    stepper = stepping(system, period)
+    stepper = carrying_inputs(system, period)
     samples = samples_of(logs, stepper, period)
     row_log = samples.step_log()
     curve = {round(h / period) for h in (*horizons, *CURVE) if h <= longest + 1e-9}

@@ -42,7 +42,7 @@ from sim2gp.models.features import Encoding
 from sim2gp.models.sim2gp import PRIOR_NOISE
 from sim2gp.project import Project
 from sim2gp.runs import Progress, new_run
-from sim2gp.systems import alone
+from sim2gp.systems import one_variant
 from sim2gp.systems.base import AbstractSystem, index_of
 from sim2gp.types import in_float64
 
@@ -119,8 +119,8 @@ def setting(
     else:
         project, joint, belief = source.project, source.project.system, source.plain
         names, noise, period = source.outputs, source.noise, source.period
-        _, corrected = alone(joint, source.posterior, asked.configuration)
-    system, belief = alone(joint, belief, asked.configuration)
+        _, corrected = one_variant(joint, source.posterior, asked.configuration)
+    system, belief = one_variant(joint, belief, asked.configuration)
     states = [channel.name for channel in system.physical_states]
     period = asked.period or period
     steps = round(asked.seconds / period)

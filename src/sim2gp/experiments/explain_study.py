@@ -22,26 +22,22 @@ from sim2gp.identification.missing_physics.explain import explain
 from sim2gp.planning.coloured_noise import coloured_noise
 from sim2gp.planning.tasks import MACHINES, Task, draw_truth
 from sim2gp.systems import (
-    AbstractSystem,
+    AbstractPlant,
     BaseTilt,
-    Candidate,
     EncoderOffset,
-    InputDelay,
-    InputLag,
-    Lagged,
+    Lag,
     effect,
+    with_parts,
 )
-from sim2gp.systems.base import AbstractMechanism
 from sim2gp.systems.effects.base import (
-    AbstractEffect,
     AbstractForce,
     AbstractInputEffect,
-    Pair,
 )
-from sim2gp.systems.effects.perturbed import perturb
+from sim2gp.systems.effects.units import force_unit
+from sim2gp.systems.mechanism import AbstractMechanism, Pair
+from sim2gp.systems.parts import AbstractPart
 from sim2gp.types import Key, Scalar
 
-Planted = AbstractEffect | InputDelay | InputLag
 EPISODES = 2
 #: Pull back to the middle, V per rad or m; pole speed from which pumping turns round.
 CENTRE = {"furuta": 1.0, "cartpole": 12.0}
@@ -61,8 +57,8 @@ class Cogging(AbstractForce):
     meaning: ClassVar[str] = "cogging of the motor"
     max_substep: ClassVar[float] = 0.005
 
-    def unit(self, system: AbstractMechanism) -> str:
-        return "N m" if system.states[system.joint(self.where)].unit == "rad" else "N"
+    def unit(self, plant: AbstractPlant) -> str:
+        return force_unit(plant, self.where)
 
     def force(
         self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
@@ -93,7 +89,7 @@ class Coupling(AbstractForce):
     meaning: ClassVar[str] = "friction that grows with the pole's speed"
     max_substep: ClassVar[float] = 0.005
 
-    def unit(self, system: AbstractMechanism) -> str:
+    def unit(self, plant: AbstractPlant) -> str:
         return "N m s^2/rad^2"
 
     def force(
@@ -103,28 +99,28 @@ class Coupling(AbstractForce):
         return jnp.zeros_like(q).at[i].set(-x * v[i] * jnp.abs(v[1 - i]))
 
 
-def _middle(machine: str, *names: str) -> dict[str, Planted]:
+def _middle(machine: str, *names: str) -> dict[str, AbstractPart]:
     return {name: effect(machine, name, "middle") for name in names}
 
 
 _SHARED = ("coulomb", "dead_zone", "spring", "delay", "drag")
 #: What is planted, at the catalogue's middle strength where it has the effect.
-PLANTED: dict[str, dict[str, Planted]] = {
+PLANTED: dict[str, dict[str, AbstractPart]] = {
     "furuta": {
         **_middle("furuta", *_SHARED),
-        "lag": InputLag("voltage", 0.015),
+        "lag": Lag("voltage", 0.015),
         "tilt": BaseTilt(magnitude=math.radians(2.0)),
         "encoder": EncoderOffset("alpha", math.radians(2.0)),
     },
     "cartpole": {
         **_middle("cartpole", *_SHARED),
-        "lag": InputLag("voltage", 0.015),
+        "lag": Lag("voltage", 0.015),
         **_middle("cartpole", "tilt"),
         "encoder": EncoderOffset("theta", math.radians(2.0)),
     },
 }
 #: What no library holds.
-OUTSIDE: dict[str, dict[str, Planted]] = {
+OUTSIDE: dict[str, dict[str, AbstractPart]] = {
     "furuta": {
         "cogging": Cogging("theta", 5e-3, 2.0),
         "saturation": Saturation("voltage", 3.0),
@@ -138,7 +134,7 @@ OUTSIDE: dict[str, dict[str, Planted]] = {
 }
 
 
-def planted_task(machine: str, planted: Planted | None, key: Key) -> Task:
+def planted_task(machine: str, planted: AbstractPart | None, key: Key) -> Task:
     """The machine's task with hidden constants and one more effect, float32."""
     make, preset = MACHINES[machine]
     bare = make()
@@ -146,11 +142,7 @@ def planted_task(machine: str, planted: Planted | None, key: Key) -> Task:
     task = preset(truth)
     if planted is None:
         return task
-    system: AbstractSystem
-    if isinstance(planted, InputLag):
-        system = Lagged(bare, planted.where, planted.magnitude, period=task.dt)
-    else:
-        system = perturb(bare, [planted], period=task.dt)
+    system = with_parts(bare, [planted], period=task.dt)
     fixed = {k: jnp.asarray(v, jnp.float32) for k, v in system.parameters.fixed}
     record = system.record(task.truth | fixed)
     dynamics = system.bind(record, task.dt)
@@ -180,7 +172,7 @@ def _fly(
 
 
 def flights(
-    machine: str, planted: Planted | None, key: Key
+    machine: str, planted: AbstractPart | None, key: Key
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """States (T + 1, n) and inputs (T, m) of two episodes on one hidden machine."""
     hidden, flown = jax.random.split(key)
@@ -200,18 +192,18 @@ def flights(
     ]
 
 
-def data_of(machine: str, planted: Planted | None, key: Key) -> OneStepData:
+def data_of(machine: str, planted: AbstractPart | None, key: Key) -> OneStepData:
     """What `explain` sees of them."""
     make, _ = MACHINES[machine]
     return OneStepData(make(), flights(machine, planted, key))
 
 
-def scaled(planted: Planted, strength: float) -> Planted:
+def scaled(planted: AbstractPart, strength: float) -> AbstractPart:
     """The same effect, so many times as strong."""
     return dataclasses.replace(planted, magnitude=strength * planted.magnitude)
 
 
-def settings(machine: str) -> dict[str, Planted | None]:
+def settings(machine: str) -> dict[str, AbstractPart | None]:
     """Everything that is planted on a machine, by name: nothing, effects, others."""
     return {NOTHING: None, **PLANTED[machine], **OUTSIDE[machine]}
 
@@ -238,7 +230,7 @@ def cell(
     ranked = [r.scored.candidate.name for r in found.search.refitted]
     scored = sorted((s for s in found.search.scored if not s.alias), key=_falling)
     inside = name in PLANTED[machine] and planted is not None
-    truth = Candidate(planted).name if inside and planted is not None else ""
+    truth = planted.name if inside and planted is not None else ""
     best = found.search.refitted[0] if ranked else None
     return {
         "machine": machine,

@@ -43,7 +43,7 @@ def _row(s: Scored, refit: Refitted | None, found: Explanation) -> dict[str, Any
         "effect": what,
         "where": where,
         "parameter": name,
-        "meaning": s.candidate.meaning,
+        "meaning": s.candidate.effect.meaning,
         "unit": constant.unit,
         "evidence_gain": gain,
         "value": value,
@@ -105,7 +105,7 @@ def _said(best: Refitted) -> str:
     candidate = best.scored.candidate
     unit = best.scored.system.parameters[candidate.name].unit
     size = f"{quantity(best.value, '')} ± {quantity(_two(best.sd), unit)}"
-    text = f"{candidate.meaning} ({candidate.name} = {size}, "
+    text = f"{candidate.effect.meaning} ({candidate.name} = {size}, "
     text += f"{best.gain:.0f} nats of evidence"
     if best.inflation > 1.0:
         text += f", errors taken as correlated over {best.inflation:.0f} samples"

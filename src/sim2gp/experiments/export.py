@@ -12,7 +12,7 @@ import jax
 from sim2gp.experiments.identified import Identified, Width, used
 from sim2gp.robot.export import write_model
 from sim2gp.runs import Progress
-from sim2gp.systems import alone
+from sim2gp.systems import one_variant
 
 
 def run(
@@ -30,7 +30,7 @@ def run(
     Raises `InputError` E152 for a machine in several configurations and none named.
     """
     known = fit.posterior if posterior == "corrected" else fit.plain
-    system, own = alone(fit.project.system, known, configuration)
+    system, own = one_variant(fit.project.system, known, configuration)
     progress.say(f"drawing {draws} machines from the {posterior} posterior")
     about = {"run": fit.run.name, **used(fit.summary, posterior)}
     key = jax.random.key(seed)

@@ -18,10 +18,10 @@ from sim2gp.errors import InputError
 from sim2gp.identification.forecast import Band
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.parameters import Parameters
-from sim2gp.inference.variants import index_of
 from sim2gp.project import Project, load_project
 from sim2gp.runs import load_run
 from sim2gp.runs.store import Run
+from sim2gp.systems.variants import index_of
 from sim2gp.types import in_float64
 
 PROJECT = "project.toml"  # the file's name in a run
@@ -59,7 +59,7 @@ class Identified(NamedTuple):
         self, logs: Sequence[Path], configuration: str | None, *, strict: bool
     ) -> tuple[Log, ...]:
         """Logs of the machine in one configuration (E152 where it has several)."""
-        index_of(configuration, self.project.system.parameters.configurations)
+        index_of(configuration, self.project.system.variants)
         found = self.project.read_logs(logs, configuration)
         if strict:
             none_unused(found)

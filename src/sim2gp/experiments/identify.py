@@ -218,7 +218,7 @@ def _summarise(
     rows = sum(len(log) for log in logs)
     actions = [channel.name for channel in system.actions]
     about = told_intervals(system, honest, found["parameters"], len(windows))
-    listed = told(system.parameters, logs, found["parameters"])
+    listed = told(system, logs, found["parameters"])
     listed["tables"] = [*lacking_table(about), *listed.get("tables", ())]
     return {
         "command": "identify",

@@ -1,7 +1,7 @@
 """The mismatch map: every learner under five effects at three strengths (Furuta).
 
 Registered before it is run: the effects and strengths of the catalogue
-(`sim2gp.systems.effects.perturbed`), scores of the third episode, and the cumulative
+(`sim2gp.systems.effects.strengths`), scores of the third episode, and the cumulative
 regret of the model that chooses, against the best model that was fixed beforehand.
 """
 
@@ -31,7 +31,7 @@ from sim2gp.experiments.swingup import (
 from sim2gp.planning.tasks import SOLVED
 from sim2gp.runs import Progress, new_run
 from sim2gp.runs.cells import Old
-from sim2gp.systems.effects.perturbed import STRENGTHS
+from sim2gp.systems.effects.strengths import STRENGTHS
 
 MACHINE = "furuta"
 EFFECTS = ("coulomb", "dead_zone", "spring", "delay", "drag")

@@ -18,6 +18,7 @@ from sim2gp.experiments.prediction import Picture
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.systems import CartPole, Furuta, MuJoCo, TwoLink, UniformRodArm
 from sim2gp.systems.base import AbstractSystem
+from sim2gp.systems.machine import plant_of
 from sim2gp.types import in_float64
 
 if TYPE_CHECKING:
@@ -47,9 +48,7 @@ def film(
     ``picture`` is what `sim2gp.experiments.prediction.drawn` made of ``grid``. Of a
     machine in several configurations the film keeps to that of its first window.
     """
-    machine = system
-    while hasattr(machine, "system"):
-        machine = machine.system
+    machine = plant_of(system)
     (which,) = picture["which"]
     if not len(which):
         return {}, {}
@@ -66,7 +65,7 @@ def film(
     about, arrays = _drawing(machine, constants, motion, dt)
     if not about:
         return {}, {}
-    several = system.parameters.configurations
+    several = system.variants
     if several:
         title = f"{title}; the machine {several[configuration[0]].name}"
     unseen = [n for n in joints if n not in columns]
@@ -109,7 +108,7 @@ def _constants(
     system: AbstractSystem, posterior: Gaussian, configuration: int
 ) -> dict[str, float]:
     mean = jnp.asarray(posterior.mean, float)
-    values = system.parameters.values(mean, configuration)
+    values = system.values(mean, configuration)
     return {name: float(value) for name, value in values.items()}
 
 

@@ -36,16 +36,17 @@ from sim2gp.planning.oracle import accept_truth, flights
 from sim2gp.planning.tasks import MACHINES, Task, draw_truth, hanging_return, score
 from sim2gp.runs import Progress
 from sim2gp.runs.cells import Cells, Old
-from sim2gp.systems import Candidate
-from sim2gp.systems.base import AbstractMechanism
-from sim2gp.systems.effects.base import AbstractEffect, RailFriction, Spring
-from sim2gp.systems.effects.perturbed import InputDelay, effect
+from sim2gp.systems import Delay, free_parts
+from sim2gp.systems.base import AbstractPlant
+from sim2gp.systems.effects.friction import RailFriction
+from sim2gp.systems.effects.springs import Spring
+from sim2gp.systems.effects.strengths import effect
+from sim2gp.systems.parts import AbstractPart
 
-Effect = AbstractEffect | InputDelay
 Group = TypeVar("Group")
 #: Physics that the real machine has in the mismatched cells of figure 2, fixed before
 #: anything was run: a cable spring (N m/rad), strong Coulomb friction.
-MISSING: dict[str, Effect] = {
+MISSING: dict[str, AbstractPart] = {
     "furuta": Spring("theta", 0.02),
     "cartpole": RailFriction(magnitude=0.1),
 }
@@ -68,16 +69,16 @@ Options = Mapping[str, Any]
 
 
 def _with_term(
-    system: AbstractMechanism, missing: Effect, options: Options
+    system: AbstractPlant, missing: AbstractPart, options: Options
 ) -> AbstractModel:
     del options
-    if isinstance(missing, InputDelay):  # its magnitude bounds a candidate's delay
+    if isinstance(missing, Delay):  # its magnitude bounds a candidate's delay
         missing = replace(missing, magnitude=2.0 * missing.magnitude)
-    return Sim2GP(Candidate(missing).freed(system, period=PERIOD))
+    return Sim2GP(free_parts(system, [missing], period=PERIOD))
 
 
 def _auto(
-    system: AbstractMechanism, missing: Effect, options: Options
+    system: AbstractPlant, missing: AbstractPart, options: Options
 ) -> AbstractModel:
     del missing
     sim = Sim2GP(system)
@@ -85,7 +86,7 @@ def _auto(
 
 
 #: Each learner, made of the simulator, the physics that it lacks, and its options.
-METHODS: dict[str, Callable[[AbstractMechanism, Effect, Options], AbstractModel]] = {
+METHODS: dict[str, Callable[[AbstractPlant, AbstractPart, Options], AbstractModel]] = {
     "SIM2GP": lambda system, _, __: Sim2GP(system),
     "point estimate": lambda system, _, __: PointEstimate(Sim2GP(system)),
     "NLM": lambda system, _, options: NLM(system, **options),
@@ -103,7 +104,7 @@ METHODS: dict[str, Callable[[AbstractMechanism, Effect, Options], AbstractModel]
 
 
 #: Trained in a world that real episodes do not change; and in which one.
-TRAINED: dict[str, Callable[[Task, AbstractMechanism], World]] = {
+TRAINED: dict[str, Callable[[Task, AbstractPlant], World]] = {
     "off-policy oracle": lambda task, _: oracle_world(task),
     "domain randomisation": lambda task, system: randomised_world(
         task, system, Sim2GP(system).prior
@@ -116,7 +117,7 @@ def planner_of(quick: bool, planning: str = "mpc") -> AbstractPlanner:
     return (QUICK_PLANNERS if quick else PLANNERS)[planning]
 
 
-def reach_of(task: Task, system: AbstractMechanism) -> dict[str, float]:
+def reach_of(task: Task, system: AbstractPlant) -> dict[str, float]:
     """The box of states that models are trusted in, by channel."""
     bound = np.asarray(task.trusted, float).tolist()
     pairs = zip(system.states, bound, strict=True)
@@ -170,7 +171,7 @@ class Cell:
         return told | {"training": QUICK_TRAINING}
 
 
-def missing(machine: str, condition: str) -> Effect:
+def missing(machine: str, condition: str) -> AbstractPart:
     """The physics that a condition is about; the nominal one has figure 2's."""
     if condition in CONDITIONS:
         return MISSING[machine]
@@ -178,7 +179,7 @@ def missing(machine: str, condition: str) -> Effect:
     return effect(machine, name, strength)
 
 
-def effects_of(machine: str, condition: str) -> tuple[Effect, ...]:
+def effects_of(machine: str, condition: str) -> tuple[AbstractPart, ...]:
     """What the real machine has and its simulator lacks.
 
     Nominal is figure 2's effect of no magnitude: both conditions are one program.

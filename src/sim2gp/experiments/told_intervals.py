@@ -9,8 +9,9 @@ import numpy as np
 from sim2gp.identification.intervals import scatter as intervals
 from sim2gp.identification.intervals.scatter import NOTHING, Corrected
 from sim2gp.identification.words import digits
+from sim2gp.systems.assemble import free_parts
 from sim2gp.systems.base import AbstractSystem
-from sim2gp.systems.effects.library import smooth_effects, with_effects
+from sim2gp.systems.effects.registry import smooth_effects
 from sim2gp.types import in_float64
 
 
@@ -38,7 +39,7 @@ def told_intervals(
 def _effects(system: AbstractSystem, honest: Corrected) -> dict[str, dict[str, Any]]:
     if honest.lacking is None:
         return {}
-    table = with_effects(system, smooth_effects(system)).parameters
+    table = free_parts(system, smooth_effects(system)).parameters
     mean, sd = (np.asarray(x) for x in (honest.lacking.mean, honest.lacking.sd()))
     return {
         name: {

@@ -117,7 +117,7 @@ def _forecast(
 
     def predict(window: Windows, x: Array) -> Array:
         tt = posterior.mean + posterior.scale @ x[n + m :]
-        params = system.record(system.parameters.values(tt, window.configuration))
+        params = system.record(system.values(tt, window.configuration))
         more = window.knots[:, None] * x[n : n + m][None]
         moved = eqx.tree_at(lambda w: w.area, window, window.area + more)
         states = simulate(system, params, moved, window.start + x[:n])

@@ -23,7 +23,6 @@ from sim2gp.errors import InputError, nearest
 from sim2gp.inference import bijections
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.linear_measurements import Weighed, residuals
-from sim2gp.inference.variants import Configuration, Which, valued
 from sim2gp.types import Scalar
 
 #: Standard deviation of a boxed parameter's virtual value: the box is nearly uniform
@@ -219,15 +218,12 @@ def _impossible(p: Parameter, mean: float, sd: float, expected: str) -> InputErr
 class Parameters(eqx.Module):
     """The table of a system's constants: those to be learned, and those held fixed.
 
-    Of a machine in several ``configurations``, the columns of all of them: ``mass`` for
-    those that share it, ``mass @ payload`` where a configuration has its own. Sums of
-    constants that were ``weighed`` are part of every fit. Raises `InputError` E148 for
-    a value held fixed that is not finite.
+    Sums of constants that were ``weighed`` are part of every fit. Raises `InputError`
+    E148 for a value held fixed that is not finite.
     """
 
     free: tuple[Parameter, ...] = eqx.field(static=True)
     fixed: tuple[tuple[str, float], ...] = eqx.field(static=True, default=())
-    configurations: tuple[Configuration, ...] = eqx.field(static=True, default=())
     weighed: tuple[Weighed, ...] = eqx.field(static=True, default=())
 
     def __check_init__(self) -> None:
@@ -282,29 +278,20 @@ class Parameters(eqx.Module):
         by_tt = jnp.linalg.solve(prior.scale.T, gradient)
         return prior.scale.T @ ((by_tt * bend)[:, None] * prior.scale)
 
-    def values(
-        self, tt: Float[Array, " p"], configuration: Which = None
-    ) -> dict[str, Scalar]:
-        """Every constant by name, in physical units: the free ones and the fixed.
-
-        ``configuration`` is an index; only a table that has several needs it (E152).
-        """
-        return valued(self._columns(tt), self.configurations, configuration)
+    def values(self, tt: Float[Array, " p"]) -> dict[str, Scalar]:
+        """Every constant by name, in physical units: the free ones and the fixed."""
+        theta = self.constrain(tt)
+        values = {name: jnp.asarray(v, tt.dtype) for name, v in self.fixed}
+        return values | {p.name: theta[i] for i, p in enumerate(self.free)}
 
     def known(self, prior: Gaussian, z: Float[Array, " p"]) -> Float[Array, "q p1"]:
         """Rows ``[K r]`` of what was weighed, in its sd, at ``tt = mu0 + L0 z``."""
 
         def r(z: Array) -> Array:
-            values = self._columns(prior.mean + prior.scale @ z)
+            values = self.values(prior.mean + prior.scale @ z)
             return residuals(self.weighed, values, z)
 
         return jnp.concatenate([jax.jacfwd(r)(z), r(z)[:, None]], axis=1)
-
-    def _columns(self, tt: Float[Array, " p"]) -> dict[str, Scalar]:
-        """Every column, and every fixed value."""
-        theta = self.constrain(tt)
-        values = {name: jnp.asarray(v, tt.dtype) for name, v in self.fixed}
-        return values | {p.name: theta[i] for i, p in enumerate(self.free)}
 
     def prior(self) -> Gaussian:
         """The independent Gaussian over virtual values; call it under `in_float64`."""
@@ -344,9 +331,7 @@ class Parameters(eqx.Module):
 
     def merge(self, other: "Parameters") -> "Parameters":
         """Both tables as one, this one's constants first."""
-        mine, more = (
-            (x.free, x.fixed, x.configurations, x.weighed) for x in (self, other)
-        )
+        mine, more = ((x.free, x.fixed, x.weighed) for x in (self, other))
         return Parameters(*(a + b for a, b in zip(mine, more, strict=True)))  # type: ignore[arg-type]
 
     def _groups(self, dtype: Any) -> list[tuple[str, np.ndarray, Any, Any]]:

@@ -20,9 +20,15 @@ from jaxtyping import Array, Bool, Float
 
 from sim2gp import checks
 from sim2gp.errors import InputError
-from sim2gp.systems import AbstractEffect, AbstractSystem, CartPole, Furuta, InputDelay
-from sim2gp.systems.base import AbstractMechanism
-from sim2gp.systems.effects.perturbed import perturb
+from sim2gp.systems import (
+    AbstractEffect,
+    AbstractPart,
+    AbstractPlant,
+    AbstractSystem,
+    CartPole,
+    Furuta,
+    with_parts,
+)
 from sim2gp.types import (
     Action,
     Box,
@@ -191,13 +197,12 @@ def _total(terms: Mapping[str, Scalar]) -> Scalar:
     return sum(rest, first)
 
 
-def furuta_swingup(
-    truth: Any = None, effects: Sequence[AbstractEffect | InputDelay] = ()
-) -> Task:
+def furuta_swingup(truth: Any = None, effects: Sequence[AbstractPart] = ()) -> Task:
     """Swing up the Furuta pendulum; ``truth`` None is the published machine.
 
-    ``truth`` is a record of constants (`draw_truth`); ``effects`` are physics that the
-    real machine has and its bare model lacks. State: theta, alpha, and their rates.
+    ``truth`` is a record of constants (`draw_truth`); ``effects`` are what the real
+    machine has and its model lacks: effects, delays, lags or offsets. State: theta,
+    alpha, and their rates.
     """
     return _preset(
         Furuta(),
@@ -214,9 +219,7 @@ def furuta_swingup(
     )
 
 
-def cartpole_swingup(
-    truth: Any = None, effects: Sequence[AbstractEffect | InputDelay] = ()
-) -> Task:
+def cartpole_swingup(truth: Any = None, effects: Sequence[AbstractPart] = ()) -> Task:
     """Swing up the cart-pole; ``truth`` None is the published machine.
 
     Arguments as in `furuta_swingup`. State: x, theta, and their rates.
@@ -238,7 +241,7 @@ def cartpole_swingup(
 
 
 #: Each machine that has a task, and its task: of a record and effects, both optional.
-MACHINES: dict[str, tuple[Callable[[], AbstractMechanism], Callable[..., Task]]] = {
+MACHINES: dict[str, tuple[Callable[[], AbstractPlant], Callable[..., Task]]] = {
     "furuta": (Furuta, furuta_swingup),
     "cartpole": (CartPole, cartpole_swingup),
 }
@@ -311,31 +314,31 @@ def episodes_to_95(
 
 
 def _preset(
-    bare: AbstractMechanism,
+    plant: AbstractPlant,
     truth: Any,
-    effects: Sequence[AbstractEffect | InputDelay],
+    effects: Sequence[AbstractPart],
     *,
     dt: float = 0.02,
     **fields: Any,
 ) -> Task:
-    """A task on ``bare`` with ``effects``; all arrays float32."""
+    """A task on ``plant`` with ``effects``; all arrays float32."""
     # Magnitudes are data: one program serves every strength, none included.
     kinds = [
         dataclasses.replace(e, magnitude=0.0) if isinstance(e, AbstractEffect) else e
         for e in effects
     ]
-    system: AbstractSystem = perturb(bare, kinds, period=dt)
-    record = bare.nominal() if truth is None else truth
-    values = _values(record, bare)
-    # An effect's magnitude is a fixed constant of the perturbed machine's table.
+    system = with_parts(plant, kinds, period=dt)
+    record = plant.nominal() if truth is None else truth
+    values = _values(record, plant)
+    # An effect's magnitude is a fixed constant of the machine's table.
     strengths = {e.name: e.magnitude for e in effects if isinstance(e, AbstractEffect)}
     values |= {
         name: jnp.asarray(strengths.get(name, value), jnp.float32)
         for name, value in system.parameters.fixed
         if name not in values
     }
-    low = _single(*(channel.low for channel in bare.actions))
-    high = _single(*(channel.high for channel in bare.actions))
+    low = _single(*(channel.low for channel in plant.actions))
+    high = _single(*(channel.high for channel in plant.actions))
     return Task(
         dynamics=system.bind(system.record(values), dt),
         truth=values,

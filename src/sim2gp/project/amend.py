@@ -12,21 +12,21 @@ from sim2gp.errors import InputError, Sim2GPError
 from sim2gp.project.project import Project
 from sim2gp.project.replace import key, replace_project
 from sim2gp.project.schema import EFFECT_OPTIONS
-from sim2gp.systems import AbstractEffect, Candidate, InputDelay
+from sim2gp.systems import Candidate, Delay, Lag
 
 
 def lines_for(candidate: Candidate) -> tuple[str, list[str]]:
     """Header and lines of the table that frees a candidate (E160 for a lag)."""
     effect = candidate.effect
     where = key(effect.where)
-    if isinstance(effect, AbstractEffect):
+    if not isinstance(effect, Delay | Lag):
         lines = ["mean = 0.0", f"sd = {effect.magnitude!r}"]
         for field in dataclasses.fields(effect):
             value = getattr(effect, field.name)
             if field.name in EFFECT_OPTIONS and value != field.default:
                 lines.append(f"{field.name} = {value!r}")
         return f"[effects.{where}.{effect.what}]", lines
-    if isinstance(effect, InputDelay):
+    if isinstance(effect, Delay):
         box = f"{{low = 0.0, high = {effect.magnitude!r}}}"
         return f"[actuators.{where}]", [f"delay = {box}"]
     raise InputError(

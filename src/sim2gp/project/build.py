@@ -11,12 +11,10 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from sim2gp.errors import InputError
 from sim2gp.inference.parameters import Parameter, Parameters, unknown_parameter
-from sim2gp.inference.variants import AT
 from sim2gp.project import slips
-from sim2gp.project.effects import perturbed
+from sim2gp.project.effects import with_effects
 from sim2gp.project.priors import located, prior
 from sim2gp.project.schema import (
-    ActuatorSpec,
     ColumnSpec,
     LogSpec,
     ParameterSpec,
@@ -24,14 +22,16 @@ from sim2gp.project.schema import (
 )
 from sim2gp.project.source import Source
 from sim2gp.project.validate import unknown, words, wrong_value
-from sim2gp.systems import AbstractSystem
-from sim2gp.systems.actuators import Actuated, actuator_prior
+from sim2gp.systems import AbstractPlant, AbstractSystem, with_parts
+from sim2gp.systems.actuators import neutral_actuators
+from sim2gp.systems.machine import plant_of
+from sim2gp.systems.variants import AT
 
 
 def build_system(
-    spec: ProjectSpec, source: Source, kind: type[AbstractSystem]
+    spec: ProjectSpec, source: Source, kind: type[AbstractPlant]
 ) -> AbstractSystem:
-    """The machine of the file, wrapped by its actuators (E141, E145, E160)."""
+    """The machine of the file, with effects and actuators (E141, E145, E160)."""
     options = _options(spec.options, source, kind)
     try:
         plain = kind(**options)
@@ -48,14 +48,12 @@ def build_system(
         ) from error
     shared = {k: v for k, v in spec.parameters.items() if AT not in k}
     table = _table(plain.parameters, shared, source, ("parameters",))
-    system: AbstractSystem = kind(parameters=table, **options)
-    if spec.effects:
-        system = perturbed(system, spec.effects, source)
-    return actuated(system, spec.actuators, source)
+    plant: Any = kind(parameters=table, **options)
+    return with_actuators(with_effects(plant, spec.effects, source), spec, source)
 
 
 def _options(
-    options: Mapping[str, Any], source: Source, kind: type[AbstractSystem]
+    options: Mapping[str, Any], source: Source, kind: type[AbstractPlant]
 ) -> dict[str, Any]:
     """The options that the class takes, each of its declared type."""
     hints = get_type_hints(kind.__init__)
@@ -105,26 +103,29 @@ def _table(
     return table.replace(**changes)
 
 
-def actuated(
-    system: AbstractSystem, specs: Mapping[str, ActuatorSpec], source: Source
+def with_actuators(
+    system: AbstractSystem, spec: ProjectSpec, source: Source
 ) -> AbstractSystem:
-    """The machine behind its actuators; what the file does not name is neutral."""
-    if not specs:
+    """The machine with its actuators; what the file does not name is neutral."""
+    if not spec.actuators:
         return system
-    channels = {channel.name: channel for channel in system.actions}
+    plant, inputs = plant_of(system), [channel.name for channel in system.actions]
     stated: dict[str, Parameter | float] = {}
-    for name, spec in specs.items():
-        if name not in channels:
-            raise unknown("input", name, channels, source.where("actuators", name))
-        for part in ("gain", "offset", "delay"):
-            said = getattr(spec, part)
-            where = source.where("actuators", name, part)
-            base = actuator_prior(channels[name], part)
-            own = None if part == "delay" else ActuatorSpec.model_fields[part].default
-            chosen = base if said == "free" else prior(said, base, where, own)
-            _check_delay(part, chosen, where)
-            stated[f"{name}.{part}"] = chosen
-    return Actuated(system, stated)
+    for name in spec.actuators:
+        if name not in inputs:
+            raise unknown("input", name, inputs, source.where("actuators", name))
+    parts = neutral_actuators(system.actions)
+    for part in parts:
+        if part.where not in spec.actuators:
+            continue
+        said = getattr(spec.actuators[part.where], part.what)
+        where = source.where("actuators", part.where, part.what)
+        base = part.parameter(plant)
+        own = None if part.what == "delay" else part.magnitude
+        chosen = base if said == "free" else prior(said, base, where, own)
+        _check_delay(part.what, chosen, where)
+        stated[part.name] = chosen
+    return with_parts(system, parts, stated)
 
 
 def _check_delay(part: str, stated: Parameter | float, where: str) -> None:

@@ -1,4 +1,4 @@
-"""Groups of logs as configurations of one machine, and sums that were weighed.
+"""Groups of logs as variants of one machine, and sums that were weighed.
 
     [[logs]]                                  [[logs]]
     name = "bare"                             name = "payload"
@@ -13,13 +13,13 @@ from collections.abc import Mapping
 from sim2gp.errors import InputError
 from sim2gp.inference.linear_measurements import Weighed
 from sim2gp.inference.parameters import Parameter, unknown_parameter
-from sim2gp.inference.variants import AT, Configuration
 from sim2gp.project.priors import located, prior
 from sim2gp.project.schema import ParameterSpec, ProjectSpec
 from sim2gp.project.source import Source
-from sim2gp.systems import AbstractSystem, configured
+from sim2gp.systems import AbstractSystem, Variant, with_variants
+from sim2gp.systems.assemble import with_weighed
 from sim2gp.systems.function_checks import names_of
-from sim2gp.systems.variants import with_weighed
+from sim2gp.systems.variants import AT
 
 
 def in_configurations(
@@ -51,9 +51,9 @@ def in_configurations(
     for name, i in places.items():
         group = spec.logs[i]
         fixed = tuple(group.fixed.items())
-        found.append(Configuration(name, fixed, tuple(group.free)))
+        found.append(Variant(name, fixed, tuple(group.free)))
         try:  # alone, so that a fault has its group's place
-            configured(system, found[-1:])
+            with_variants(system, found[-1:])
         except InputError as error:
             wrong = str(error.got).split(" ")[0]
             if wrong in group.free or not group.fixed:
@@ -62,7 +62,7 @@ def in_configurations(
                 where = source.where("logs", i, "fixed", wrong)
             raise located(error, where) from error
     priors = _priors(spec, source, system, found)
-    return configured(system, found, priors)
+    return with_variants(system, found, priors)
 
 
 def weighed(
@@ -99,11 +99,11 @@ def _priors(
     spec: ProjectSpec,
     source: Source,
     system: AbstractSystem,
-    configurations: list[Configuration],
+    variants: list[Variant],
 ) -> dict[str, Parameter]:
     """What the file says of columns of one configuration."""
     table = system.parameters
-    columns = {c.column(name): name for c in configurations for name in c.own}
+    columns = {c.column(name): name for c in variants for name in c.own}
     priors = {}
     for column in own_columns(spec.parameters):
         where = source.where("parameters", column)

@@ -1,4 +1,4 @@
-"""Physics that the file adds to a bundled machine: what is possible, and its prior.
+"""Physics that the file adds to a machine: what is possible, and its prior.
 
     [effects.theta.coulomb]
     mean = 0.0
@@ -7,11 +7,7 @@
 An effect that changes nothing of the machine's equations on its channel is an error.
 """
 
-import dataclasses
 from collections.abc import Collection, Mapping
-from typing import Any
-
-import jax.numpy as jnp
 
 from sim2gp.errors import InputError, nearest
 from sim2gp.inference.parameters import Parameter
@@ -19,88 +15,50 @@ from sim2gp.project.priors import prior
 from sim2gp.project.schema import EFFECT_OPTIONS, EffectSpec
 from sim2gp.project.source import Source
 from sim2gp.project.validate import unknown
-from sim2gp.systems import AbstractMechanism, AbstractSystem, Perturbed
-from sim2gp.systems.effects import base as effects
-from sim2gp.systems.effects import placement
-from sim2gp.systems.effects.base import AbstractEffect
-
-#: Effects by the last part of their constant's name, ``<channel>.<effect>``.
-EFFECTS: dict[str, Any] = {
-    kind.what: kind
-    for kind in (
-        effects.BackEmf,
-        placement.BaseTilt,
-        placement.BaseTiltSide,
-        effects.Coulomb,
-        effects.DeadZone,
-        effects.Drag,
-        placement.EncoderOffset,
-        placement.Payload,
-        effects.PoleGeometry,
-        effects.RailFriction,
-        effects.RailTilt,
-        effects.RodInertia,
-        effects.Spring,
-        effects.Stribeck,
-    )
-}
+from sim2gp.systems import AbstractPart, AbstractPlant, AbstractSystem, with_parts
+from sim2gp.systems.effects.registry import (
+    ALIASES,
+    NAMES,
+    named,
+    options_of,
+    possible,
+)
 
 
-def perturbed(
-    system: AbstractSystem,
+def with_effects(
+    plant: AbstractPlant,
     specs: Mapping[str, Mapping[str, EffectSpec | float]],
     source: Source,
 ) -> AbstractSystem:
     """The machine with the effects of the file; magnitudes are constants by name."""
-    assert isinstance(system, AbstractMechanism)  # as every class of `SYSTEMS` is
-    added: list[AbstractEffect] = []
+    parts: list[AbstractPart] = []
     stated: dict[str, Parameter | float] = {}
     for where, kinds in specs.items():
         for what, said in kinds.items():
             line = source.where("effects", where, what)
-            if not _possible(system, what, where):
-                raise _impossible(system, what, where, line)
-            effect = _effect(what, where, said, line)
-            added.append(effect)
-            base = effect.parameter(system)
-            stated[effect.name] = prior(said, base, line, own=0.0)
-    table = Perturbed(system, added).parameters.replace(**stated)
-    return Perturbed(system, added, table)
+            if not possible(plant, what, where):
+                raise _impossible(plant, what, where, line)
+            options = effect_options(what, said, options_of(what), line)
+            part = named(what, where, 1.0, **options)
+            parts.append(part)
+            stated[part.name] = prior(said, part.parameter(plant), line, own=0.0)
+    return with_parts(plant, parts, stated)
 
 
-def _possible(system: AbstractMechanism, what: str, where: str) -> bool:
-    """Whether a machine can have an effect: it changes its equations in motion.
-
-    The zero of an encoder does not where nothing depends on the joint's position.
-    """
-    try:
-        changed = Perturbed(system, [EFFECTS[what](where=where, magnitude=1.0)])
-    except (InputError, KeyError):
-        return False
-    q, v = jnp.full(2, 0.7), jnp.full(2, 0.9)
-    a = jnp.asarray([min(0.3 * channel.high, 1.0) for channel in system.actions])
-    before, after = (
-        jnp.stack([*s.inertia(p, q), *s.forces(p, q, v, a)])
-        for s, p in ((system, system.nominal()), (changed, changed.nominal()))
-    )
-    return bool(jnp.any(before != after))
-
-
-def _impossible(
-    system: AbstractMechanism, what: str, where: str, line: str
-) -> InputError:
+def _impossible(plant: AbstractPlant, what: str, where: str, line: str) -> InputError:
     """An effect that no machine, this one, or this channel has (E103, E145, E160)."""
-    channels = [c.name for c in (*system.states[:2], *system.actions)]
+    joints = [c.name for c in plant.physical_states if c.unit in ("rad", "m")]
+    channels = [*joints, *(c.name for c in plant.actions)]
     known = {
-        channel: [kind for kind in EFFECTS if _possible(system, kind, channel)]
+        channel: [kind for kind in NAMES if possible(plant, kind, channel)]
         for channel in channels
     }
-    homes = [channel for channel in channels if what in known[channel]]
+    homes = [channel for channel in channels if possible(plant, what, channel)]
     every = sorted({kind for kinds in known.values() for kind in kinds})
-    if where in EFFECTS:  # [effects.coulomb] and below it the keys of a prior
+    if where in (*NAMES, *ALIASES):  # [effects.coulomb] and below it a prior's keys
         code, wrong, got, names = "E103", "unknown channel", where, channels
         fix = f"write [effects.CHANNEL.{where}]"
-    elif what not in EFFECTS:
+    elif what not in (*NAMES, *ALIASES):
         return unknown("effect", what, known.get(where, every), line)
     elif homes and where not in channels:
         code, wrong, got, names = "E103", "unknown channel", where, homes
@@ -118,16 +76,6 @@ def _impossible(
         expected="one of " + ", ".join(names),
         fix=fix,
     )
-
-
-def _effect(
-    what: str, where: str, said: EffectSpec | float, line: str
-) -> AbstractEffect:
-    """The effect of a name on a channel, with the options it has (E160)."""
-    known = [field.name for field in dataclasses.fields(EFFECTS[what])]
-    options = effect_options(what, said, known[2:], line)
-    made: AbstractEffect = EFFECTS[what](where=where, magnitude=1.0, **options)
-    return made
 
 
 def effect_options(

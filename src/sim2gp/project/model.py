@@ -13,18 +13,16 @@ from pathlib import Path
 
 from sim2gp.errors import InputError
 from sim2gp.inference.parameters import Parameter
-from sim2gp.inference.variants import AT
-from sim2gp.project.build import actuated
-from sim2gp.project.effects import effect_options
+from sim2gp.project.build import with_actuators
+from sim2gp.project.effects import with_effects
 from sim2gp.project.priors import located, prior
 from sim2gp.project.schema import ParameterSpec, ProjectSpec
 from sim2gp.project.source import Source
 from sim2gp.project.validate import unknown
 from sim2gp.systems import AbstractSystem, MuJoCo
-from sim2gp.systems.base import AbstractPlant
 from sim2gp.systems.mujoco.constants import SIGNED, Constant, constants_of, matching
 from sim2gp.systems.mujoco.system import default_prior, loaded
-from sim2gp.systems.sensors import Zeroed, offset_prior
+from sim2gp.systems.variants import AT
 
 
 def build_model(
@@ -67,27 +65,10 @@ def build_model(
             groups.append([c.path for c in group])
             priors[group[0].path] = _prior(stated, group[0], model, where)
     try:
-        system: AbstractPlant = MuJoCo(model, groups or None, priors, source=path)
+        plant = MuJoCo(model, groups or None, priors, source=path)
     except InputError as error:
         raise located(error, source.where("parameters")) from error
-    return actuated(_zeroed(system, spec, source), spec.actuators, source)
-
-
-def _zeroed(system: AbstractPlant, spec: ProjectSpec, source: Source) -> AbstractPlant:
-    """The machine behind encoders with offsets, the one effect that a model has."""
-    offsets: dict[str, Parameter | float] = {}
-    for joint, kinds in spec.effects.items():
-        for what, said in kinds.items():
-            line = source.where("effects", joint, what)
-            if what != "encoder":
-                raise unknown("effect", what, ("encoder",), line)
-            try:
-                base = offset_prior(system, joint)
-            except InputError as error:
-                raise located(error, line) from error
-            effect_options(what, said, (), line)
-            offsets[joint] = prior(said, base, line, own=0.0)
-    return Zeroed(system, offsets) if offsets else system
+    return with_actuators(with_effects(plant, spec.effects, source), spec, source)
 
 
 def _root(spec: ProjectSpec, source: Source, folder: Path) -> Path | None:

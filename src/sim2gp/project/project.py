@@ -27,7 +27,7 @@ from sim2gp.project.source import Source, read_source
 from sim2gp.project.validate import validated
 
 if TYPE_CHECKING:
-    from sim2gp.systems import AbstractSystem
+    from sim2gp.systems import AbstractPlant, AbstractSystem
 
 #: Names of a project file -> module and class in sim2gp.systems.
 SYSTEMS = {
@@ -251,10 +251,10 @@ def unknown_system(name: str, where: str) -> InputError:
     )
 
 
-def system_class(name: str) -> "type[AbstractSystem]":
+def system_class(name: str) -> "type[AbstractPlant]":
     """The class behind a name of `SYSTEMS`."""
     module, kind = SYSTEMS[name]
-    found: type[AbstractSystem] = getattr(
+    found: type[AbstractPlant] = getattr(
         importlib.import_module(f"sim2gp.systems.plants.{module}"), kind
     )
     return found

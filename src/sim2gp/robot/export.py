@@ -21,7 +21,7 @@ from sim2gp.runs import new_run
 from sim2gp.runs.archive import Declared
 from sim2gp.runs.store import Writer
 from sim2gp.systems import AbstractSystem, BlackBox, MuJoCo
-from sim2gp.systems.actuators import bare
+from sim2gp.systems.machine import plant_of
 from sim2gp.systems.mujoco.load import compiled_all
 from sim2gp.types import Key, in_float64, single
 
@@ -165,7 +165,7 @@ def _write_variants(
     writer: Writer, system: AbstractSystem, rows: dict[str, np.ndarray]
 ) -> None:
     """Of a MuJoCo model, its file with each draw's constants (E170)."""
-    model = bare(system)
+    model = plant_of(system)
     if not isinstance(model, MuJoCo) or model.source is None:
         return
     file, draws = model.file(mjcf=True), len(next(iter(rows.values())))
@@ -186,7 +186,7 @@ def _write_variants(
 def _compiled(belief: AbstractBelief, system: AbstractSystem) -> bytes:
     from jax import export
 
-    if isinstance(bare(system), MuJoCo | BlackBox):
+    if isinstance(plant_of(system), MuJoCo | BlackBox):
         raise InputError(
             "E135",
             "compiled code cannot be written",

@@ -27,8 +27,8 @@ from sim2gp.inference.parameters import unknown_parameter
 from sim2gp.planning.episode import Purpose, key_for
 from sim2gp.planning.mpc import from_unit
 from sim2gp.planning.tasks import MACHINES, TRUTHS, Task, draw_truth
-from sim2gp.systems import AbstractEffect, InputDelay
-from sim2gp.systems.effects.perturbed import effect
+from sim2gp.systems import AbstractPart
+from sim2gp.systems.effects.strengths import effect
 from sim2gp.types import Action, AnyArray, Key, Scalar, State
 
 #: Environments by name, and their machines.
@@ -58,7 +58,7 @@ def environment(
     *,
     truth: str = PUBLISHED,
     params: Mapping[str, float] | None = None,
-    effects: Sequence[AbstractEffect | InputDelay | str] = (),
+    effects: Sequence[AbstractPart | str] = (),
     render_mode: None = None,
 ) -> Any:
     """The swing-up of ``furuta`` or ``cartpole`` as a `gymnasium.Env`.
@@ -146,7 +146,7 @@ class Hidden:
     machine: str
     truth: str
     params: Mapping[str, float]
-    effects: tuple[AbstractEffect | InputDelay, ...]
+    effects: tuple[AbstractPart, ...]
 
     def published(self) -> Task:
         """The machine before anything is drawn."""
@@ -167,7 +167,7 @@ def hidden(
     machine: str,
     truth: str,
     params: Mapping[str, float],
-    effects: Sequence[AbstractEffect | InputDelay | str],
+    effects: Sequence[AbstractPart | str],
 ) -> Hidden:
     """The same, checked; words name effects of the catalogue and their strength.
 
@@ -188,7 +188,7 @@ def hidden(
     return Hidden(machine, truth, dict(params), made)
 
 
-def _effect(machine: str, words: str) -> AbstractEffect | InputDelay:
+def _effect(machine: str, words: str) -> AbstractPart:
     name, _, strength = words.partition(" ")
     return effect(machine, name, strength)
 

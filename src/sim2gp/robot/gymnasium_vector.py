@@ -31,7 +31,7 @@ from sim2gp.robot.gymnasium import (
     hidden,
     key_of,
 )
-from sim2gp.systems import AbstractEffect, InputDelay
+from sim2gp.systems import AbstractPart
 from sim2gp.types import AnyArray, Key
 
 
@@ -41,7 +41,7 @@ def environments(
     *,
     truth: str = PUBLISHED,
     params: Mapping[str, float] | None = None,
-    effects: Sequence[AbstractEffect | InputDelay | str] = (),
+    effects: Sequence[AbstractPart | str] = (),
     max_episode_steps: int = Task.horizon,
     render_mode: None = None,
 ) -> Any:

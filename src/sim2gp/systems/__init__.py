@@ -1,49 +1,42 @@
 """Physics only: machines as differential equations, with published constants."""
 
-from sim2gp.inference.variants import Configuration
-from sim2gp.systems.actuators import Actuated, ActuatedParams, actuator_prior
+from sim2gp.systems.actuators import (
+    Delay,
+    Gain,
+    Lag,
+    Offset,
+    delayed_means,
+    lagged_means,
+    neutral_actuators,
+)
+from sim2gp.systems.assemble import free_parts, one_variant, with_parts, with_variants
 from sim2gp.systems.base import (
-    AbstractMechanism,
     AbstractODE,
     AbstractPlant,
     AbstractSystem,
     Bound,
     Channel,
-    delayed_means,
     rk4,
 )
-from sim2gp.systems.effects.base import (
-    AbstractEffect,
-    BackEmf,
+from sim2gp.systems.effects.base import AbstractEffect
+from sim2gp.systems.effects.forces import BaseTilt, BaseTiltSide, Payload, RailTilt
+from sim2gp.systems.effects.friction import (
     Coulomb,
-    DeadZone,
     Drag,
-    PoleGeometry,
     RailFriction,
-    RailTilt,
-    RodInertia,
-    Spring,
     Stribeck,
+    Viscous,
 )
-from sim2gp.systems.effects.library import Candidate, InputLag, library
-from sim2gp.systems.effects.perturbed import (
-    STRENGTHS,
-    InputDelay,
-    Perturbed,
-    PerturbedParams,
-    catalogue,
-    effect,
-    perturb,
-)
-from sim2gp.systems.effects.placement import (
-    BaseTilt,
-    BaseTiltSide,
-    EncoderOffset,
-    Payload,
-)
-from sim2gp.systems.lag import Lagged, LaggedParams, lagged_means
+from sim2gp.systems.effects.geometry import PoleGeometry, RodInertia
+from sim2gp.systems.effects.inputs import DeadZone
+from sim2gp.systems.effects.registry import Candidate, candidates
+from sim2gp.systems.effects.springs import Spring
+from sim2gp.systems.effects.strengths import STRENGTHS, catalogue, effect
+from sim2gp.systems.machine import Machine, MachineParams, plant_of
+from sim2gp.systems.mechanism import AbstractMechanism
 from sim2gp.systems.mujoco.sysid import read_sysid, write_sysid
 from sim2gp.systems.mujoco.system import MuJoCo
+from sim2gp.systems.parts import AbstractPart
 from sim2gp.systems.plants.black_box import BlackBox
 from sim2gp.systems.plants.cartpole import CartPole, CartPoleParams
 from sim2gp.systems.plants.functions import ODE
@@ -54,8 +47,8 @@ from sim2gp.systems.plants.two_link import (
     UniformRodArm,
     UniformRodParams,
 )
-from sim2gp.systems.sensors import Zeroed
-from sim2gp.systems.variants import Configured, alone, configured
+from sim2gp.systems.sensors import EncoderOffset
+from sim2gp.systems.variants import Variant
 
 __all__ = [
     "ODE",
@@ -63,11 +56,9 @@ __all__ = [
     "AbstractEffect",
     "AbstractMechanism",
     "AbstractODE",
+    "AbstractPart",
     "AbstractPlant",
     "AbstractSystem",
-    "Actuated",
-    "ActuatedParams",
-    "BackEmf",
     "BaseTilt",
     "BaseTiltSide",
     "BlackBox",
@@ -76,22 +67,20 @@ __all__ = [
     "CartPole",
     "CartPoleParams",
     "Channel",
-    "Configuration",
-    "Configured",
     "Coulomb",
     "DeadZone",
+    "Delay",
     "Drag",
     "EncoderOffset",
     "Furuta",
     "FurutaParams",
-    "InputDelay",
-    "InputLag",
-    "Lagged",
-    "LaggedParams",
+    "Gain",
+    "Lag",
+    "Machine",
+    "MachineParams",
     "MuJoCo",
+    "Offset",
     "Payload",
-    "Perturbed",
-    "PerturbedParams",
     "PoleGeometry",
     "RailFriction",
     "RailTilt",
@@ -102,17 +91,20 @@ __all__ = [
     "TwoLinkParams",
     "UniformRodArm",
     "UniformRodParams",
-    "Zeroed",
-    "actuator_prior",
-    "alone",
+    "Variant",
+    "Viscous",
+    "candidates",
     "catalogue",
-    "configured",
     "delayed_means",
     "effect",
+    "free_parts",
     "lagged_means",
-    "library",
-    "perturb",
+    "neutral_actuators",
+    "one_variant",
+    "plant_of",
     "read_sysid",
     "rk4",
+    "with_parts",
+    "with_variants",
     "write_sysid",
 ]

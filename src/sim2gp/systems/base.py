@@ -5,9 +5,8 @@ one point; batches are made at the edge by ``vmap``. The step over one period ``
 
     s' = RK4 over ceil(dt / max_substep) equal substeps of  ds/dt = ode(s, u),
 
-with the action held (zero-order hold). A delayed input enters a substep of length ``h``
-by its mean, ``(U(t + h - tau) - U(t - tau)) / h`` with ``U`` the integral of the held
-input; so the delay ``tau`` has a gradient, which a shift by whole samples has not.
+with the action held (zero-order hold). What delays and lags do to the inputs is in
+`sim2gp.systems.actuators`.
 """
 
 import abc
@@ -31,14 +30,15 @@ from sim2gp.inference.parameters import (
     parameters_of,
     unknown_parameter,
 )
-from sim2gp.inference.variants import Which
-from sim2gp.systems.function_checks import check_mechanism, check_returns, names_of
+from sim2gp.systems.function_checks import check_returns, names_of
+from sim2gp.systems.variants import Variant, Which, values_of
 from sim2gp.types import Action, Scalar, State
 
 #: Of RK4 inside the windows that logs are cut into, s.
 WINDOW_SUBSTEP = 2e-3
+#: An input that moves within a period is averaged over no more than this, s.
+LONGEST_MEAN = 0.01
 R = TypeVar("R")
-Inertia = tuple[Scalar, Scalar, Scalar]
 
 
 @dataclass(frozen=True)
@@ -75,6 +75,11 @@ class AbstractSystem(eqx.Module):
 
     def __check_init__(self) -> None:
         self.check_functions()
+
+    @property
+    @abc.abstractmethod
+    def variants(self) -> tuple[Variant, ...]:
+        """What differs between several machines of one fit; empty for one machine."""
 
     @property
     @abc.abstractmethod
@@ -165,7 +170,7 @@ class AbstractSystem(eqx.Module):
                 "delay longer than the carried history",
                 got=f"{self.history} past actions of {dt:g} s",
                 expected=f"at least {self.longest_delay:g} s",
-                fix="bound the delay and give Actuated(..., delay_max=, period=)",
+                fix="bound the delay and give Machine(..., period=)",
             )
         n = s.size - self.history * m
         held = jnp.concatenate([a[None], s[n:].reshape(self.history, m)])
@@ -183,11 +188,19 @@ class AbstractSystem(eqx.Module):
         s: State,
         a: Action,
         dt: float,
-        configuration: Which = None,
+        variant: Which = None,
     ) -> State:
         """The step as a function of the virtual parameters, for inference."""
-        values = self.parameters.values(tt, configuration)
-        return self.step(self.record(values), s, a, dt)
+        return self.step(self.record(self.values(tt, variant)), s, a, dt)
+
+    def values(
+        self, tt: Float[Array, " p"], variant: Which = None
+    ) -> dict[str, Scalar]:
+        """Every constant by name, in physical units, of one variant.
+
+        ``variant`` is an index; only a machine that has several needs it (E152).
+        """
+        return values_of(self.parameters.values(tt), self.variants, variant)
 
 
 class Bound(eqx.Module):
@@ -205,7 +218,11 @@ class Bound(eqx.Module):
 
 
 class AbstractPlant(AbstractSystem):
-    """A machine that remembers nothing: its inputs act at once."""
+    """Physics that remembers nothing: its inputs act at once."""
+
+    @property
+    def variants(self) -> tuple[Variant, ...]:
+        return ()
 
     @property
     def history(self) -> int:
@@ -246,63 +263,6 @@ class AbstractODE(AbstractPlant):
         return rk4(lambda x, u: self.ode(params, x, u), s, a, h)
 
 
-class AbstractMechanism(AbstractODE):
-    """Two joints ``q``: ``M(q) dv/dt = forces(q, v, a)``, solved in closed form.
-
-    States are ``(q1, q2, v1, v2)``. A locked joint keeps its place: its velocity counts
-    as zero whatever the state says.
-    """
-
-    locked: AbstractVar[tuple[bool, bool]]
-
-    def check_functions(self) -> None:
-        """That inertia and forces are those of two joints."""
-        check_mechanism(self)
-
-    @abc.abstractmethod
-    def inertia(self, params: Any, q: Float[Array, " 2"]) -> Inertia:
-        """The three numbers ``M11, M12, M22`` of the symmetric ``M(q)``."""
-
-    @abc.abstractmethod
-    def forces(
-        self, params: Any, q: Float[Array, " 2"], v: Float[Array, " 2"], a: Action
-    ) -> Float[Array, " 2"]:
-        """Inputs, gyroscopic terms, gravity and friction: all but ``M dv/dt``."""
-
-    def mass_matrix(self, params: Any, q: Float[Array, " 2"]) -> Float[Array, "2 2"]:
-        """Joint-space inertia ``M(q)``."""
-        a, b, c = self.inertia(params, q)
-        return jnp.stack([jnp.stack([a, b]), jnp.stack([b, c])])
-
-    def ode(self, params: Any, s: State, a: Action) -> State:
-        """``(v, M^-1 forces)``."""
-        rest = jnp.zeros_like(s[2])
-        v = [rest if locked else s[2 + i] for i, locked in enumerate(self.locked)]
-        M = self.inertia(params, s[:2])
-        f = self.forces(params, s[:2], jnp.stack(v), a)
-        return jnp.stack([*v, *solve_two(M, f, self.locked)])
-
-    def joint(self, name: str) -> int:
-        """Index of a joint by the name of its position channel (E103 if unknown)."""
-        return index_of(name, self.states[:2])
-
-
-def solve_two(
-    M: Inertia, f: Float[Array, " 2"], locked: tuple[bool, bool]
-) -> tuple[Scalar, Scalar]:
-    """``M^-1 f`` for two joints; a locked joint does not accelerate."""
-    a, b, c = M
-    rest = jnp.zeros_like(f[0])
-    if all(locked):
-        return rest, rest
-    if locked[0]:
-        return rest, f[1] / c
-    if locked[1]:
-        return f[0] / a, rest
-    det = a * c - b * b
-    return (c * f[0] - b * f[1]) / det, (a * f[1] - b * f[0]) / det
-
-
 def rk4(
     f: Callable[[State, Action], State], s: State, u: Action, h: float | Scalar
 ) -> State:
@@ -318,26 +278,6 @@ def rk4(
     k3 = jax.lax.optimization_barrier(f(s + 0.5 * h * k2, u))
     k4 = jax.lax.optimization_barrier(f(s + h * k3, u))
     return s + (h / 6.0) * (k1 + 2.0 * (k2 + k3) + k4)
-
-
-def delayed_means(
-    held: Float[Array, "past m"], dt: float, delay: Float[Array, " m"], count: int
-) -> Float[Array, "count m"]:
-    """Mean delayed input over each of ``count`` substeps of one period ``dt``.
-
-    ``held`` are the held inputs, newest first: row ``k`` acts on
-    ``[-k dt, (1 - k) dt)``. On a knot the derivative with respect to the delay is the
-    one from the right (a longer delay), so that it never vanishes by accident.
-    """
-    h = dt / count
-    t = jnp.arange(count + 1, dtype=held.dtype)[:, None] * h - delay[None]
-
-    def area(k: int) -> Float[Array, "times m"]:
-        z = t + k * dt
-        return jnp.where(z <= 0.0, 0.0, jnp.where(z > dt, dt, z)) * held[k][None]
-
-    integral = sum(area(k) for k in range(len(held)))
-    return jnp.diff(jnp.asarray(integral), axis=0) / h
 
 
 def record_from(record: type[R], values: Mapping[str, Scalar]) -> R:

@@ -15,7 +15,8 @@ from sim2gp.inference.parameters import Parameters
 from sim2gp.types import Action, State
 
 if TYPE_CHECKING:
-    from sim2gp.systems.base import AbstractMechanism, AbstractSystem, Channel
+    from sim2gp.systems.base import AbstractSystem, Channel
+    from sim2gp.systems.mechanism import AbstractMechanism
 
 
 def names_of(table: Parameters) -> tuple[str, ...]:

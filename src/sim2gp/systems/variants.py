@@ -1,112 +1,101 @@
-"""A machine with another table of constants: of several configurations, or of one.
+"""Variants of one machine: which constants they share, and which each has alone.
 
-What was weighed is part of a table as well (`with_weighed`).
+Logs of one robot with and without its payload share nearly all constants. A joint fit
+has one vector of free columns: those of shared constants, and for a constant that some
+variant has alone a column of its own, named ``<constant> @ <variant>``. Variant ``g``
+of the machine has the constants
 
-``configured(system, [Configuration("bare", fixed=...), Configuration("payload", own=...
-)])`` is one machine for a joint fit: windows and transitions say which configuration
-each row is of. `alone` is the machine as it stands in one of them, for whoever acts on
-it, and what a joint posterior says of it.
+    theta_g = G_g (theta, known),    G_g a selection of columns and of known values,
+
+so the fit sees one function of one vector, and ``g`` is data like the inputs. Project
+files and the command line call a variant a configuration.
 """
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
 
-import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Int
 
-from sim2gp.errors import InputError
-from sim2gp.inference.gaussian import Gaussian
-from sim2gp.inference.linear_measurements import Weighed
+from sim2gp.errors import InputError, nearest
 from sim2gp.inference.parameters import Parameter, Parameters, unknown_parameter
-from sim2gp.inference.variants import AT, Configuration, index_of
-from sim2gp.systems.base import AbstractSystem, Channel
 from sim2gp.systems.function_checks import names_of
-from sim2gp.types import Action, Scalar, State, in_float64
+from sim2gp.types import AnyArray, Scalar
+
+#: Between a constant and the one variant whose column it is.
+AT = " @ "
+#: The index of a variant; a machine without variants needs none.
+Which = Int[AnyArray, ""] | int | None
 
 
-class Configured(AbstractSystem):
-    """A machine that is ``system`` in all but its table of constants."""
+@dataclass(frozen=True)
+class Variant:
+    """What one variant has alone; all other constants are shared.
 
-    system: AbstractSystem
-    parameters: Parameters = eqx.field(static=True)
-
-    def __init__(self, system: AbstractSystem, parameters: Parameters) -> None:
-        self.system, self.parameters = system, parameters
-
-    def check_functions(self) -> None:
-        """The machine inside has checked its own."""
-
-    @property
-    def states(self) -> tuple[Channel, ...]:
-        return self.system.states
-
-    @property
-    def actions(self) -> tuple[Channel, ...]:
-        return self.system.actions
-
-    @property
-    def max_substep(self) -> float:
-        return self.system.max_substep
-
-    @property
-    def window_substep(self) -> float:
-        return self.system.window_substep
-
-    @property
-    def history(self) -> int:
-        return self.system.history
-
-    @property
-    def longest_delay(self) -> float:
-        return self.system.longest_delay
-
-    def record(self, values: Mapping[str, Scalar]) -> Any:
-        return self.system.record(values)
-
-    def flow(self, params: Any, s: State, a: Action, h: float | Scalar) -> State:
-        return self.system.flow(params, s, a, h)
-
-    def delays(self, params: Any) -> Float[Array, " m"]:
-        return self.system.delays(params)
-
-    def mean_inputs(
-        self, params: Any, held: Float[Array, "past m"], dt: float, count: int
-    ) -> Float[Array, "count m"]:
-        return self.system.mean_inputs(params, held, dt, count)
-
-    def around(self, system: AbstractSystem) -> "Configured":
-        """Another version of the machine inside: its new free constants are shared."""
-        known, had = names_of(self.parameters), self.system.parameters.names
-        new = [p for p in system.parameters.free if p.name not in had]
-        freed = {p.name: p for p in new if p.name in known}  # a fixed one until now
-        more = Parameters(tuple(p for p in new if p.name not in known))
-        return Configured(system, self.parameters.merge(more).replace(**freed))
-
-
-def configured(
-    system: AbstractSystem,
-    configurations: Sequence[Configuration],
-    priors: Mapping[str, Parameter] | None = None,
-) -> Configured:
-    """The machine in all of its configurations at once.
-
-    ``priors`` are those of columns, by ``<constant> @ <configuration>``; a column
-    without one has the prior of its constant, independently. Raises `InputError` E145
-    for an unknown constant or column, and for one that is stated twice or is not free.
+    ``fixed`` are constants whose value is known in it, ``own`` those that are learned
+    for it by themselves.
     """
-    table, given = system.parameters, dict(priors or {})
-    for c in configurations:
+
+    name: str
+    fixed: tuple[tuple[str, float], ...] = ()
+    own: tuple[str, ...] = ()
+
+    def column(self, constant: str) -> str:
+        """The free column, or the name of the known value, that a constant has in it.
+
+        A value that is fixed in this variant is named ``<constant> @ <name>``, too: it
+        is no column of the table.
+        """
+        alone = constant in self.own or constant in dict(self.fixed)
+        return f"{constant}{AT}{self.name}" if alone else constant
+
+
+def values_of(
+    columns: Mapping[str, Scalar], variants: Sequence[Variant], index: Which
+) -> dict[str, Scalar]:
+    """The constants of one variant out of all columns and known values.
+
+    ``index`` may be traced: constants that differ are gathered, the others stay as they
+    are. Raises `InputError` E152 where there are several and none is chosen.
+    """
+    if not variants:
+        return dict(columns)
+    if index is None:
+        raise which(None, [c.name for c in variants])
+    like = next(iter(columns.values()))
+    known = dict(columns)
+    for c in variants:
+        known |= {c.column(x): jnp.asarray(v, like.dtype) for x, v in c.fixed}
+    differing = {x: None for c in variants for x in (*dict(c.fixed), *c.own)}
+    alone = {c.column(x) for c in variants for x in differing if x != c.column(x)}
+    found = {name: x for name, x in columns.items() if name not in alone}
+    for x in differing:
+        found[x] = jnp.stack([known[c.column(x)] for c in variants])[index]
+    return found
+
+
+def joint_table(
+    table: Parameters,
+    variants: Sequence[Variant],
+    priors: Mapping[str, Parameter] | None = None,
+) -> Parameters:
+    """The columns of all variants of a machine with this table.
+
+    ``priors`` are those of columns, by ``<constant> @ <variant>``; a column without one
+    has the prior of its constant, independently. Raises `InputError` E145 for an
+    unknown constant or column, and for one that is stated twice or is not free.
+    """
+    given = dict(priors or {})
+    for c in variants:
         _check(table, c)
-    names = [c.name for c in configurations]
+    names = [c.name for c in variants]
     if len(set(names)) < len(names):
         raise InputError("E145", "two configurations of one name", got=", ".join(names))
     free = []
     for p in table.free:
-        columns = dict.fromkeys(c.column(p.name) for c in configurations)
-        own = {c.column(p.name) for c in configurations if p.name in c.own}
+        columns = dict.fromkeys(c.column(p.name) for c in variants)
+        own = {c.column(p.name) for c in variants if p.name in c.own}
         for column in columns:
             if column == p.name or column in own:
                 prior = given.pop(column, p)
@@ -114,100 +103,20 @@ def configured(
                 free.append(dataclasses.replace(prior, **named))  # type: ignore[arg-type]
     for column in given:
         raise unknown_parameter(column, [p.name for p in free])
-    both = Parameters(tuple(free), table.fixed, tuple(configurations))
-    for c in configurations:
-        _check_delays(system, both, c)
-    return Configured(system, both)
-
-
-def with_weighed(system: AbstractSystem, sums: Sequence[Weighed]) -> Configured:
-    """The machine, of which some sums of constants were measured.
-
-    Of a machine in several configurations a sum names columns. Raises `InputError` E142
-    for a sum that the bounds rule out, E144 for its sd, E145 for an unknown constant,
-    one that stands twice, or a sum of fixed ones alone.
-    """
-    table = system.parameters
-    ranges = {p.name: (p.low, p.high) for p in table.free}
-    ranges |= {name: (value, value) for name, value in table.fixed}
-    for x in sums:
-        for name in x.of:
-            if name not in ranges:
-                raise unknown_parameter(name, ranges)
-        doubled = len(set(x.of)) < len(x.of)
-        if doubled or not set(x.of) & set(table.names):
-            raise InputError(
-                "E145",
-                "a constant twice in a sum" if doubled else "a sum without unknowns",
-                got=" + ".join(x.of),
-                expected="each constant once, one of them free",
-                fix="state its weight" if doubled else "give one of them a prior",
-            )
-        x.check(ranges)
-    more = dataclasses.replace(table, weighed=(*table.weighed, *sums))
-    inner = system.system if isinstance(system, Configured) else system
-    return Configured(inner, more)
-
-
-def _check(table: Parameters, configuration: Configuration) -> None:
-    """Constants that the table has, each stated once, own ones free (E145)."""
-    fixed, own = dict(configuration.fixed), configuration.own
-    for name in (*fixed, *own):
-        if name not in names_of(table):
-            raise unknown_parameter(name, names_of(table))
-    for name in own:
-        if name in fixed or own.count(name) > 1:
-            raise InputError(
-                "E145",
-                "a constant stated twice in one configuration",
-                where=configuration.name,
-                got=name,
-                expected="a known value, or a column of its own",
-                fix=f"leave one of the two out for {name}",
-            )
-        if name not in table.names:
-            raise InputError(
-                "E145",
-                "a fixed constant cannot be free in one configuration",
-                where=configuration.name,
-                got=f"{name} = {dict(table.fixed)[name]:g}",
-                expected="a constant with a prior",
-                fix=f"give {name} a prior, and fix it in the other configurations",
-            )
-
-
-def _check_delays(
-    system: AbstractSystem, table: Parameters, configuration: Configuration
-) -> None:
-    """No delay is longer than what inputs are kept for (E141)."""
-    fixed = dict(configuration.fixed)
-    for name in (f"{channel.name}.delay" for channel in system.actions):
-        low = high = fixed.get(name, 0.0)
-        if name in configuration.own:
-            prior = table[configuration.column(name)]
-            low, high = prior.low, prior.high
-        if not 0.0 <= low <= high <= system.longest_delay:
-            raise InputError(
-                "E141",
-                f"{name} of one configuration",
-                where=configuration.name,
-                got=f"{low:g} s" if low == high else f"from {low:g} to {high:g} s",
-                expected=f"from 0 to {system.longest_delay:g} s, as the machine has it",
-                fix=f"widen the machine's own {name}",
-            )
+    return Parameters(tuple(free), table.fixed)
 
 
 def own_table(
-    table: Parameters, name: str | None
+    table: Parameters, variants: Sequence[Variant], name: str | None
 ) -> tuple[Parameters, tuple[int, ...]]:
-    """One configuration's constants, and where the free ones stand in the joint table.
+    """One variant's constants, and where the free ones are in the joint table.
 
-    Raises `InputError` E152 for an unknown configuration, or none where there are some.
+    Raises `InputError` E152 for an unknown variant, or none where there are some.
     """
-    if not table.configurations:
+    if not variants:
         index_of(name, ())
         return table, tuple(range(len(table)))
-    chosen = table.configurations[index_of(name, table.configurations)]
+    chosen = variants[index_of(name, variants)]
     known = dict(table.fixed) | dict(chosen.fixed)
     free, places = [], []
     for i, p in enumerate(table.free):
@@ -220,21 +129,51 @@ def own_table(
     return Parameters(tuple(free), tuple(known.items())), tuple(places)
 
 
-@in_float64
-def alone(
-    system: AbstractSystem, belief: Gaussian, name: str | None
-) -> tuple[AbstractSystem, Gaussian]:
-    """The machine as it stands in one configuration, and what is believed of it.
+def index_of(name: str | None, variants: Sequence[Variant]) -> int:
+    """Position of a variant; the first where there are none (E152)."""
+    names = [c.name for c in variants]
+    if not names and name is None:
+        return 0
+    if name not in names:
+        raise which(name, names)
+    return names.index(name)
 
-    ``belief`` is one over the joint table's virtual values. A machine that has one
-    configuration alone has no names: it comes back as it is. Raises `InputError` E152.
-    """
-    if not system.parameters.configurations:
-        index_of(name, ())
-        return system, belief
-    assert isinstance(system, Configured)  # no other table has configurations
-    table, places = own_table(system.parameters, name)
-    at = np.asarray(places, int)
-    own = Gaussian(jnp.asarray(belief.mean)[at], jnp.asarray(belief.scale)[at])
-    square = Gaussian(own.mean, own.triangular())
-    return Configured(system.system, table), square
+
+def which(name: str | None, known: Sequence[str]) -> InputError:
+    """E152: a variant must be named, by one of the known names."""
+    close = nearest(name, known) if name else None
+    said = f"one of {', '.join(known)}" if known else "no name: there is one alone"
+    return InputError(
+        "E152",
+        "unknown configuration" if name else "which configuration of the machine",
+        got=name or "none named",
+        expected=said,
+        fix=f"did you mean {close}" if close else "name one with --configuration",
+    )
+
+
+def _check(table: Parameters, variant: Variant) -> None:
+    """Constants that the table has, each stated once, own ones free (E145)."""
+    fixed, own = dict(variant.fixed), variant.own
+    for name in (*fixed, *own):
+        if name not in names_of(table):
+            raise unknown_parameter(name, names_of(table))
+    for name in own:
+        if name in fixed or own.count(name) > 1:
+            raise InputError(
+                "E145",
+                "a constant stated twice in one configuration",
+                where=variant.name,
+                got=name,
+                expected="a known value, or a column of its own",
+                fix=f"leave one of the two out for {name}",
+            )
+        if name not in table.names:
+            raise InputError(
+                "E145",
+                "a fixed constant cannot be free in one configuration",
+                where=variant.name,
+                got=f"{name} = {dict(table.fixed)[name]:g}",
+                expected="a constant with a prior",
+                fix=f"give {name} a prior, and fix it in the other configurations",
+            )

@@ -25,9 +25,10 @@ from sim2gp.identification.intervals.pulls import (
 from sim2gp.identification.intervals.scatter import Corrected, corrected
 from sim2gp.identification.missing_physics.score import sine_to
 from sim2gp.inference.gaussian import Gaussian
+from sim2gp.systems.assemble import free_parts
 from sim2gp.systems.base import AbstractSystem
-from sim2gp.systems.effects.base import AbstractEffect
-from sim2gp.systems.effects.library import smooth_effects, with_effects
+from sim2gp.systems.effects.registry import smooth_effects
+from sim2gp.systems.parts import AbstractPart
 from sim2gp.types import in_float64
 
 #: Sine of the angle to the constants' span below which an effect is one of them in
@@ -48,7 +49,7 @@ def compile_corrected(system: AbstractSystem, cut: Windows) -> None:
     compile_linearise(system, cut)
     effects = smooth_effects(system)
     if effects:
-        compile_linearise(with_effects(system, effects), cut)
+        compile_linearise(free_parts(system, effects), cut)
 
 
 @in_float64
@@ -56,7 +57,7 @@ def corrected_windows(
     belief: WindowsBelief,
     cut: Windows,
     group: Int[np.ndarray, " W"],
-    effects: Sequence[AbstractEffect] | None = None,
+    effects: Sequence[AbstractPart] | None = None,
 ) -> Corrected:
     """The corrected posterior of a fit's constants, checked with the simulator itself.
 
@@ -99,12 +100,12 @@ def corrected_windows(
 
 
 def _with(
-    belief: WindowsBelief, effects: Sequence[AbstractEffect]
+    belief: WindowsBelief, effects: Sequence[AbstractPart]
 ) -> tuple[WindowsBelief, Int[np.ndarray, " p"]]:
     """The belief of the machine with effects, all at nothing; its own constants."""
     if not effects:
         return belief, np.arange(belief.prior.mean.size)
-    system = with_effects(belief.system, effects)
+    system = free_parts(belief.system, effects)
     names, prior = system.parameters.names, system.parameters.prior()
     own = np.asarray([names.index(name) for name in belief.system.parameters.names])
     scale = prior.scale.at[np.ix_(own, own)].set(belief.prior.scale)

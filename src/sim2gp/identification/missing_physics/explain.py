@@ -13,7 +13,7 @@ from typing import Literal
 from sim2gp.identification.misfit.tests import Misfit
 from sim2gp.identification.missing_physics.data import AbstractData
 from sim2gp.identification.missing_physics.search import REFITS, Search, search
-from sim2gp.systems.effects.library import Candidate
+from sim2gp.systems.effects.registry import Candidate
 
 Answer = Literal["nothing missing", "missing", "none of these"]
 

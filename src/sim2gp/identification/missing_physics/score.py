@@ -31,9 +31,9 @@ from sim2gp.inference.arrowhead import Blocks, Noise, eliminate
 from sim2gp.inference.expectation_maximisation import expectation
 from sim2gp.inference.levenberg_marquardt import AbstractLikelihood, Fit, multi_start
 from sim2gp.inference.linalg import triangular
+from sim2gp.systems.assemble import free_parts
 from sim2gp.systems.base import AbstractSystem
-from sim2gp.systems.effects.base import AbstractEffect
-from sim2gp.systems.effects.library import Candidate, with_effects
+from sim2gp.systems.effects.registry import Candidate
 from sim2gp.types import Scalar, in_float64
 
 ROUNDS = 5  # EM for the noise, of a linearised fit
@@ -71,17 +71,17 @@ def score(
 ) -> list[Scored]:
     """Every candidate by its linearisation at the bare machine's MAP."""
     names, n = bare.system.parameters.names, bare.nuisances.shape[1]
-    effects = [c.effect for c in candidates if c.smooth]
-    smooth = [e for e in effects if isinstance(e, AbstractEffect)]
+    smooth = [c.effect for c in candidates if c.smooth]
     # One machine with all of these: one compilation, one simulation.
-    whole = with_effects(bare.system, smooth)
+    whole = free_parts(bare.system, smooth)
     z = _extended(bare, whole, {e.name: 0.0 for e in smooth})
     every = np.asarray(data.blocks(whole, z[None], bare.nuisances)[0])
     plain = _columns(every, whole, [*names, None], n)
     without = _linear(data, bare, plain, np.append(np.asarray(bare.whitened()), 0.0))
     out = []
     for candidate in candidates:
-        system = candidate.freed(bare.system, period=data.period)
+        period = data.period or None
+        system = free_parts(bare.system, [candidate.effect], period=period)
         order = [*names, candidate.name]
         z = np.stack(
             [_extended(bare, system, {candidate.name: x}) for x in candidate.grid]

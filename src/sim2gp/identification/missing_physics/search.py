@@ -20,7 +20,8 @@ from sim2gp.identification.missing_physics.score import (
     tempered,
     widened,
 )
-from sim2gp.systems.effects.library import Candidate, library
+from sim2gp.systems.effects.registry import Candidate
+from sim2gp.systems.effects.registry import candidates as registered
 from sim2gp.types import in_float64
 
 REFITS = 3
@@ -97,7 +98,7 @@ def search(
     ``failed``.
     """
     if candidates is None:
-        candidates = library(data.system, windows=not data.period)
+        candidates = registered(data.system, windows=not data.period)
     bare = data.fit()
     on_step("the machine as it is")
     scored = score(data, bare, candidates)

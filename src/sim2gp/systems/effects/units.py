@@ -3,19 +3,20 @@
 from collections.abc import Mapping
 
 from sim2gp.errors import InputError
-from sim2gp.systems.base import AbstractMechanism
+from sim2gp.systems.base import AbstractPlant, Channel, index_of
+from sim2gp.systems.mechanism import AbstractMechanism
 
 
-def only_on(name: str, system: AbstractMechanism, homes: Mapping[type, str]) -> None:
+def only_on(name: str, plant: AbstractPlant, homes: Mapping[type, str]) -> None:
     """Refuse an effect on a machine or a channel that cannot have it (E145)."""
     where, what = name.rsplit(".", 1)
     for kind, channel in homes.items():
-        if isinstance(system, kind) and where == channel:
+        if isinstance(plant, kind) and where == channel:
             return
     raise InputError(
         "E145",
         f"{what} of this machine",
-        got=f"{where} of {type(system).__name__}",
+        got=f"{where} of {type(plant).__name__}",
         expected=" or ".join(f"{c} of {k.__name__}" for k, c in homes.items()),
     )
 
@@ -25,15 +26,21 @@ def gravity_of(system: AbstractMechanism) -> float:
     return float(system.gravity)  # type: ignore[attr-defined]
 
 
-def force_unit(system: AbstractMechanism, name: str) -> str:
+def joint_of(plant: AbstractPlant, name: str) -> Channel:
+    """A joint by the name of its position (E103)."""
+    joints = [c for c in plant.physical_states if c.unit in ("rad", "m")]
+    return joints[index_of(name, joints)]
+
+
+def force_unit(plant: AbstractPlant, name: str) -> str:
     """N on a slide, N m on a hinge."""
-    return "N" if system.states[system.joint(name)].unit == "m" else "N m"
+    return "N" if joint_of(plant, name).unit == "m" else "N m"
 
 
 def unit_per(
-    system: AbstractMechanism, name: str, seconds: str, square: bool = False
+    plant: AbstractPlant, name: str, seconds: str, square: bool = False
 ) -> str:
     """Unit of a force per position, or per squared velocity."""
-    position = system.states[system.joint(name)].unit
     power = "^2" if square else ""
-    return f"{force_unit(system, name)}{seconds}/{position}{power}"
+    position = joint_of(plant, name).unit
+    return f"{force_unit(plant, name)}{seconds}/{position}{power}"

@@ -22,8 +22,7 @@ from jaxtyping import Array, Float
 
 from sim2gp.errors import InputError
 from sim2gp.inference.parameters import Parameter, Parameters
-from sim2gp.systems.actuators import LONGEST_MEAN
-from sim2gp.systems.base import AbstractPlant, Channel
+from sim2gp.systems.base import LONGEST_MEAN, AbstractPlant, Channel
 from sim2gp.systems.mujoco.constants import (
     OF_INERTIA,
     SIGNED,

@@ -21,8 +21,7 @@ from jaxtyping import Array, Float
 from sim2gp import checks
 from sim2gp.errors import InputError
 from sim2gp.inference.parameters import Parameter, Parameters
-from sim2gp.systems.actuators import LONGEST_MEAN
-from sim2gp.systems.base import AbstractPlant, Channel, table_of
+from sim2gp.systems.base import LONGEST_MEAN, AbstractPlant, Channel, table_of
 from sim2gp.systems.function_checks import named_once, names_of
 from sim2gp.systems.plants.external import (
     AbstractSimulator,

@@ -24,13 +24,8 @@ from jaxtyping import Array, Float
 
 from sim2gp import checks
 from sim2gp.inference.parameters import Parameters, bounded, log_bounded
-from sim2gp.systems.base import (
-    AbstractMechanism,
-    Channel,
-    Inertia,
-    record_from,
-    table_for,
-)
+from sim2gp.systems.base import Channel, record_from, table_for
+from sim2gp.systems.mechanism import AbstractMechanism, Inertia
 from sim2gp.types import Action, Scalar
 
 

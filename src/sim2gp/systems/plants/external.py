@@ -24,8 +24,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from sim2gp.inference.parameters import Parameters
-from sim2gp.systems.actuators import bare
 from sim2gp.systems.base import AbstractSystem
+from sim2gp.systems.machine import plant_of
 from sim2gp.types import Action, Scalar, State
 
 #: What a constant changes by less, of the largest number, it does not change.
@@ -122,7 +122,7 @@ class AbstractSimulator(abc.ABC):
 
 def on_host(system: AbstractSystem) -> bool:
     """Whether a simulator here moves it, which tells all slopes or none."""
-    found = bare(system)
+    found = plant_of(system)
     engine = isinstance(getattr(found, "engine", None), AbstractSimulator)
     return engine and getattr(found, "mjx", None) is None
 

@@ -13,9 +13,9 @@ HANGING, ``alpha = pi`` upright. With ``l = Lp / 2``, ``Jp = Mp Lp^2 / 12`` and
                             - Mp g l sin(alpha)
 
 The published model leaves ``Jp`` out of ``A`` and of the ``sin(2 alpha)`` terms;
-`sim2gp.systems.effects.base.RodInertia` puts it back. Constants: Quanser Qube-Servo 2
-manual; dampings as in public drivers and simulators of that rig, which disagree by
-decades and therefore get logarithmic boxes.
+`sim2gp.systems.effects.geometry.RodInertia` puts it back. Constants: Quanser
+Qube-Servo 2 manual; dampings as in public drivers and simulators of that rig, which
+disagree by decades and therefore get logarithmic boxes.
 """
 
 from collections.abc import Mapping
@@ -27,13 +27,8 @@ from jaxtyping import Array, Float
 
 from sim2gp import checks
 from sim2gp.inference.parameters import Parameters, bounded, log_bounded
-from sim2gp.systems.base import (
-    AbstractMechanism,
-    Channel,
-    Inertia,
-    record_from,
-    table_for,
-)
+from sim2gp.systems.base import Channel, record_from, table_for
+from sim2gp.systems.mechanism import AbstractMechanism, Inertia
 from sim2gp.types import Action, Scalar
 
 

@@ -1,8 +1,4 @@
-"""How a machine stands, what its encoders call zero, and what it carries.
-
-Effects on the geometry: the equations stay those of the bare machine, at another
-configuration, under another gravity, or with one more mass.
-"""
+"""How a machine stands, and what it carries: tilts and payloads."""
 
 import math
 from typing import Any, ClassVar
@@ -11,49 +7,45 @@ import equinox as eqx
 import jax.numpy as jnp
 from equinox import AbstractClassVar
 
-from sim2gp.systems.base import AbstractMechanism, Inertia
-from sim2gp.systems.effects.base import AbstractForce, AbstractGeometry, Pair
+from sim2gp.systems.base import AbstractPlant
+from sim2gp.systems.effects.base import SUBSTEP, AbstractForce, AbstractJointEffect
 from sim2gp.systems.effects.units import gravity_of, only_on
+from sim2gp.systems.mechanism import AbstractMechanism, Inertia, Pair
 from sim2gp.systems.plants.cartpole import CartPole
 from sim2gp.systems.plants.furuta import Furuta
 from sim2gp.types import Scalar
 
-_SUBSTEP = 0.005  # s, as for every effect without dry friction
 
+class RailTilt(AbstractForce):
+    """A rail that rises by ``magnitude`` radians towards positive ``x``.
 
-class EncoderOffset(AbstractGeometry):
-    """A joint whose true position is the measured one plus ``magnitude``.
-
-    Inertia and forces are the machine's own at the true configuration. On the first
-    joint of a vertical arm this is also a tilt of its base in the plane.
+    The pole's angle stays relative to the rail's normal; with ``b`` the tilt, the force
+    is ``-g sin(b) (m_c + m_p)`` along the rail and
+    ``m_p l g [(1 - cos b) sin(theta) - sin b cos(theta)]`` on the pole.
     """
 
-    where: str = eqx.field(static=True)
-    magnitude: float = eqx.field(static=True)
-    what: ClassVar[str] = "encoder"
-    meaning: ClassVar[str] = "offset of the encoder's zero"
-    max_substep: ClassVar[float] = _SUBSTEP
+    where: str = eqx.field(static=True, default="x")
+    magnitude: float = eqx.field(static=True, default=math.radians(1.0))
+    what: ClassVar[str] = "tilt"
+    meaning: ClassVar[str] = "tilt of the rail"
+    max_substep: ClassVar[float] = SUBSTEP
 
-    def unit(self, system: AbstractMechanism) -> str:
-        return system.states[system.joint(self.where)].unit
-
-    def inertia(
-        self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair
-    ) -> Inertia:
-        true = system.inertia(params, self._true(system, x, q))
-        seen = system.inertia(params, q)
-        return true[0] - seen[0], true[1] - seen[1], true[2] - seen[2]
+    def unit(self, plant: AbstractPlant) -> str:
+        only_on(self.name, plant, {CartPole: "x"})
+        return "rad"
 
     def force(
         self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
     ) -> Pair:
-        # No machine's input depends on where it is.
-        none = jnp.zeros(len(system.actions), q.dtype)
-        true = system.forces(params, self._true(system, x, q), v, none)
-        return true - system.forces(params, q, v, none)
-
-    def _true(self, system: AbstractMechanism, x: Scalar, q: Pair) -> Pair:
-        return q.at[system.joint(self.where)].add(x)
+        p, g = params, gravity_of(system)
+        up, lost = jnp.sin(x), 2.0 * jnp.sin(0.5 * x) ** 2
+        lever = lost * jnp.sin(q[1]) - up * jnp.cos(q[1])
+        return g * jnp.stack(
+            [
+                -up * (p.cart_mass + p.pole_mass),
+                p.pole_mass * p.pole_half_length * lever,
+            ]
+        )
 
 
 class AbstractBaseTilt(AbstractForce):
@@ -66,10 +58,10 @@ class AbstractBaseTilt(AbstractForce):
     """
 
     towards: AbstractClassVar[float]
-    max_substep: ClassVar[float] = _SUBSTEP
+    max_substep: ClassVar[float] = SUBSTEP
 
-    def unit(self, system: AbstractMechanism) -> str:
-        only_on(self.name, system, {Furuta: "theta"})
+    def unit(self, plant: AbstractPlant) -> str:
+        only_on(self.name, plant, {Furuta: "theta"})
         return "rad"
 
     def force(
@@ -105,17 +97,17 @@ class BaseTiltSide(AbstractBaseTilt):
     towards: ClassVar[float] = 0.5 * math.pi
 
 
-class Payload(AbstractGeometry):
+class Payload(AbstractJointEffect):
     """A point of ``magnitude`` kilograms at the pole's free end, at ``2 l``."""
 
     where: str = eqx.field(static=True)
     magnitude: float = eqx.field(static=True)
     what: ClassVar[str] = "payload"
     meaning: ClassVar[str] = "mass at the pole's end"
-    max_substep: ClassVar[float] = _SUBSTEP
+    max_substep: ClassVar[float] = SUBSTEP
 
-    def unit(self, system: AbstractMechanism) -> str:
-        only_on(self.name, system, {Furuta: "alpha", CartPole: "theta"})
+    def unit(self, plant: AbstractPlant) -> str:
+        only_on(self.name, plant, {Furuta: "alpha", CartPole: "theta"})
         return "kg"
 
     def inertia(

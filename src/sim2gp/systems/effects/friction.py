@@ -1,0 +1,134 @@
+"""Friction: dry, viscous and quadratic."""
+
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from sim2gp import checks
+from sim2gp.systems.base import AbstractPlant
+from sim2gp.systems.effects.base import SUBSTEP, AbstractForce, on_joint
+from sim2gp.systems.effects.friction_laws import (
+    COULOMB_SUBSTEP,
+    coulomb,
+    quadratic_drag,
+)
+from sim2gp.systems.effects.units import force_unit, gravity_of, only_on, unit_per
+from sim2gp.systems.mechanism import AbstractMechanism, Pair
+from sim2gp.systems.plants.cartpole import CartPole
+from sim2gp.types import Scalar
+
+
+class Coulomb(AbstractForce):
+    """Dry friction of a joint, ``-magnitude tanh(v / width)``."""
+
+    where: str = eqx.field(static=True)
+    magnitude: float = eqx.field(static=True)
+    width: float = eqx.field(static=True, default=0.05)
+    what: ClassVar[str] = "coulomb"
+    meaning: ClassVar[str] = "dry friction"
+    max_substep: ClassVar[float] = COULOMB_SUBSTEP
+
+    def __check_init__(self) -> None:
+        checks.positive("Coulomb", width=self.width)
+
+    def unit(self, plant: AbstractPlant) -> str:
+        return force_unit(plant, self.where)
+
+    def force(
+        self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
+    ) -> Pair:
+        i = system.joint(self.where)
+        return on_joint(i, -coulomb(v[i], x, self.width))
+
+
+class RailFriction(AbstractForce):
+    """Dry friction of a cart by its weight, ``-magnitude (m_c + m_p) g tanh``."""
+
+    where: str = eqx.field(static=True, default="x")
+    magnitude: float = eqx.field(static=True, default=0.02)
+    width: float = eqx.field(static=True, default=0.01)  # m/s
+    what: ClassVar[str] = "rail_friction"
+    meaning: ClassVar[str] = "friction coefficient of the rail"
+    max_substep: ClassVar[float] = COULOMB_SUBSTEP
+
+    def __check_init__(self) -> None:
+        checks.positive("RailFriction", width=self.width)
+
+    def unit(self, plant: AbstractPlant) -> str:
+        only_on(self.name, plant, {CartPole: "x"})
+        return "1"
+
+    def force(
+        self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
+    ) -> Pair:
+        weight = (params.cart_mass + params.pole_mass) * gravity_of(system)
+        return on_joint(0, -coulomb(v[0], x * weight, self.width))
+
+
+class Stribeck(AbstractForce):
+    """Friction that is twice as large at rest as in motion.
+
+    ``-magnitude (1 + exp(-(v / speed)^2)) / 2 tanh(v / width)``: ``magnitude`` is the
+    level at breakaway, half of it the level of fast motion (Armstrong-Helouvry 1991).
+    """
+
+    where: str = eqx.field(static=True)
+    magnitude: float = eqx.field(static=True)
+    width: float = eqx.field(static=True, default=0.05)
+    speed: float = eqx.field(static=True, default=1.0)
+    what: ClassVar[str] = "stribeck"
+    meaning: ClassVar[str] = "friction that falls from rest to motion"
+    max_substep: ClassVar[float] = COULOMB_SUBSTEP
+
+    def __check_init__(self) -> None:
+        checks.positive("Stribeck", width=self.width, speed=self.speed)
+
+    def unit(self, plant: AbstractPlant) -> str:
+        return force_unit(plant, self.where)
+
+    def force(
+        self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
+    ) -> Pair:
+        i = system.joint(self.where)
+        level = 0.5 * x * (1.0 + jnp.exp(-((v[i] / self.speed) ** 2)))
+        return on_joint(i, -coulomb(v[i], level, self.width))
+
+
+class Viscous(AbstractForce):
+    """Damping of a joint, ``-magnitude v``, such as the back-EMF of its motor."""
+
+    where: str = eqx.field(static=True)
+    magnitude: float = eqx.field(static=True)
+    #: Older project files and runs say ``back_emf``.
+    what: str = eqx.field(static=True, default="viscous")
+    meaning: ClassVar[str] = "damping, such as a motor's back-EMF"
+    max_substep: ClassVar[float] = SUBSTEP
+
+    def unit(self, plant: AbstractPlant) -> str:
+        return unit_per(plant, self.where, " s")
+
+    def force(
+        self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
+    ) -> Pair:
+        i = system.joint(self.where)
+        return on_joint(i, -x * v[i])
+
+
+class Drag(AbstractForce):
+    """Quadratic drag of a joint, ``-magnitude v |v|``."""
+
+    where: str = eqx.field(static=True)
+    magnitude: float = eqx.field(static=True)
+    what: ClassVar[str] = "drag"
+    meaning: ClassVar[str] = "quadratic drag"
+    max_substep: ClassVar[float] = SUBSTEP
+
+    def unit(self, plant: AbstractPlant) -> str:
+        return unit_per(plant, self.where, " s^2", square=True)
+
+    def force(
+        self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
+    ) -> Pair:
+        i = system.joint(self.where)
+        return on_joint(i, -quadratic_drag(v[i], x))

@@ -1,0 +1,307 @@
+"""A machine: physics, and what is around it, as one record.
+
+``Machine(plant, effects, sensors, actuators, variants)`` is a system. The plant is
+physics: a bundled machine, a MuJoCo model, or the user's function. Each part around it
+is a small record with one constant. Constants of the machine are the plant's and those
+of its parts, fixed at their magnitudes: ``parameters`` gives them priors, or other
+values, and `free_parts` (`sim2gp.systems.assemble`) gives each part its own prior.
+
+    machine = Machine(Furuta(), effects=[Coulomb("theta", 2e-3)])
+    machine = free_parts(machine, [Delay("voltage", 0.02)])
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sim2gp import checks
+from sim2gp.errors import InputError
+from sim2gp.inference.parameters import Parameter, Parameters, unknown_parameter
+from sim2gp.systems.actuators import (
+    FADED,
+    AbstractActuator,
+    Delay,
+    Gain,
+    Lag,
+    Offset,
+    delayed_means,
+    lagged_means,
+)
+from sim2gp.systems.base import (
+    LONGEST_MEAN,
+    AbstractPlant,
+    AbstractSystem,
+    Channel,
+    index_of,
+)
+from sim2gp.systems.effects.base import (
+    AbstractEffect,
+    AbstractInputEffect,
+    AbstractJointEffect,
+    check_effect,
+)
+from sim2gp.systems.function_checks import names_of
+from sim2gp.systems.mechanism import AbstractMechanism, Effects
+from sim2gp.systems.parts import AbstractPart
+from sim2gp.systems.sensors import EncoderOffset
+from sim2gp.systems.variants import AT, Variant, joint_table
+from sim2gp.types import Action, Scalar, State
+
+
+class MachineParams(eqx.Module):
+    """Constants of the plant, and of each part by name."""
+
+    plant: Any
+    parts: dict[str, Scalar]
+
+
+class Machine(AbstractSystem):
+    """A plant with effects, sensors and actuators, in one or several variants.
+
+    ``parameters`` is a whole table, or maps names to a `Parameter` (free) or a number
+    (fixed). With a ``period`` (s) of the control the state carries the past actions
+    that delays and lags need, newest first, as channels ``voltage[-1]``,
+    ``voltage[-2]``, ...; without one a delay is left to the caller of `flow` (the
+    likelihood over windows).
+
+    Raises `InputError` E103 for an unknown channel, E145 for an unknown name, for two
+    parts of one name and for a part that the plant cannot have, E141 for a delay or a
+    lag out of its range, E148 for a period that is not positive, E140, E123 or E173 for
+    an effect whose functions have another shape, are no real numbers, or raise.
+    """
+
+    plant: AbstractPlant
+    effects: tuple[AbstractEffect, ...]
+    sensors: tuple[EncoderOffset, ...]
+    actuators: tuple[AbstractActuator, ...]
+    parameters: Parameters = eqx.field(static=True)
+    period: float | None = eqx.field(static=True)
+    variants: tuple[Variant, ...] = eqx.field(static=True, default=())
+
+    def __init__(
+        self,
+        plant: AbstractPlant,
+        effects: Sequence[AbstractEffect] = (),
+        sensors: Sequence[EncoderOffset] = (),
+        actuators: Sequence[AbstractActuator] = (),
+        variants: Sequence[Variant] = (),
+        parameters: Parameters | Mapping[str, Parameter | float] | None = None,
+        *,
+        period: float | None = None,
+    ) -> None:
+        self.plant, self.variants, self.period = plant, tuple(variants), period
+        self.effects, self.sensors = tuple(effects), tuple(sensors)
+        self.actuators = tuple(actuators)
+        if period is not None:
+            checks.positive("Machine", period=period)
+        for part in self.parts:
+            part.unit(plant)  # raises for a channel that is not there
+        fixed = Parameters((), tuple((p.name, p.magnitude) for p in self.parts))
+        own = plant.parameters.merge(fixed)
+        names = names_of(own)
+        for part in self.parts:
+            if names.count(part.name) > 1:
+                raise InputError("E145", "two parts of one name", got=part.name)
+        if isinstance(parameters, Parameters):
+            self.parameters = _completed(own, parameters, self.variants)
+        else:
+            table = own.replace(**dict(parameters or {}))
+            self.parameters = joint_table(table, variants) if variants else table
+        self._check_inputs()
+
+    def check_functions(self) -> None:
+        """Each effect's: a force on the wrong joints would pass for one on both."""
+        for effect in self.effects:
+            check_effect(self.plant, effect)
+
+    def _check_inputs(self) -> None:
+        """Delays and lags that can be followed (E141, E145, E148)."""
+        late = {p.where for p in self.actuators if isinstance(p, Delay)}
+        for part in self.actuators:
+            low, high = self._range(part.name)
+            if isinstance(part, Delay) and (low < 0.0 or high == math.inf):
+                raise InputError(
+                    "E141",
+                    part.name,
+                    got=f"from {low:g} to {high:g} s",
+                    expected="a delay of zero or more, with an end",
+                    fix="give it a box [0, high]",
+                )
+            if not isinstance(part, Lag):
+                continue
+            checks.positive("Machine with a lag", period=self.period or 0.0)
+            if part.where in late and self._range(f"{part.where}.delay")[1] > 0.0:
+                raise InputError(
+                    "E145", "lag of an input that is delayed", where=part.where
+                )
+            if not (low > 0.0 and math.isfinite(high)):
+                raise InputError(
+                    "E141",
+                    part.name,
+                    got=f"from {low:g} to {high:g} s",
+                    expected="a positive, bounded time constant",
+                    fix="give it a box [low, high] with low > 0",
+                )
+
+    @property
+    def parts(self) -> tuple[AbstractPart, ...]:
+        """Effects, sensors and actuators."""
+        return *self.effects, *self.sensors, *self.actuators
+
+    @property
+    def states(self) -> tuple[Channel, ...]:
+        past = tuple(
+            replace(channel, name=f"{channel.name}[-{k}]")
+            for k in range(1, self.history + 1)
+            for channel in self.actions
+        )
+        return self.plant.states + past
+
+    @property
+    def actions(self) -> tuple[Channel, ...]:
+        return self.plant.actions
+
+    @property
+    def max_substep(self) -> float:
+        mean = [LONGEST_MEAN] if self.actuators else []
+        return min(
+            [self.plant.max_substep, *(e.max_substep for e in self.effects), *mean]
+        )
+
+    @property
+    def window_substep(self) -> float:
+        return self.plant.window_substep
+
+    @property
+    def longest_delay(self) -> float:
+        delays = [p for p in self.actuators if isinstance(p, Delay)]
+        return max((self._range(p.name)[1] for p in delays), default=0.0)
+
+    @property
+    def history(self) -> int:
+        if self.period is None:
+            return 0
+        lags = [self._range(p.name)[1] for p in self.actuators if isinstance(p, Lag)]
+        longest = max(self.longest_delay, FADED * max(lags, default=0.0))
+        return math.ceil(longest / self.period - 1e-9)
+
+    def record(self, values: Mapping[str, Scalar]) -> MachineParams:
+        parts = {part.name: values[part.name] for part in self.parts}
+        return MachineParams(self.plant.record(values), parts)
+
+    def flow(
+        self, params: MachineParams, s: State, a: Action, h: float | Scalar
+    ) -> State:
+        """The plant's own with effects, at the true position, under the input that
+        arrives; ``s`` is the physical state, ``a`` the delayed or filtered input."""
+        if self._has(Gain):
+            a = self._each(params, Gain, 1.0) * a
+        if self._has(Offset):
+            a = a + self._each(params, Offset, 0.0)
+        for effect in self.effects:
+            if isinstance(effect, AbstractInputEffect):
+                i = index_of(effect.where, self.actions)
+                a = a.at[i].set(effect.through(params.parts[effect.name], a[i]))
+        if not self.sensors:
+            return self._moved(params, s, a, h)
+        zero = jnp.zeros_like(params.parts[self.sensors[0].name])
+        known = {p.where: params.parts[p.name] for p in self.sensors}
+        offset = jnp.stack([known.get(c.name, zero) for c in self.plant.states])
+        offset = offset.astype(s.dtype)
+        return self._moved(params, s + offset, a, h) - offset
+
+    def delays(self, params: MachineParams) -> Float[Array, " m"]:
+        """Delay of each input; a lag is none (E145 over windows of logs)."""
+        for part in self.actuators:
+            if isinstance(part, Lag):
+                raise InputError(
+                    "E145",
+                    f"{part.name} over windows of logs",
+                    expected="one-step data; a delay over windows",
+                    fix=f"use a delay of {part.where}",
+                )
+        if not self._has(Delay):
+            return self.plant.delays(params.plant)
+        return self._each(params, Delay, 0.0)
+
+    def mean_inputs(
+        self, params: MachineParams, held: Float[Array, "past m"], dt: float, count: int
+    ) -> Float[Array, "count m"]:
+        if self._has(Delay):
+            means = delayed_means(held, dt, self._each(params, Delay, 0.0), count)
+        else:
+            means = jnp.broadcast_to(held[:1], (count, held.shape[1]))
+        for part in self.actuators:
+            if isinstance(part, Lag):
+                i = index_of(part.where, self.actions)
+                lag = params.parts[part.name]
+                means = means.at[:, i].set(lagged_means(held[:, i], dt, lag, count))
+        return means
+
+    def acting(self, params: MachineParams) -> Effects:
+        """Effects on the joints, with their magnitudes."""
+        effects = [e for e in self.effects if isinstance(e, AbstractJointEffect)]
+        return [(effect, params.parts[effect.name]) for effect in effects]
+
+    def _moved(
+        self, params: MachineParams, s: State, a: Action, h: float | Scalar
+    ) -> State:
+        """The plant's flow, with the effects on its joints."""
+        acting = self.acting(params)
+        if not acting:
+            return self.plant.flow(params.plant, s, a, h)
+        assert isinstance(self.plant, AbstractMechanism)  # as their units need
+        return self.plant.flow_with(params.plant, acting, s, a, h)
+
+    def _has(self, kind: type[AbstractActuator]) -> bool:
+        return any(isinstance(part, kind) for part in self.actuators)
+
+    def _each(
+        self, params: MachineParams, kind: type[AbstractActuator], neutral: float
+    ) -> Float[Array, " m"]:
+        """The constants of one kind of actuator, of each input."""
+        found = {
+            part.where: params.parts[part.name]
+            for part in self.actuators
+            if isinstance(part, kind)
+        }
+        none = jnp.full_like(next(iter(found.values())), neutral)
+        return jnp.stack([found.get(channel.name, none) for channel in self.actions])
+
+    def _range(self, name: str) -> tuple[float, float]:
+        """Least and largest value of a constant, in any variant."""
+        fixed = [*self.parameters.fixed, *(x for c in self.variants for x in c.fixed)]
+        low = high = [value for known, value in fixed if known == name]
+        free = [p for p in self.parameters.free if p.name.split(AT)[0] == name]
+        low, high = low + [p.low for p in free], high + [p.high for p in free]
+        return min(low), max(high)
+
+
+def plant_of(system: AbstractSystem) -> AbstractPlant:
+    """The physics of a system, without what is around it."""
+    found = system.plant if isinstance(system, Machine) else system
+    assert isinstance(found, AbstractPlant)  # a system is a plant or a machine
+    return found
+
+
+def as_machine(system: AbstractSystem) -> Machine:
+    """A plant as a machine without parts."""
+    return system if isinstance(system, Machine) else Machine(plant_of(system))
+
+
+def _completed(
+    own: Parameters, given: Parameters, variants: Sequence[Variant]
+) -> Parameters:
+    """The given table with the constants that it does not mention (E145)."""
+    known = {name.split(AT)[0] for name in names_of(given)}
+    for name in sorted(known - set(names_of(own))):
+        raise unknown_parameter(name, names_of(own))
+    known |= {name for c in variants for name in (*dict(c.fixed), *c.own)}
+    free = tuple(p for p in own.free if p.name not in known)
+    fixed = tuple((name, value) for name, value in own.fixed if name not in known)
+    return given.merge(Parameters(free, fixed))

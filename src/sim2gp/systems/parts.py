@@ -1,0 +1,53 @@
+"""A part of a machine: one scalar more than its plant has, with its name and prior.
+
+Effects, sensors and actuators are parts. A machine holds them in tuples
+(`sim2gp.systems.machine`); the constant of each is named ``<where>.<what>``.
+"""
+
+import abc
+
+import equinox as eqx
+from equinox import AbstractClassVar, AbstractVar
+
+from sim2gp import checks
+from sim2gp.inference.parameters import Parameter
+from sim2gp.systems.base import AbstractPlant
+
+
+class AbstractPart(eqx.Module):
+    """A part on the channel ``where``, of one ``magnitude``.
+
+    ``meaning`` describes it. Raises `InputError` E148 for a magnitude that is not
+    finite.
+    """
+
+    where: AbstractVar[str]
+    magnitude: AbstractVar[float]
+    meaning: AbstractClassVar[str]
+
+    def __check_init__(self) -> None:
+        checks.finite(type(self).__name__, magnitude=self.magnitude)
+
+    @property
+    @abc.abstractmethod
+    def what(self) -> str:
+        """What kind of part this is, in one word."""
+
+    @property
+    def name(self) -> str:
+        """Name of the constant: ``<where>.<what>``."""
+        return f"{self.where}.{self.what}"
+
+    @abc.abstractmethod
+    def unit(self, plant: AbstractPlant) -> str:
+        """Unit of the constant; E103 or E145 where the plant cannot have the part."""
+
+    @abc.abstractmethod
+    def parameter(self, plant: AbstractPlant) -> Parameter:
+        """The constant with its prior, to free it."""
+
+
+def around_nothing(part: AbstractPart, plant: AbstractPlant, sd: float) -> Parameter:
+    """A constant that is zero in the mean."""
+    unit = part.unit(plant)
+    return Parameter(part.name, unit, part.meaning, "identity", mean=0.0, sd=sd)
