@@ -11,8 +11,13 @@ import numpy as np
 
 from sim2gp.data.logs import Log
 from sim2gp.experiments.explain_study import Cogging
-from sim2gp.systems import Perturbed, UniformRodArm
-from sim2gp.systems.effects.base import AbstractEffect, Coulomb
+from sim2gp.systems import (
+    AbstractEffect,
+    AbstractSystem,
+    Coulomb,
+    UniformRodArm,
+    free_parts,
+)
 
 PERIOD, SECONDS = 0.01, 10.0
 SUBSTEPS = 10  # of RK4 in a period: dry friction is stiff
@@ -134,7 +139,7 @@ def _rate(
     ).T
 
 
-def with_what_is_missing(condition: Condition) -> Perturbed:
+def with_what_is_missing(condition: Condition) -> AbstractSystem:
     """The simulator of an oracle who knows what is missing, not how much of it."""
     joints = "q1", "q2"
     effects: list[AbstractEffect] = [
@@ -143,4 +148,4 @@ def with_what_is_missing(condition: Condition) -> Perturbed:
         else Coulomb(q, 0.05, condition.width)
         for q in joints
     ]
-    return Perturbed(UniformRodArm(), effects, free=True)
+    return free_parts(UniformRodArm(), effects)

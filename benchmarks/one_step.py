@@ -30,7 +30,7 @@ from sim2gp.planning.coloured_noise import coloured_noise
 from sim2gp.planning.episode import Purpose, key_for
 from sim2gp.planning.tasks import MACHINES, Task, draw_truth
 from sim2gp.runs.workers import cores, spread
-from sim2gp.systems.effects.perturbed import effect
+from sim2gp.systems.effects.strengths import effect
 from sim2gp.types import in_float64
 
 CONDITIONS = ("nominal", "coulomb mild")

@@ -33,7 +33,7 @@ from sim2gp.identification.intervals.discrepancy import corrected_windows
 from sim2gp.project import Project, load_project
 from sim2gp.runs.cells import Cells, add_options
 from sim2gp.runs.workers import cores, spread
-from sim2gp.systems.actuators import bare
+from sim2gp.systems import plant_of
 from sim2gp.types import in_float64
 
 SECONDS, HOLD, NOISE = 10.0, 0.1, 1e-3  # s, s, rad or m
@@ -145,7 +145,7 @@ def work(job: Job) -> dict[str, Any]:
         tt = np.asarray(prior.mean) + np.asarray(prior.scale) @ rng.standard_normal(
             len(table)
         )
-        step = bare(project.system).engine.model.opt.timestep
+        step = plant_of(project.system).engine.model.opt.timestep
         late = {n: step * rng.integers(1, 4) for n in table.names if "delay" in n}
         at = [table.names.index(name) for name in late]
         tt[at] = [table[name].unconstrain(late[name]) for name in late]
@@ -200,7 +200,7 @@ def record(
     """Ten seconds of C MuJoCo with these constants, as a file."""
     import mujoco
 
-    inner = bare(system)
+    inner = plant_of(system)
     model = inner.engine.with_values(np.array([truth[n] for n in inner.names]))
     data = mujoco.MjData(model)
     data.qpos[:] = robot.start + 0.3 * rng.standard_normal(model.nq)

@@ -5,7 +5,7 @@ import numpy as np
 
 from sim2gp import design as d
 from sim2gp.inference.gaussian import Gaussian
-from sim2gp.systems.actuators import Actuated, actuator_prior
+from sim2gp.systems import Delay, free_parts
 from simulated_logs import pendulum
 
 PERIOD, STEPS, WINDOW = 0.01, 200, 20
@@ -43,5 +43,4 @@ def limits(system, stated=LIMITS, rates=None, start=(0.1, 0.4, 0.0, 0.0)):
 def delayed():
     """The same pendulum behind an input with an unknown delay."""
     system = pendulum()
-    free = {"voltage.delay": actuator_prior(system.actions[0], "delay")}
-    return Actuated(system, free)
+    return free_parts(system, [Delay("voltage")])

@@ -2,7 +2,7 @@
 
 from mutant_list import Mutant
 
-GATHER, MACHINES = "inference/variants.py", "systems/variants.py"
+GATHER, MACHINES = "systems/variants.py", "systems/assemble.py"
 SUMS, INFORMED = "inference/linear_measurements.py", "inference/informed_prior.py"
 HERE, WEIGHED = "test_configurations.py", "test_weighed.py"
 CLOSED = (HERE, "closed_form")
@@ -12,8 +12,8 @@ CONFIGURATIONS = (
     Mutant(
         "configurations: everybody is the first",
         GATHER,
-        "for c in configurations])[index]",
-        "for c in configurations])[0 * index]",
+        "for c in variants])[index]",
+        "for c in variants])[0 * index]",
         (HERE, "has_its_constants"),
     ),
     Mutant(
@@ -26,13 +26,13 @@ CONFIGURATIONS = (
     Mutant(
         "configurations: windows of the wrong machine",
         "data/windows.py",
-        "values = self.system.parameters.values(tt, window.configuration)",
-        "values = self.system.parameters.values(tt, 0 * window.configuration)",
+        "values = self.system.values(tt, window.configuration)",
+        "values = self.system.values(tt, 0 * window.configuration)",
         CLOSED,
     ),
     Mutant(
         "configurations: own columns without their priors",
-        MACHINES,
+        GATHER,
         "prior = given.pop(column, p)",
         "prior = given.pop(column, p) and p",
         CLOSED,
@@ -55,7 +55,7 @@ CONFIGURATIONS = (
     Mutant(
         "configurations: delays beyond what is kept",
         MACHINES,
-        "if not 0.0 <= low <= high <= system.longest_delay:",
+        "if not 0.0 <= low <= high <= longest:",
         "if not 0.0 <= low <= high:",
         (HERE, "delay"),
     ),
@@ -75,7 +75,7 @@ CONFIGURATIONS = (
     ),
     Mutant(
         "configurations: a column for what is known",
-        MACHINES,
+        GATHER,
         "if column == p.name or column in own:",
         "if column == p.name or AT in column:",
         (HERE, "columns_are"),
@@ -132,8 +132,8 @@ CONFIGURATIONS = (
     Mutant(
         "weighed: lost when a candidate is tried",
         MACHINES,
-        "return Configured(system, self.parameters.merge(more).replace(**freed))",
-        "return Configured(system, system.parameters)",
+        "table, names = machine.parameters, {part.name for part in parts}",
+        "table, names = machine.plant.parameters, {part.name for part in parts}",
         (WEIGHED, "candidate"),
     ),
     Mutant(

@@ -3,7 +3,7 @@
 from mutant_list import Mutant
 
 COLUMNS, READINGS = "project/columns.py", "project/readings.py"
-DRAFT, ZEROS = "project/draft.py", "systems/sensors.py"
+DRAFT, ZEROS = "project/draft.py", "systems/machine.py"
 ODD = ("test_draft.py", "odd_log")
 
 FIRST_DRAFT = (
@@ -68,7 +68,7 @@ FIRST_DRAFT = (
         ZEROS,
         "s + offset, a, h) - offset",
         "s + offset, a, h)",
-        ("test_placement.py", "zeroed"),
+        ("test_placement.py", "moves_the_machine"),
     ),
     Mutant(
         "mujoco: a coarse model is stepped finely",

@@ -166,15 +166,15 @@ INPUTS = (
     ),
     Mutant(
         "project: an effect may change nothing",
-        "project/effects.py",
-        "return bool(jnp.any(before != after))",
+        "systems/effects/registry.py",
+        "return bool(jnp.any(jnp.stack([*M, *f]) != jnp.stack([*M2, *f2])))",
         "return True",
         ("test_unused_keys.py", "cannot_use"),
     ),
     Mutant(
         "project: an effect is on any machine",
         "systems/effects/units.py",
-        "if isinstance(system, kind) and where == channel:",
+        "if isinstance(plant, kind) and where == channel:",
         "if True:",
         ("test_unused_keys.py", "cannot_use"),
     ),

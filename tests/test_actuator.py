@@ -199,8 +199,8 @@ def test_mistakes_are_named():
         short.step(short.nominal(), jnp.append(START, 0.0), jnp.ones(1), 0.01)
     with pytest.raises(InputError, match=r"E145.*voltage\.delay"):
         sy.Machine(bare, actuators=[delay], parameters={"voltge.delay": 0.01})
+    table = dataclasses.replace(short.parameters, fixed=(("voltge.gain", 1.0),))
     with pytest.raises(InputError, match=r"E145.*voltage\.delay"):
-        table = dataclasses.replace(short.parameters, fixed=(("voltge.gain", 1.0),))
         sy.Machine(bare, actuators=[delay], parameters=table)
     with pytest.raises(InputError, match="E141"):
         sy.Machine(bare, actuators=[delay], parameters={"voltage.delay": -0.01})

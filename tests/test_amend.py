@@ -25,7 +25,7 @@ theta = "theta"
 voltage = "u"
 """
 SPRING = Candidate(sy.Spring("x", 8.0))
-DELAY = Candidate(sy.InputDelay("voltage", 0.04))
+DELAY = Candidate(sy.Delay("voltage", 0.04))
 
 
 @pytest.fixture
@@ -50,14 +50,14 @@ def test_an_effect_becomes_a_free_constant(project: Path) -> None:
     assert project.stat().st_mode & 0o777 == 0o640
 
 
-@pytest.mark.parametrize("candidate", sy.library(sy.CartPole(), windows=True))
+@pytest.mark.parametrize("candidate", sy.candidates(sy.CartPole(), windows=True))
 def test_every_candidate_can_be_added(project: Path, candidate: Candidate) -> None:
     amend(project, candidate)
     added = load_project(project).system
     assert candidate.name in added.parameters.names
-    if isinstance(candidate.effect, sy.AbstractEffect):
-        assert isinstance(added, sy.Perturbed)
-        (effect,) = added.effects
+    if not isinstance(candidate.effect, sy.Delay):
+        assert isinstance(added, sy.Machine)
+        (effect,) = (*added.effects, *added.sensors)
         options = ("width", "smoothing", "speed")
         for name in options:
             wanted = getattr(candidate.effect, name, None)
@@ -84,7 +84,7 @@ def test_what_is_stated_is_not_overwritten(project: Path) -> None:
         amend(project, DELAY)
     assert project.read_text() == stated
     with pytest.raises(InputError, match=r"E160.*lag.*delay"):
-        amended(TEXT, Candidate(sy.InputLag("voltage", 0.04)))
+        amended(TEXT, Candidate(sy.Lag("voltage", 0.04)))
 
 
 def test_a_file_that_cannot_take_a_table_stays_as_it_was(project: Path) -> None:

@@ -15,8 +15,7 @@ from sim2gp.experiments import compare
 from sim2gp.models import ResidualFunctionSpace
 from sim2gp.project import load_project
 from sim2gp.runs import Progress, load_run
-from sim2gp.systems import Perturbed, UniformRodArm
-from sim2gp.systems.effects.base import Spring
+from sim2gp.systems import Machine, Spring, UniformRodArm
 
 QUIET = Progress(quiet=True)
 #: The simulator and one learned model: each model more is half a minute of compiling,
@@ -54,7 +53,7 @@ def recorded(path: Path, *, seed: int, share: float, seconds: float = 2.5) -> No
     rng = np.random.default_rng(seed)
     time = 2e-3 * np.arange(int(seconds / 2e-3))
     held = np.repeat(rng.uniform(-1.0, 1.0, (len(time) // 100 + 1, 2)), 100, axis=0)
-    arm = Perturbed(UniformRodArm(), [Spring("q1", 0.0), Spring("q2", 0.0)])
+    arm = Machine(UniformRodArm(), [Spring("q1", 0.0), Spring("q2", 0.0)])
     with jax.enable_x64(True):
         cables = {name: share * value for name, value in SPRINGS.items()}
         values = arm.parameters.nominal() | cables

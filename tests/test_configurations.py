@@ -117,9 +117,7 @@ def test_a_configuration_alone_is_an_ordinary_machine(float64: None) -> None:
         np.testing.assert_allclose(np.asarray(own.covariance()), whole, atol=1e-12)
         assert own.scale.shape == (len(places), len(places))
         values = table.values(own.mean)
-        joint_values = system.values(
-            belief.mean, ("bare", "loaded").index(name)
-        )
+        joint_values = system.values(belief.mean, ("bare", "loaded").index(name))
         assert {k: float(v) for k, v in values.items()} == pytest.approx(
             {k: float(v) for k, v in joint_values.items()}
         )

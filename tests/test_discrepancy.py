@@ -26,9 +26,8 @@ from sim2gp.identification.intervals.scatter import (
 )
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.parameters import Parameter
-from sim2gp.systems import UniformRodArm
-from sim2gp.systems.actuators import Actuated
-from sim2gp.systems.effects.library import smooth_effects
+from sim2gp.systems import Delay, UniformRodArm, with_parts
+from sim2gp.systems.effects.registry import smooth_effects
 from sim2gp.types import in_float64
 from test_intervals import HIGH, LOW, Linear, Plain, ar1, gaussian, smooth
 
@@ -221,7 +220,8 @@ def test_a_sound_simulator_is_believed(arms: ModuleType) -> None:
 def test_a_belief_keeps_its_constants_among_effects() -> None:
     """Actuators, whose constants stand elsewhere in the table, and a dense prior."""
     delay = Parameter("torque1.delay", "s", "delay", "box", 0.0, 0.02)
-    system = Actuated(UniformRodArm(), {"torque1.delay": delay})
+    parts = {"torque1.delay": delay}
+    system = with_parts(UniformRodArm(), [Delay("torque1")], parts)
     p = len(system.parameters.names)
     scale = jnp.asarray(np.tril(1.0 + np.arange(p * p).reshape(p, p)))
     prior = Gaussian(jnp.linspace(0.5, 1.0, p), scale)

@@ -28,7 +28,7 @@ from sim2gp.types import in_float64
 
 def some(*names: str) -> list[sy.Candidate]:
     """Part of the library: each effect that is fitted costs a compilation."""
-    return [c for c in sy.library(sy.Furuta()) if c.name in names]
+    return [c for c in sy.candidates(sy.Furuta()) if c.name in names]
 
 
 FEW = some("theta.spring", "theta.back_emf")
@@ -100,7 +100,7 @@ def test_a_dead_zone_is_found_though_its_slope_at_nothing_is_not() -> None:
 def test_payload_of_a_cartpole_is_a_pole_of_another_size() -> None:
     data = study.data_of("cartpole", None, jax.random.key(3))
     kinds = ("theta.payload", "theta.geometry", "x.spring")
-    few = [c for c in sy.library(sy.CartPole()) if c.name in kinds]
+    few = [c for c in sy.candidates(sy.CartPole()) if c.name in kinds]
     bare = data.fit()
     found = {s.candidate.name: s for s in score(data, bare, few)}
     assert not found["x.spring"].alias
@@ -232,7 +232,7 @@ def test_the_study_plants_what_it_says(machine: str, name: str) -> None:
 
 @pytest.mark.parametrize("machine", MACHINES)
 def test_the_library_holds_what_is_planted_and_not_the_others(machine: str) -> None:
-    library = {c.name for c in sy.library(MACHINES[machine][0]())}
+    library = {c.name for c in sy.candidates(MACHINES[machine][0]())}
     for planted in study.PLANTED[machine].values():
         assert sy.Candidate(planted).name in library
         half = study.scaled(planted, 0.5)

@@ -30,7 +30,7 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def short(system: Any, *, windows: bool = False) -> tuple[sy.Candidate, ...]:
         kinds = ("theta.spring", "theta.back_emf")
-        every = sy.library(system, windows=windows)
+        every = sy.candidates(system, windows=windows)
         return tuple(c for c in every if c.name in kinds)
 
     monkeypatch.setattr("sim2gp.identification.missing_physics.search.library", short)

@@ -22,7 +22,7 @@ from sim2gp.planning.tasks import furuta_swingup
 from sim2gp.robot import NumpyPolicy, load_policy
 from sim2gp.robot.export import export_model, export_policy
 from sim2gp.runs import load_run, new_run, store
-from sim2gp.systems import Actuated, CartPole, Furuta, MuJoCo
+from sim2gp.systems import CartPole, Delay, Furuta, Machine, MuJoCo
 
 KEY = jax.random.key(0)
 TASK, SYSTEM = furuta_swingup(), Furuta()
@@ -276,7 +276,7 @@ def test_draws_of_a_mujoco_model_are_its_files(tmp_path: Path) -> None:
     path = tmp_path / "cart.xml"
     path.write_text(CART)
     bare = MuJoCo(path, ["body/pole/mass", "joint/x/damping"])
-    system = Actuated(bare, {"voltage.delay": 0.01})
+    system = Machine(bare, actuators=[Delay("voltage", 0.01)])
     belief = Sim2GP(system).init(KEY)
     export_model(belief, tmp_path / "model", system, dt=0.02, draws=3, key=KEY)
     run = load_run(tmp_path / "model")

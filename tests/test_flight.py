@@ -25,7 +25,7 @@ from mass_task import (
 from sim2gp.errors import NotFinite, Sim2GPWarning
 from sim2gp.planning import AbstractPlanner, MarkovObjective, World, tasks
 from sim2gp.planning.episode import Trajectory, episode, fly, oracle_world, world_of
-from sim2gp.systems import InputDelay
+from sim2gp.systems import Delay
 from sim2gp.types import Key, State
 
 
@@ -114,7 +114,7 @@ def world_limit(world: World, a: Array) -> Array:
 
 
 def test_a_planner_sees_the_past_actions_that_its_world_carries() -> None:
-    task = tasks.furuta_swingup(effects=[InputDelay("voltage", 0.03)])
+    task = tasks.furuta_swingup(effects=[Delay("voltage", 0.03)])
     task = eqx.tree_at(lambda t: t.noise, task, jnp.zeros(4))
     assert task.history == 2
     world, planner = oracle_world(task), Scripted(single(9.0))

@@ -19,10 +19,9 @@ from sim2gp.experiments import (
 )
 from sim2gp.experiments.configurations import told
 from sim2gp.experiments.identified import restored
-from sim2gp.inference.variants import Configuration
 from sim2gp.project import load_project
 from sim2gp.runs import Progress, load_run
-from sim2gp.systems import Furuta
+from sim2gp.systems import Furuta, Variant
 
 QUIET = Progress(quiet=True)
 
@@ -57,9 +56,9 @@ def test_groups_become_configurations(tmp_path: Path) -> None:
     again = BARE.replace("bare.csv", "other.csv")
     project = load_project(project_in(tmp_path, BARE, loaded, again, more=more))
     table = project.system.parameters
-    assert table.configurations == (
-        Configuration("bare", fixed=(("alpha.payload", 0.0),)),
-        Configuration("loaded", own=("motor_constant", "alpha.payload")),
+    assert project.system.variants == (
+        Variant("bare", fixed=(("alpha.payload", 0.0),)),
+        Variant("loaded", own=("motor_constant", "alpha.payload")),
     )
     assert table["motor_constant"].map != table["motor_constant @ loaded"].map == "log"
     assert table["alpha.payload @ loaded"].high == 0.01
@@ -110,14 +109,15 @@ def test_what_makes_no_sense_is_one_line(
 
 
 def test_a_table_says_what_each_configuration_has(tmp_path: Path) -> None:
-    table = load_project(project_in(tmp_path, BARE, LOADED)).system.parameters
-    entries = {name: {"mean": 0.0061, "sd": 2e-4} for name in table.names}
+    system = load_project(project_in(tmp_path, BARE, LOADED)).system
+    names = system.parameters.names
+    entries = {name: {"mean": 0.0061, "sd": 2e-4} for name in names}
     t, none = np.arange(2.0), dict[str, Any]()
     logs = [
         Log("x", source, t, none, none, none, group=group)
         for source, group in (("a", 0), ("a", 0), ("b", 1), ("c", 1))
     ]
-    found = told(table, logs, entries)
+    found = told(system, logs, entries)
     assert found["configurations"] == {
         "bare": {"recordings": 1, "fixed": {"alpha.payload": 0.0}, "own": []},
         "loaded": {"recordings": 2, "fixed": {}, "own": ["alpha.payload"]},
@@ -127,7 +127,7 @@ def test_a_table_says_what_each_configuration_has(tmp_path: Path) -> None:
         ["recordings", "1", "2"],
         ["alpha.payload", "0 (known)", "0.0061 kg +- 0.0002"],
     ]
-    assert told(Furuta().parameters, logs, entries) == {}
+    assert told(Furuta(), logs, entries) == {}
 
 
 # A model of MuJoCo's: an arm whose hand weighs 0.1 kg, or some more.

@@ -19,11 +19,11 @@ from sim2gp.planning.episode import Purpose, fly, key_for, oracle_world
 from sim2gp.planning.mpc import from_unit
 from sim2gp.planning.tasks import MACHINES, Task, draw_truth, furuta_swingup
 from sim2gp.robot.gymnasium import NAMES, _kind, after, environment, register
-from sim2gp.systems import Furuta, InputDelay
+from sim2gp.systems import Delay, Furuta
 from sim2gp.types import Key, State
 
 SEED = 7
-WRONG = {"effects": ["coulomb mild", InputDelay("voltage", 0.01)]}
+WRONG = {"effects": ["coulomb mild", Delay("voltage", 0.01)]}
 
 
 class Played(AbstractPlanner):

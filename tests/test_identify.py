@@ -15,7 +15,7 @@ from sim2gp.experiments.identified import restored
 from sim2gp.experiments.longer import Longer
 from sim2gp.project import load_project
 from sim2gp.runs import Progress, load_run
-from sim2gp.systems import Furuta, Perturbed
+from sim2gp.systems import Furuta, Machine
 from simulated_logs import FREE, simulated
 
 QUIET = Progress(quiet=True)
@@ -247,7 +247,7 @@ def test_effects_are_constants_of_the_machine(folder: Path) -> None:
     effect = "[effects.theta.coulomb]\nmean = 5e-4\nsd = 5e-4\nmap = 'log'\n"
     path = project_in(folder, f"\n{effect}width = 0.02\n[effects.alpha]\ndrag = 0.1\n")
     system = load_project(path).build_system()
-    assert isinstance(system, Perturbed)
+    assert isinstance(system, Machine)
     assert [e.name for e in system.effects] == ["theta.coulomb", "alpha.drag"]
     assert system.effects[0].width == 0.02
     assert system.parameters["theta.coulomb"].map == "log"

@@ -13,8 +13,9 @@ from sim2gp.experiments import mismatch, swingup
 from sim2gp.experiments.swingup import CONDITIONS, METHODS, WITH_TERM, Cell
 from sim2gp.planning.tasks import MACHINES, furuta_swingup
 from sim2gp.runs import Progress
-from sim2gp.systems import Actuated, Furuta
-from sim2gp.systems.effects.perturbed import InputDelay, effect
+from sim2gp.systems import Delay, Furuta
+from sim2gp.systems.effects.strengths import effect
+from sim2gp.systems.machine import Machine
 
 ORACLE = {"hang_return": 50.0, "oracle_return": 150.0, "redrawn": 0, "returns": [150.0]}
 
@@ -45,9 +46,9 @@ def test_conditions_of_a_figure_are_one_program():
 
 def test_the_right_term_is_there_for_delays_as_well():
     lacking = swingup.missing("furuta", "delay strong")
-    assert isinstance(lacking, InputDelay)
+    assert isinstance(lacking, Delay)
     model = METHODS[WITH_TERM](Furuta(), lacking, {})
-    assert isinstance(model.system, Actuated)
+    assert isinstance(model.system, Machine)
     assert "voltage.delay" in model.system.parameters.names
     low, high = 0.0, 2 * lacking.magnitude
     table = {p.name: p for p in model.system.parameters.free}

@@ -69,7 +69,7 @@ def test_furuta(full_rod):
     """As published; and with the rod's own inertia, which the published model omits."""
     furuta = sy.Furuta()
     if full_rod:
-        furuta = sy.Perturbed(furuta, [sy.RodInertia()])
+        furuta = sy.Machine(furuta, [sy.RodInertia()])
     assert compare(furuta, lambda p: mjcf.furuta(p, full_rod=full_rod)) < 1e-9
 
 
@@ -78,9 +78,9 @@ def test_cartpole(tilt, extra):
     """As published; on a tilted rail; with the pole's centre off its middle."""
     cartpole = sy.CartPole()
     if tilt:
-        cartpole = sy.Perturbed(cartpole, [sy.RailTilt(magnitude=tilt)])
+        cartpole = sy.Machine(cartpole, [sy.RailTilt(magnitude=tilt)])
     if extra:
-        cartpole = sy.Perturbed(cartpole, [sy.PoleGeometry(magnitude=extra)])
+        cartpole = sy.Machine(cartpole, [sy.PoleGeometry(magnitude=extra)])
     xml = lambda p: mjcf.cartpole(p, tilt=tilt, extra=extra)  # noqa: E731
     assert compare(cartpole, xml) < 1e-9
 

@@ -13,7 +13,7 @@ from sim2gp.inference import linear_regression as last_layer
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.models import NLM, features
 from sim2gp.models import nlm as module
-from sim2gp.systems import Actuated, Furuta
+from sim2gp.systems import Delay, Furuta, Machine
 
 KEY = jax.random.key(0)
 N, M, D = 40, 7, 2
@@ -287,7 +287,7 @@ def test_encoding_of_channels():
 
 def test_past_actions_move_on():
     """Carried inputs are known, not predicted: newest first, the oldest dropped."""
-    system = Actuated(Furuta(), {"voltage.delay": 0.03}, delay_max=0.04, period=0.02)
+    system = Machine(Furuta(), actuators=[Delay("voltage", 0.03)], period=0.02)
     model = NLM(system, hidden=(4,))
     belief = model.init(KEY)
     s, a = jnp.asarray([0.0, 0.1, 0.2, 0.3, 1.0, 2.0]), jnp.asarray([3.0])

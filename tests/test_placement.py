@@ -11,7 +11,6 @@ import machines
 from machines import against, close
 from sim2gp import systems as sy
 from sim2gp.errors import InputError
-from sim2gp.inference.parameters import Parameter
 from test_systems import cartpole_forces, furuta_forces
 
 pytestmark = pytest.mark.usefixtures("float64")

@@ -15,7 +15,7 @@ from sim2gp.errors import InputError
 from sim2gp.inference.parameters import BOX_SD
 from sim2gp.project import Project, load_project
 from sim2gp.project.source import read_source
-from sim2gp.systems.actuators import Actuated
+from sim2gp.systems.machine import Machine
 from sim2gp.systems.plants.two_link import TwoLink
 
 BASE = """system = "two_link"
@@ -71,9 +71,9 @@ def test_the_agreed_shape_is_accepted(tmp_path: Path) -> None:
     project = load(tmp_path, BASE)
     assert project.name == "arm"
     system = project.build_system()
-    assert isinstance(system, Actuated)
-    assert isinstance(system.system, TwoLink)
-    assert system.system.gravity == 9.81
+    assert isinstance(system, Machine)
+    assert isinstance(system.plant, TwoLink)
+    assert system.plant.gravity == 9.81
     assert project.spec.likelihood.window == 0.2
 
 

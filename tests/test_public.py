@@ -17,8 +17,8 @@ systems tasks
 """
 #: Of `sim2gp.systems`, what a system of one's own is made with.
 SYSTEMS = """
-AbstractMechanism AbstractODE AbstractPlant AbstractSystem Actuated BlackBox Bound
-CartPole Channel Furuta MuJoCo ODE TwoLink rk4
+AbstractMechanism AbstractODE AbstractPlant AbstractSystem BlackBox Bound CartPole
+Channel Furuta Machine MuJoCo ODE TwoLink free_parts rk4 with_parts
 """
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 

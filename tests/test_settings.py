@@ -40,6 +40,11 @@ def ode(**options):
     return sy.ODE(lambda p, s, a: -s, CONSTANTS, STATES, INPUTS, **options)
 
 
+def late(*parts, **options):
+    actuators = parts or [sy.Delay("voltage")]
+    return sy.Machine(sy.Furuta(), actuators=actuators, **options)
+
+
 def host(**options):
     return sy.BlackBox(lambda p, s, a, h: s, CONSTANTS, STATES, INPUTS, **options)
 
@@ -114,23 +119,17 @@ IMPOSSIBLE = {
     "length": (lambda: sy.TwoLink(length1=0.0), "E148"),
     "width of friction": (lambda: sy.TwoLink(coulomb_width=0.0), "E148"),
     "delay negative": (
-        lambda: sy.Actuated(sy.Furuta(), {"voltage.delay": -0.01}),
+        lambda: late(parameters={"voltage.delay": -0.01}),
         "E141",
     ),
     "delay without end": (
-        lambda: sy.Actuated(
-            sy.Furuta(), {"voltage.delay": Parameter("", "s", "", "log", 0.0)}
-        ),
+        lambda: late(parameters={"voltage.delay": Parameter("", "s", "", "log", 0.0)}),
         "E141",
     ),
-    "delay_max": (lambda: sy.Actuated(sy.Furuta(), delay_max=-0.1), "E148"),
-    "actuator's period": (lambda: sy.Actuated(sy.Furuta(), period=0.0), "E148"),
-    "lag": (lambda: sy.Lagged(sy.Furuta(), "voltage", 0.0), "E141"),
-    "lag's period": (
-        lambda: sy.Lagged(sy.Furuta(), "voltage", 0.1, period=0.0),
-        "E148",
-    ),
-    "input delay": (lambda: sy.InputDelay("voltage", -0.01), "E148"),
+    "machine's period": (lambda: late(period=0.0), "E148"),
+    "lag": (lambda: late(sy.Lag("voltage", 0.0), period=0.02), "E141"),
+    "lag's period": (lambda: late(sy.Lag("voltage", 0.1)), "E148"),
+    "input delay": (lambda: sy.Delay("voltage", -0.01), "E148"),
     "magnitude": (lambda: sy.Spring("theta", NAN), "E148"),
     "width": (lambda: sy.Coulomb("theta", 1e-3, width=0.0), "E148"),
     "rail's width": (lambda: sy.RailFriction(width=-0.01), "E148"),
@@ -260,7 +259,7 @@ def test_what_can_be_is_taken() -> None:
     sg.SAC(discount=1.0, rate=0.0, hidden=())
     sg.NLM(linear(2, 2), steps=0, refit_steps=0)
     sy.Coulomb("theta", 0.0)
-    sy.InputDelay("voltage", 0.0)
+    sy.Delay("voltage", 0.0)
 
 
 def test_numbers_that_nobody_knows_yet_are_not_checked() -> None:

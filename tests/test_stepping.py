@@ -14,7 +14,6 @@ from sim2gp.data.one_step_log import (
     mean_inputs,
     samples_of,
     smoothed_states,
-    stepping,
     steps_of_grid,
     transitions,
 )
@@ -23,7 +22,8 @@ from sim2gp.data.windows import Windows
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.models import Sim2GP, Sim2GPBelief
 from sim2gp.models.ensemble import ensemble
-from sim2gp.systems import AbstractSystem, Actuated, Furuta, actuator_prior
+from sim2gp.systems import AbstractSystem, Delay, free_parts
+from sim2gp.systems.assemble import carrying_inputs
 from sim2gp.systems.simulate import simulate
 from sim2gp.types import Dynamics, in_float64
 from simulated_logs import pendulum, simulated
@@ -32,16 +32,15 @@ PERIOD = 0.02
 DELAY = 0.007
 
 
-def behind_delay() -> Actuated:
+def behind_delay() -> AbstractSystem:
     """The pendulum with a delay to be learned."""
-    channel = Furuta().actions[0]
-    return Actuated(pendulum(), {"voltage.delay": actuator_prior(channel, "delay")})
+    return free_parts(pendulum(), [Delay("voltage")])
 
 
 @in_float64
-def known(system: Actuated) -> Gaussian:
+def known(system: AbstractSystem) -> Gaussian:
     """A posterior that is sure of the published constants and of the delay."""
-    values = system.system.parameters.nominal() | {"voltage.delay": DELAY}
+    values = pendulum().parameters.nominal() | {"voltage.delay": DELAY}
     theta = jnp.asarray([values[name] for name in system.parameters.names])
     tt = system.parameters.unconstrain(theta)
     return Gaussian(tt, 1e-9 * jnp.eye(tt.size))
@@ -67,16 +66,16 @@ def test_mean_inputs_are_integrals_of_what_was_held(log: Log) -> None:
 
 def test_the_delay_stays_a_constant_and_the_past_is_carried() -> None:
     system = behind_delay()
-    stepper = stepping(system, PERIOD)
+    stepper = carrying_inputs(system, PERIOD)
     assert stepper.parameters == system.parameters
     assert [c.name for c in stepper.states[4:]] == ["voltage[-1]"]
-    assert stepping(pendulum(), PERIOD) == pendulum()
-    half = stepping(system, 0.01)
+    assert carrying_inputs(pendulum(), PERIOD) == pendulum()
+    half = carrying_inputs(system, 0.01)
     assert [c.name for c in half.states[4:]] == ["voltage[-1]", "voltage[-2]"]
 
 
 def test_rows_follow_each_other_and_carry_the_past(log: Log) -> None:
-    stepper = stepping(behind_delay(), PERIOD)
+    stepper = carrying_inputs(behind_delay(), PERIOD)
     samples = samples_of([log, log], stepper, PERIOD)
     data, of = transitions(samples, samples.rough), samples.step_log()
     count = data.count
@@ -130,7 +129,7 @@ def test_masked_samples_leave_no_transition(log: Log) -> None:
     bad = {name: mask.copy() for name, mask in log.mask.items()}
     bad["alpha"][300] = False
     other = Log(log.name, log.source, log.time, log.channels, log.inputs, bad)
-    system = stepping(pendulum(), PERIOD)
+    system = carrying_inputs(pendulum(), PERIOD)
     whole, part = (len(samples_of([x], system, PERIOD).first) for x in (log, other))
     # A parabola spans 50 ms, a transition has two of them 20 ms apart.
     assert whole - part in (3, 4)
@@ -141,7 +140,7 @@ def test_rollouts_are_the_windows_forecasts(log: Log) -> None:
     """At 20 ms with mean inputs, the point is the forecast at 2 ms."""
     system = behind_delay()
     grid = evaluation_windows([log], system, longest=0.2)
-    stepper = stepping(system, PERIOD)
+    stepper = carrying_inputs(system, PERIOD)
     steps = steps_of_grid(grid, [log], stepper, PERIOD, (5, 10))
     posterior = known(system)
     rows = np.asarray([steps_of(0.1), steps_of(0.2)])
@@ -158,7 +157,7 @@ def test_rollouts_are_the_windows_forecasts(log: Log) -> None:
 
 @in_float64
 def simulated_at(
-    system: Actuated, posterior: Gaussian, windows: Windows, rows: np.ndarray
+    system: AbstractSystem, posterior: Gaussian, windows: Windows, rows: np.ndarray
 ) -> np.ndarray:
     """Angles at rows of the grid, every window at 2 ms under the recorded inputs."""
     params = system.record(system.parameters.values(posterior.mean))

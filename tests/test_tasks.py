@@ -12,7 +12,7 @@ import scipy.stats
 from sim2gp.errors import InputError
 from sim2gp.planning import tasks
 from sim2gp.planning.tasks import CartPoleReward, FurutaReward, Task
-from sim2gp.systems import CartPole, Coulomb, Furuta, InputDelay
+from sim2gp.systems import CartPole, Coulomb, Delay, Furuta
 
 KEY = jax.random.key(0)
 PRESETS = [tasks.furuta_swingup, tasks.cartpole_swingup]
@@ -157,7 +157,7 @@ def test_effects_change_the_truth_and_nothing_else() -> None:
 
 
 def test_an_input_delay_carries_past_actions() -> None:
-    task = tasks.furuta_swingup(effects=[InputDelay("voltage", 0.02)])
+    task = tasks.furuta_swingup(effects=[Delay("voltage", 0.02)])
     assert task.history == 1
     assert task.size == 4
     s = task.reset(KEY)

@@ -21,9 +21,10 @@ from sim2gp.inference.parameters import Parameter, Parameters
 from sim2gp.models import Sim2GP
 from sim2gp.models.sim2gp import likelihood
 from sim2gp.project import load_project
-from sim2gp.systems import Candidate, Configuration, Coulomb, InputDelay, configured
+from sim2gp.systems import Coulomb, Delay, Variant, free_parts, with_variants
+from sim2gp.systems.assemble import with_weighed
+from sim2gp.systems.machine import Machine
 from sim2gp.systems.plants.furuta import Furuta
-from sim2gp.systems.variants import Configured, with_weighed
 from sim2gp.types import in_float64
 
 KEY = jax.random.key(0)
@@ -138,16 +139,15 @@ def test_bounded_constants_keep_their_sum() -> None:
 def test_a_candidate_keeps_what_is_known() -> None:
     """Explain tries machines with one constant more."""
     x = Weighed(("arm_mass", "pendulum_mass"), (1.0, 1.0), 0.119, 0.001)
-    heavy = Configuration("heavy", own=("pendulum_mass",))
-    both = with_weighed(configured(Furuta(), [Configuration("bare"), heavy]), [x])
+    heavy = Variant("heavy", own=("pendulum_mass",))
+    both = with_weighed(with_variants(Furuta(), [Variant("bare"), heavy]), [x])
     machine = both
-    for effect in (Coulomb("theta", 0.01), InputDelay("voltage", 0.02)):
-        candidate = Candidate(effect)
-        machine = candidate.freed(machine)
-        assert isinstance(machine, Configured)
+    for part in (Coulomb("theta", 0.01), Delay("voltage", 0.02)):
+        machine = free_parts(machine, [part])
+        assert isinstance(machine, Machine)
         assert machine.parameters.weighed == (x,)
-        assert machine.parameters.configurations == both.parameters.configurations
-        assert {*machine.parameters.names} >= {*both.parameters.names, candidate.name}
+        assert machine.variants == both.variants
+        assert {*machine.parameters.names} >= {*both.parameters.names, part.name}
     assert machine.longest_delay == 0.02
     more = {"theta.coulomb", "voltage.delay"}
     assert {*machine.parameters.names} == {*both.parameters.names, *more}

@@ -17,9 +17,8 @@ from sim2gp.data.windows import Windows, fit_windows
 from sim2gp.inference import arrowhead
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.models import Sim2GP
-from sim2gp.systems import Actuated, Furuta
+from sim2gp.systems import Delay, Furuta, free_parts
 from sim2gp.systems import simulate as stretch
-from sim2gp.systems.actuators import actuator_prior
 from sim2gp.types import in_float64
 from simulated_logs import FREE, NAMES, pendulum, simulated
 
@@ -223,8 +222,7 @@ def _none(x: object) -> bool:
 @pytest.mark.parametrize("jitter", [pytest.param(0.0, marks=pytest.mark.nightly), 0.4])
 def test_delay_is_recovered_without_velocities(jitter: float) -> None:
     truth = 0.0063
-    free = actuator_prior(pendulum().actions[0], "delay")
-    system = Actuated(pendulum(), {"voltage.delay": free})
+    system = free_parts(pendulum(), [Delay("voltage")])
     logs = [
         simulated(seconds=1.0, seed=s, delay=truth, jitter=jitter, noise=5e-4)
         for s in (5, 6)
@@ -249,8 +247,7 @@ def test_delay_is_recovered_without_velocities(jitter: float) -> None:
 
 def test_delayed_inputs_are_smooth_in_the_delay(short: Log) -> None:
     """No kink where the delay is a whole number of samples."""
-    free = actuator_prior(pendulum().actions[0], "delay")
-    system = Actuated(pendulum(), {"voltage.delay": free})
+    system = free_parts(pendulum(), [Delay("voltage")])
     windows, _ = cut([short], system, window=0.1)
     with jax.enable_x64(True):
         one = jax.tree.map(lambda x: jnp.asarray(x[0]), eqx.tree_at(

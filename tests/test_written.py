@@ -146,9 +146,9 @@ class Pull(AbstractForce):
 def test_an_effect_of_ones_own_likewise(answer, said) -> None:
     """A force of one number would pull at both joints."""
     with pytest.raises(InputError, match=f"^{said}") as caught:
-        sy.Perturbed(sy.Furuta(), [Pull(answer)])
+        sy.Machine(sy.Furuta(), [Pull(answer)])
     assert "Pull.force" in str(caught.value)
-    assert sy.Perturbed(sy.Furuta(), [Pull(lambda q: -q)]).effects
+    assert sy.Machine(sy.Furuta(), [Pull(lambda q: -q)]).effects
 
 
 HOST = {name: x for name, x in WRONG.items() if name not in ("a list", "nothing")}
@@ -268,7 +268,9 @@ def test_names_are_the_users() -> None:
 
 def test_what_is_ours_says_itself_what_is_wrong() -> None:
     """An error with a code is not wrapped in another one."""
-    delayed = sy.Actuated(sy.Furuta(), {"voltage.delay": 0.05}, delay_max=0.05)
+    delayed = sy.Machine(
+        sy.Furuta(), actuators=[sy.Delay("voltage", 0.05)], period=0.02
+    )
     short = delayed.bind(delayed.nominal(), 0.001)
     with pytest.raises(InputError, match=r"^E113 delay longer"):
         replace(furuta_swingup(), dynamics=short, history=delayed.history)
