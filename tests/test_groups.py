@@ -76,7 +76,7 @@ def test_groups_become_configurations(tmp_path: Path) -> None:
     # A machine in one configuration is what it was, whatever its groups are called.
     plain = [group.split("fixed")[0].split("free")[0] for group in (BARE, LOADED)]
     project = load_project(project_in(tmp_path, *plain))
-    assert project.system.parameters.configurations == ()
+    assert project.system.variants == ()
     unnamed = LOADED.replace('name = "loaded"\n', "")
     project = load_project(project_in(tmp_path, BARE, unnamed))
     assert project.system.parameters.names[-1] == "alpha.payload @ 2"

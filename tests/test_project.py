@@ -11,10 +11,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import payload_arm
 from sim2gp.errors import InputError
 from sim2gp.inference.parameters import BOX_SD
 from sim2gp.project import Project, load_project
 from sim2gp.project.source import read_source
+from sim2gp.systems.effects.registry import candidates
 from sim2gp.systems.machine import Machine
 from sim2gp.systems.plants.two_link import TwoLink
 
@@ -75,6 +77,42 @@ def test_the_agreed_shape_is_accepted(tmp_path: Path) -> None:
     assert isinstance(system.plant, TwoLink)
     assert system.plant.gravity == 9.81
     assert project.spec.likelihood.window == 0.2
+
+
+def test_older_files_call_viscous_damping_back_emf(tmp_path: Path) -> None:
+    more = "\nmean = 0.0\nsd = 0.1\n"
+    for what in ("viscous", "back_emf"):
+        system = load(tmp_path, f"{BASE}\n[effects.q1.{what}]{more}").build_system()
+        assert system.parameters[f"q1.{what}"].sd == 0.1
+        assert f"q1.{what}" in system.parameters.names
+        names = [c.name for c in candidates(system, windows=True)]
+        assert "q1.viscous" not in names
+        assert "q2.viscous" in names
+
+
+def test_a_system_of_ones_own_in_a_project(tmp_path: Path) -> None:
+    """Priors, effects and actuators of the file are for the user's system."""
+    path = tmp_path / "mine.toml"
+    path.write_text(
+        'system = "my arm"\n[parameters]\ndamping = 0.05\n'
+        "weight = {mean = 1.0, sd = 0.1}\n"
+        "[effects.torque]\ndead_zone = 0.1\n"
+        "[actuators.torque]\ndelay = {low = 0.0, high = 0.01}\n"
+    )
+    project = load_project(path, system=payload_arm.arm())
+    table = project.system.parameters
+    assert table.names == ("inertia", "weight", "payload", "torque.delay")
+    known = dict(table.fixed)
+    assert (known["damping"], known["torque.dead_zone"]) == (0.05, 0.1)
+    assert project.system.longest_delay == 0.01
+    path.write_text('system = "my arm"\n[effects.q.spring]\nsd = 0.1\n')
+    with pytest.raises(InputError, match=r"E145 no spring on this machine.*encoder"):
+        load_project(path, system=payload_arm.arm())
+    path.write_text('system = "my arm"\n[options]\ngravity = 9.81\n')
+    with pytest.raises(InputError, match="E160 unknown option"):
+        load_project(path, system=payload_arm.arm())
+    with pytest.raises(InputError, match="E160"):
+        load_project(path)
 
 
 def test_moments_become_the_prior(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ This half of the project loads the simulators; `sim2gp.project.schema` does not.
 
 import inspect
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, get_type_hints
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
@@ -24,7 +25,7 @@ from sim2gp.project.source import Source
 from sim2gp.project.validate import unknown, words, wrong_value
 from sim2gp.systems import AbstractPlant, AbstractSystem, with_parts
 from sim2gp.systems.actuators import neutral_actuators
-from sim2gp.systems.machine import plant_of
+from sim2gp.systems.machine import as_machine, plant_of
 from sim2gp.systems.variants import AT
 
 
@@ -50,6 +51,21 @@ def build_system(
     table = _table(plain.parameters, shared, source, ("parameters",))
     plant: Any = kind(parameters=table, **options)
     return with_actuators(with_effects(plant, spec.effects, source), spec, source)
+
+
+def build_own(
+    spec: ProjectSpec, source: Source, system: AbstractSystem
+) -> AbstractSystem:
+    """A user's system with the file's priors, effects and actuators.
+
+    Raises `InputError` E141, E145, and E160 for ``[options]``, which it has none of.
+    """
+    for name in spec.options:
+        raise unknown("option", name, (), source.where("options", name))
+    shared = {k: v for k, v in spec.parameters.items() if AT not in k}
+    table = _table(system.parameters, shared, source, ("parameters",))
+    machine = replace(as_machine(system), parameters=table)
+    return with_actuators(with_effects(machine, spec.effects, source), spec, source)
 
 
 def _options(

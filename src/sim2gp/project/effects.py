@@ -23,15 +23,16 @@ from sim2gp.systems.effects.registry import (
     options_of,
     possible,
 )
+from sim2gp.systems.machine import plant_of
 
 
 def with_effects(
-    plant: AbstractPlant,
+    system: AbstractSystem,
     specs: Mapping[str, Mapping[str, EffectSpec | float]],
     source: Source,
 ) -> AbstractSystem:
     """The machine with the effects of the file; magnitudes are constants by name."""
-    parts: list[AbstractPart] = []
+    plant, parts = plant_of(system), list[AbstractPart]()
     stated: dict[str, Parameter | float] = {}
     for where, kinds in specs.items():
         for what, said in kinds.items():
@@ -42,7 +43,7 @@ def with_effects(
             part = named(what, where, 1.0, **options)
             parts.append(part)
             stated[part.name] = prior(said, part.parameter(plant), line, own=0.0)
-    return with_parts(plant, parts, stated)
+    return with_parts(system, parts, stated)
 
 
 def _impossible(plant: AbstractPlant, what: str, where: str, line: str) -> InputError:

@@ -192,20 +192,27 @@ class Project:
 
 
 def load_project(
-    path: Path | str, folder: Path | None = None, model: Path | None = None
+    path: Path | str,
+    folder: Path | None = None,
+    model: Path | None = None,
+    *,
+    system: "AbstractSystem | None" = None,
 ) -> Project:
     """Read and check a project file; logs are not opened yet (E120 to E162).
 
     A model's file is named relative to ``folder``, the project's own if None; ``model``
-    is another file.
+    is another file. ``system`` is one of your own: the file's ``system`` is then any
+    name for it, and priors, effects and actuators of the file are for yours.
     """
     path = Path(path)
-    source, spec = read_spec(path)
+    source, spec = read_spec(path, own=system is not None)
     # Imported late: a misspelt key is reported before the simulators are loaded.
-    from sim2gp.project.build import build_system, check_names
+    from sim2gp.project.build import build_own, build_system, check_names
     from sim2gp.project.configure import in_configurations, weighed
 
-    if is_model(spec.system):
+    if system is not None:
+        system = build_own(spec, source, system)
+    elif is_model(spec.system):
         from sim2gp.project.model import build_model
 
         folder = path.parent if folder is None else folder
@@ -217,11 +224,14 @@ def load_project(
     return Project(path, source, spec, system)
 
 
-def read_spec(path: Path | str) -> tuple[Source, ProjectSpec]:
-    """The file's text and its validated values, without loading any simulator."""
+def read_spec(path: Path | str, *, own: bool = False) -> tuple[Source, ProjectSpec]:
+    """The file's text and its validated values, without loading any simulator.
+
+    The system of the file must be known, but for a user's ``own``.
+    """
     source = read_source(Path(path))
     spec = validated(source)
-    if not (spec.system in SYSTEMS or is_model(spec.system)):
+    if not (own or spec.system in SYSTEMS or is_model(spec.system)):
         raise unknown_system(spec.system, source.where("system"))
     return source, spec
 
