@@ -11,7 +11,7 @@ the prior of its constant, or of ``[parameters."body/hand/mass @ payload"]``.
 from collections.abc import Mapping
 
 from sim2gp.errors import InputError
-from sim2gp.inference.linear_measurements import Weighed
+from sim2gp.inference.linear_measurements import LinearMeasurement
 from sim2gp.inference.parameters import Parameter, unknown_parameter
 from sim2gp.inference.variants import AT, Configuration
 from sim2gp.project.priors import located, prior
@@ -82,7 +82,7 @@ def weighed(
                 expected=f"{len(stated.of)}, one for each constant",
                 fix="state one for each, or leave weights out",
             )
-        found = Weighed(tuple(stated.of), weights, stated.value, stated.sd)
+        found = LinearMeasurement(tuple(stated.of), weights, stated.value, stated.sd)
         try:
             system = with_weighed(system, [found])
         except InputError as error:

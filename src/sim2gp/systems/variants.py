@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from sim2gp.errors import InputError
 from sim2gp.inference.gaussian import Gaussian
-from sim2gp.inference.linear_measurements import Weighed
+from sim2gp.inference.linear_measurements import LinearMeasurement
 from sim2gp.inference.parameters import Parameter, Parameters, unknown_parameter
 from sim2gp.inference.variants import AT, Configuration, index_of
 from sim2gp.systems.base import AbstractSystem, Channel
@@ -120,7 +120,9 @@ def configured(
     return Configured(system, both)
 
 
-def with_weighed(system: AbstractSystem, sums: Sequence[Weighed]) -> Configured:
+def with_weighed(
+    system: AbstractSystem, sums: Sequence[LinearMeasurement]
+) -> Configured:
     """The machine, of which some sums of constants were measured.
 
     Of a machine in several configurations a sum names columns. Raises `InputError` E142
@@ -144,7 +146,7 @@ def with_weighed(system: AbstractSystem, sums: Sequence[Weighed]) -> Configured:
                 fix="state its weight" if doubled else "give one of them a prior",
             )
         x.check(ranges)
-    more = dataclasses.replace(table, weighed=(*table.weighed, *sums))
+    more = dataclasses.replace(table, measurements=(*table.measurements, *sums))
     inner = system.system if isinstance(system, Configured) else system
     return Configured(inner, more)
 
