@@ -52,6 +52,8 @@ from sim2gp.inference.parameters import Parameters
 from sim2gp.project import Project
 from sim2gp.runs import Progress, new_run
 
+#: Forecasts to draw: of whom, and what and where they are.
+Drawn = tuple[Gaussian, Picture, Grid]
 _SHORTEST = 4  # windows: a film of fewer held-out ones is not worth watching
 
 
@@ -83,27 +85,24 @@ def run(
         task.advance(f"{len(windows)} windows")
         key, robust = jax.random.key(seed), project.spec.likelihood.robust
         grid = evaluation_windows(logs, project.system, longest=CURVE[-1])
-        system = project.system
-        compile_forecast(system, grid)
-        compile_corrected(system, windows)
-        fitted = fit_windows(system, windows, key=key, robust=robust)
+        compile_forecast(project.system, grid)
+        compile_corrected(project.system, windows)
+        fitted = fit_windows(project.system, windows, key=key, robust=robust)
         task.advance("posterior")
-        band, picture = _own_forecasts(project, fitted.posterior, grid, logs)
-        known = fitted.with_measurements(system.parameters)
-        likelihood = WindowsLikelihood(system, windows)
+        band, own = _own_forecasts(project, fitted.posterior, grid, logs)
+        known = fitted.with_measurements(project.system.parameters)
+        likelihood = WindowsLikelihood(project.system, windows)
         honest = corrected_windows(likelihood, known, of)
         summary = _summarise(project, logs, likelihood, known, honest, band, seed)
-        arrays = _stored(system.parameters, known, honest.posterior, band, seed)
-        other = None
-        if held_out:
-            other = unseen(project, logs, windows, places, grid, known)
-        drawing = fitted.posterior, picture, grid
-        said, drawings = _drawings(project, logs, drawing, other)
+        arrays = _stored(project.system.parameters, known, honest.posterior, band, seed)
+        other = (
+            unseen(project, logs, windows, places, grid, known) if held_out else None
+        )
+        said, drawings = _drawings(project, logs, own, other)
         summary, arrays = summary | said, arrays | drawings
         task.advance("forecasts")
         asked = {"quick": not held_out, "check": check, "nuts": nuts, "longer": longer}
-        options = ["--out", out, "--seed", seed, *(f"--{k}" * asked[k] for k in asked)]
-        line = command("sim2gp", "identify", project.path, *options)
+        line = _command(project, out, seed, asked)
         summary |= _held_against(likelihood, fitted, seed, check=check, nuts=nuts)
         if longer:
             progress.say("fitting longer windows")
@@ -118,6 +117,13 @@ def run(
         writer.write_text("report.html", write_report(summary, arrays))
         task.advance("report")
     return summary
+
+
+def _command(project: Project, out: Path, seed: int, asked: dict[str, bool]) -> str:
+    """The line that makes such a run."""
+    flags = [f"--{name}" * yes for name, yes in asked.items()]
+    options = ["--out", out, "--seed", seed, *flags]
+    return command("sim2gp", "identify", project.path, *options)
 
 
 def _place(project: Project, out: Path) -> dict[str, str]:
@@ -150,11 +156,11 @@ def _held_against(
 def _drawings(
     project: Project,
     logs: Sequence[Log],
-    fitted: tuple[Gaussian, Picture, Grid],
+    own: Drawn,
     other: Unseen | None,
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Forecasts of the fitted logs and of held-out data, and a film of the latter."""
-    posterior, picture, shown = fitted
+    posterior, picture, shown = own
     names = channels(project.system, shown.windows)
     arrays, data = trace_arrays(picture, shown, logs, names), "fitted"
     summary: dict[str, Any] = {}
@@ -171,12 +177,12 @@ def _drawings(
 
 def _own_forecasts(
     project: Project, posterior: Gaussian, grid: Grid, logs: Sequence[Log]
-) -> tuple[Band, Picture]:
+) -> tuple[Band, Drawn]:
     """Of the logs that were fitted: the band made of them, and what is drawn."""
     found = predicted(project.system, posterior, grid, CURVE[0])
     rows = rows_for(CURVE[0])[1:]
     band = fit_band(found.at(rows), grid, len(set(recordings(logs))))
-    return band, drawn(found, band, grid)
+    return band, (posterior, drawn(found, band, grid), grid)
 
 
 def _stored(

@@ -65,5 +65,5 @@ def fit_windows(
         freedom=freedom,
         needed=needed,
     )
-    found.raise_unless_converged(system.parameters.names, f"{len(windows)} windows")
+    found.convergence.check(system.parameters.names, f"{len(windows)} windows")
     return found

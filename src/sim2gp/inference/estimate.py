@@ -123,6 +123,37 @@ class Convergence(eqx.Module):
     newton_step_sd: Scalar  # its largest entry, in posterior sd
     steps: Int[Array, ""]
 
+    def check(self, names: tuple[str, ...], where: str) -> None:
+        """Raise a typed error on the host, naming what to look at."""
+        status = int(self.status)
+        if status == NOT_FINITE:
+            raise NotFinite(
+                "E203",
+                "the simulation is not finite at any start of the fit",
+                where=where,
+                fix="narrow the priors, or shorten the step",
+            )
+        if status == DEAD:
+            raise DeadParameters(
+                "E146",
+                "no parameter reaches the data",
+                where=where,
+                got=f"zero sensitivity to {', '.join(names)}",
+                expected="data that depend on one of them at least",
+                fix="check the columns, the excitation and what is fixed",
+            )
+        if status == STALLED:
+            step = f"{float(self.newton_step_sd):.1e} posterior sd"
+            raise NotConverged(
+                "E201",
+                "the MAP did not converge",
+                where=where,
+                got=f"scaled gradient {float(self.gradient):.1e} "
+                f"({step}) after {int(self.steps)} steps",
+                expected=f"at most {GRADIENT_TOLERANCE:.0e}",
+                fix="check units and bounds, or add starts",
+            )
+
 
 class Estimate(eqx.Module):
     """A Gaussian over virtual parameters, and the noise, from data and a prior.
@@ -163,38 +194,6 @@ class Estimate(eqx.Module):
             scores=self.scores @ change,
         )
 
-    def raise_unless_converged(self, names: tuple[str, ...], where: str) -> None:
-        """Raise a typed error on the host, naming what to look at."""
-        ended = self.convergence
-        status = int(ended.status)
-        if status == NOT_FINITE:
-            raise NotFinite(
-                "E203",
-                "the simulation is not finite at any start of the fit",
-                where=where,
-                fix="narrow the priors, or shorten the step",
-            )
-        if status == DEAD:
-            raise DeadParameters(
-                "E146",
-                "no parameter reaches the data",
-                where=where,
-                got=f"zero sensitivity to {', '.join(names)}",
-                expected="data that depend on one of them at least",
-                fix="check the columns, the excitation and what is fixed",
-            )
-        if status == STALLED:
-            step = f"{float(ended.newton_step_sd):.1e} posterior sd"
-            raise NotConverged(
-                "E201",
-                "the MAP did not converge",
-                where=where,
-                got=f"scaled gradient {float(ended.gradient):.1e} "
-                f"({step}) after {int(ended.steps)} steps",
-                expected=f"at most {GRADIENT_TOLERANCE:.0e}",
-                fix="check units and bounds, or add starts",
-            )
-
 
 def drawn_starts(
     first: Float[Array, "k p"], count: int, key: Key
@@ -220,7 +219,7 @@ def estimate(
 
     ``noise`` is where EM begins: a large one traps no first MAP. Rounds beyond those
     ``needed``, and starts that are no number, are compiled and not taken. What did not
-    converge is reported by `Estimate.raise_unless_converged`.
+    converge is reported by `Convergence.check`.
     """
     counts, floor = likelihood.counts, likelihood.floor
 

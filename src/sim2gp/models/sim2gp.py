@@ -161,7 +161,7 @@ class Sim2GP(AbstractModel):
         first = jnp.stack([warm, jnp.zeros_like(warm)])
         found = _fit(self, rows, drawn_starts(first, STARTS, key))
         names = self.system.parameters.names
-        found.raise_unless_converged(names, f"{data.count} transitions")
+        found.convergence.check(names, f"{data.count} transitions")
         return _belief(self, found, rows)
 
     def update(

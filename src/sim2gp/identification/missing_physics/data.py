@@ -85,7 +85,7 @@ class AbstractData(abc.ABC):
             freedom=jnp.asarray(self.freedom),
         )
         rows = int(np.asarray(likelihood.counts).max(axis=1).sum())
-        found.raise_unless_converged(table.names, f"{rows} rows")
+        found.convergence.check(table.names, f"{rows} rows")
         return found
 
     def blocks(
@@ -147,7 +147,7 @@ class OneStepData(AbstractData):
             rounds=self.rounds,
         )
         rows = int(likelihood.counts[0, 0])
-        found.raise_unless_converged(table.names, f"{rows} transitions")
+        found.convergence.check(table.names, f"{rows} transitions")
         return found
 
     def likelihood(self, system: AbstractSystem) -> OneStepLikelihood:
