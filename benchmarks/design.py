@@ -25,7 +25,6 @@ import numpy as np
 
 from sim2gp.data.logs import Log
 from sim2gp.data.split_log import cut
-from sim2gp.data.windows import fit_windows
 from sim2gp.design import (
     AbstractSignal,
     Everything,
@@ -41,6 +40,7 @@ from sim2gp.design import (
 )
 from sim2gp.design.limits import excess
 from sim2gp.experiments.claims import of_median
+from sim2gp.identification.fit import fit_windows
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.parameters import prior_from_moments
 from sim2gp.runs.cells import Cells, Old, add_options

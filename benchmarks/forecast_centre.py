@@ -14,8 +14,9 @@ import jax
 import numpy as np
 
 from sim2gp.data.grid import CURVE, evaluation_windows, steps_of
-from sim2gp.data.windows import fit_windows
+from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.experiments.prediction import channels, cut_logs, predicted, recordings
+from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.intervals.discrepancy import corrected_windows
 from sim2gp.project import load_project
 from sim2gp.types import in_float64
@@ -36,7 +37,9 @@ def compare(path: Path) -> list[str]:
     windows, of = cut_logs(project, known)
     robust = project.spec.likelihood.robust
     belief = fit_windows(system, windows, key=jax.random.key(0), robust=robust)
-    wide = corrected_windows(belief.informed(), windows, of).posterior
+    known = belief.with_measurements(system.parameters)
+    likelihood = WindowsLikelihood(system, windows)
+    wide = corrected_windows(likelihood, known, of).posterior
     grid = evaluation_windows(others, system, longest=CURVE[-1])
     lines = []
     for name, posterior in (("MAP", belief.posterior), ("corrected mean", wide)):

@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import nnls
 
-from sim2gp.data.windows import Windows, WindowsBelief, linearise
+from sim2gp.data.windows_likelihood import WindowsLikelihood, linearise
 from sim2gp.identification.intervals.scatter import Pulls
+from sim2gp.inference.estimate import Estimate
 from sim2gp.models.tempering import FEW, disagreement
 
 #: Correlation times of the mixture, in samples; 0 is white noise.
@@ -41,18 +42,19 @@ class Linear:
         return A.T @ A
 
 
-def linear(belief: WindowsBelief, cut: Windows, pulls: Pulls) -> Linear:
+def linear(likelihood: WindowsLikelihood, fitted: Estimate, pulls: Pulls) -> Linear:
     """Of a fit whose prior has a diagonal scale."""
     p = pulls.scores.shape[1]
-    found = linearise(belief, cut, belief.posterior.mean)
-    stamped = np.flatnonzero(cut.mask.any(axis=(0, 2)))
-    noise = np.asarray(belief.noise)
+    found = linearise(likelihood, fitted, fitted.posterior.mean)
+    mask = np.asarray(likelihood.windows.mask)
+    stamped = np.flatnonzero(mask.any(axis=(0, 2)))
+    noise = np.asarray(fitted.noise.sd)
     r = np.asarray(found.residual)[:, stamped] / noise
     J = np.asarray(found.jacobian)[:, stamped] / noise[:, None]
-    prior_sd = np.diag(np.asarray(belief.prior.scale))
-    z = np.asarray(belief.posterior.mean - belief.prior.mean) / prior_sd
-    e = (np.asarray(belief.starts) - cut.start) / cut.start_sd
-    valid = cut.mask[:, stamped].all(axis=2)
+    prior_sd = np.diag(np.asarray(fitted.prior.scale))
+    z = np.asarray(fitted.posterior.mean - fitted.prior.mean) / prior_sd
+    e = np.asarray(fitted.nuisances)
+    valid = mask[:, stamped].all(axis=2)
     return Linear(z, r, J[..., :p], J[..., p:], e, noise, valid, pulls)
 
 

@@ -38,7 +38,8 @@ from interval_sysid import intervals
 from scipy.stats import beta, norm
 
 from sim2gp.data.split_log import cut
-from sim2gp.data.windows import WindowsBelief, fit_windows
+from sim2gp.data.windows_likelihood import WindowsLikelihood
+from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.intervals.discrepancy import corrected_windows
 from sim2gp.identification.intervals.pulls import pulls_of_windows
 from sim2gp.identification.intervals.scatter import NOTHING, Corrected
@@ -104,16 +105,18 @@ def work(job: Job) -> dict[str, Any]:
     about = SPEAK[WINDOW], MISSING
     found: dict[str, list[Any]] = {name: [] for name in (*METHODS, *about)}
     for s in range(CHUNK):
-        belief, windows, group = _fitted(data, s, WINDOW, key)
-        found[SPEAK[WINDOW]].append(misfit_of_windows(belief, windows).alarm)
-        pulls = pulls_of_windows(belief, windows, group)
-        x = candidates.linear(belief, windows, pulls)
-        ours = corrected_windows(belief, windows, group)
+        likelihood, belief, group = _fitted(data, s, WINDOW, key)
+        found[SPEAK[WINDOW]].append(misfit_of_windows(likelihood, belief).alarm)
+        pulls = pulls_of_windows(likelihood, belief, group)
+        x = candidates.linear(likelihood, belief, pulls)
+        ours = corrected_windows(likelihood, belief, group)
         found[MISSING].append(float(f"{ours.missing:.4g}"))
         each = {
             "plain": (x.z, np.asarray(belief.posterior.sd()) / prior_sd),
             "corrected": _units(ours, prior_sd),
-            "scatter": _units(corrected_windows(belief, windows, group, ()), prior_sd),
+            "scatter": _units(
+                corrected_windows(likelihood, belief, group, ()), prior_sd
+            ),
             "clusters": candidates.clusters(x),
             "mixture": candidates.mixture(x),
             "five_parts": candidates.five_parts(x),
@@ -140,21 +143,21 @@ def _also(job: Job, data: Recordings, prior_sd: Any, key: Any) -> dict[str, Any]
         if job.also == "sysid":
             centre, sd = intervals(data, s, UniformRodArm().parameters)
         else:
-            belief, windows, group = _fitted(data, s, LONGER, key)
-            alarm = misfit_of_windows(belief, windows).alarm
+            likelihood, belief, group = _fitted(data, s, LONGER, key)
+            alarm = misfit_of_windows(likelihood, belief).alarm
             found.setdefault(SPEAK[LONGER], []).append(alarm)
-            centre, sd = _units(corrected_windows(belief, windows, group), prior_sd)
+            centre, sd = _units(corrected_windows(likelihood, belief, group), prior_sd)
         error = centre - data.truth[s] / prior_sd
         found[job.also].append([_rounded(error), _rounded(sd)])
     return found
 
 
 def _fitted(data: Recordings, s: int, window: float, key: Any) -> tuple[Any, Any, Any]:
-    """Belief, windows and their recordings, of one set."""
+    """Windows, their estimate and their recordings, of one set."""
     system = UniformRodArm()
     windows, of = cut([data.log(s)], system, window=window)
-    belief: WindowsBelief = fit_windows(system, windows, key=key)
-    return belief, windows, np.asarray([k for k, _ in of])
+    belief = fit_windows(system, windows, key=key)
+    return WindowsLikelihood(system, windows), belief, np.asarray([k for k, _ in of])
 
 
 def _units(found: Corrected, prior_sd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

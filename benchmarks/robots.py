@@ -26,9 +26,10 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from sim2gp.data.windows import fit_windows
+from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.errors import InputError, NotConverged, NotFinite
 from sim2gp.experiments.prediction import cut_logs
+from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.intervals.discrepancy import corrected_windows
 from sim2gp.project import Project, load_project
 from sim2gp.runs.cells import Cells, add_options
@@ -160,7 +161,8 @@ def work(job: Job) -> dict[str, Any]:
             belief = fit_windows(project.system, windows, key=key, robust=robust)
         except (NotConverged, NotFinite) as error:
             return {"failed": str(error)}
-        mine = corrected_windows(belief, windows, of).posterior
+        likelihood = WindowsLikelihood(project.system, windows)
+        mine = corrected_windows(likelihood, belief, of).posterior
         seconds = time.perf_counter() - started
     found = table.values(mine.mean)
     return {

@@ -21,9 +21,11 @@ from bad_inputs import (
     renamed,
     stored,
 )
-from sim2gp.inference import levenberg_marquardt as laplace
 from sim2gp.inference.arrowhead import Elimination
+from sim2gp.inference.estimate import Laplace
 from sim2gp.inference.gaussian import from_covariance
+from sim2gp.inference.least_squares import prior_rows
+from sim2gp.inference.levenberg_marquardt import Point
 from sim2gp.types import in_float64
 
 
@@ -103,12 +105,11 @@ def nothing_moves(folder: Path, patch: Patch) -> None:
     """
     factor, none = jnp.zeros((3, 3)).at[2, 2].set(1.0), jnp.zeros((1, 0))
     z, zero = jnp.zeros(2), jnp.zeros(())
-    known = jnp.zeros((0, 3))
-    at = laplace.Point(z, none, factor[None, None], known, zero + 0.5, z, none)
+    blocks, rows = factor[None, None], prior_rows(z)
+    at = Point(z, none, blocks, rows, zero + 0.5, z, none, jnp.zeros((1, 2)))
     arrow = Elimination(factor, jnp.zeros((1, 0, 0)), jnp.zeros((1, 0, 3)))
-    status, steps = jnp.asarray(laplace.CONVERGED), jnp.asarray(0)
-    fit = laplace.Fit(at, arrow, factor, zero, status, steps)
-    fit.raise_unless_converged(("mass", "length"), "arm.csv")
+    found = Laplace(at, arrow, jnp.eye(3)).convergence(jnp.asarray(0))
+    found.check(("mass", "length"), "arm.csv")
 
 
 BOMB = "a: &a [x, x]\nb: &b [*a, *a]\nc: [*b, *b]\n"

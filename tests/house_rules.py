@@ -26,7 +26,6 @@ SIBLINGS: frozenset[tuple[str, str]] = frozenset(
         ("types", "checks"),
         ("compilation", "types"),
         ("belief", "data"),
-        ("identification", "models"),
         ("planning", "models"),
     }
 )

@@ -3,7 +3,7 @@
 from mutant_list import Mutant
 
 GATHER, MACHINES = "systems/variants.py", "systems/assemble.py"
-SUMS, INFORMED = "inference/linear_measurements.py", "inference/informed_prior.py"
+SUMS, PRIOR = "inference/linear_measurements.py", "inference/prior.py"
 HERE, WEIGHED = "test_configurations.py", "test_weighed.py"
 CLOSED = (HERE, "closed_form")
 ROW = (WEIGHED, "one_more_row")
@@ -25,7 +25,7 @@ CONFIGURATIONS = (
     ),
     Mutant(
         "configurations: windows of the wrong machine",
-        "data/windows.py",
+        "data/windows_likelihood.py",
         "values = self.system.values(tt, window.configuration)",
         "values = self.system.values(tt, 0 * window.configuration)",
         CLOSED,
@@ -39,10 +39,10 @@ CONFIGURATIONS = (
     ),
     Mutant(
         "configurations: one step of the wrong machine",
-        "models/sim2gp.py",
-        "return model.system.transition(tt, s, a, model.dt, which)[:d]",
-        "which = which if which is None else 0 * which\n"
-        "                return model.system.transition(tt, s, a, model.dt, which)[:d]",
+        "data/one_step.py",
+        "return system.transition(tt + scale @ x, s, a, self.dt, which)[:d]",
+        "i, at = which if which is None else 0 * which, tt + scale @ x\n"
+        "                return system.transition(at, s, a, self.dt, i)[:d]",
         (HERE, "one_step"),
     ),
     Mutant(
@@ -97,36 +97,36 @@ CONFIGURATIONS = (
     Mutant(
         "weighed: not in the cost",
         "inference/levenberg_marquardt.py",
-        "z @ z + apart @ apart)",
-        "z @ z + 0.0 * apart @ apart)",
+        "+ offset @ offset)",
+        "+ z @ z)",
         ROW,
     ),
     Mutant(
         "weighed: not in the posterior",
-        "inference/levenberg_marquardt.py",
-        "full = with_prior(arrow.data, best.z, best.known)",
-        "full = with_prior(arrow.data, best.z)",
+        "inference/estimate.py",
+        "return Laplace(at, arrow, stack(arrow.data, at.prior))",
+        "return Laplace(at, arrow, stack(arrow.data, at.prior[: at.z.size]))",
         ROW,
     ),
     Mutant(
         "weighed: not in the gradient",
         "inference/levenberg_marquardt.py",
-        "+ z + known[:, :-1].T @ apart",
+        "+ rows[:, :-1].T @ offset",
         "+ z",
         (WEIGHED, "gradient"),
     ),
     Mutant(
         "weighed: linearised about the prior's mean",
-        INFORMED,
+        PRIOR,
         "about = rows.at[:, -1].add(-rows[:, :-1] @ z)",
         "about = rows",
         (WEIGHED, "prior_to_the_logs or keep_their_sum"),
     ),
     Mutant(
         "weighed: information in the old prior's units",
-        "data/windows.py",
-        "factor = self.information @ jnp.linalg.solve(L0, prior.scale)",
-        "factor = self.information",
+        "inference/estimate.py",
+        "information=self.information @ change",
+        "information=self.information",
         (WEIGHED, "prior_to_the_logs"),
     ),
     Mutant(

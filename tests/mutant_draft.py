@@ -79,9 +79,9 @@ FIRST_DRAFT = (
     ),
     Mutant(
         "a small step makes a MAP of a cusp",
-        "inference/levenberg_marquardt.py",
-        "(best.gradient <= flat) & (left <= near)",
-        "left <= near",
+        "inference/estimate.py",
+        "(gradient <= flat) & (step_sd <= short)",
+        "step_sd <= short",
         ("test_laplace.py", "stalled"),
     ),
 )

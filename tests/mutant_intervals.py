@@ -87,7 +87,7 @@ INTERVALS = (
     Mutant(
         "intervals: a centre is believed wherever it lies",
         LACKING,
-        "if cost_of_rows(found, cut) - before - told <= slack:",
+        "if cost_of_rows(found, cut) - before - linear <= slack:",
         "if cost_of_rows(found, cut) < np.inf:",
         (HERE, "at_its_bound"),
     ),
@@ -143,14 +143,14 @@ INTERVALS = (
     Mutant(
         "discrepancy: a belief's own prior is dropped",
         LACKING,
-        "scale = prior.scale.at[np.ix_(own, own)].set(belief.prior.scale)",
+        "scale = prior.scale.at[np.ix_(own, own)].set(fitted.prior.scale)",
         "scale = prior.scale",
         (LACKS, "keeps_its_constants"),
     ),
     Mutant(
         "longer: missing physics refuses nothing",
         LONGER,
-        "alarm = misfit_of_windows(belief, windows).alarm",
+        "alarm = misfit_of_windows(likelihood, fitted).alarm",
         "alarm = False",
         ("test_longer.py", "too_slow"),
     ),

@@ -40,10 +40,11 @@ class Mutant:
 
 
 JACOBIAN = "inference/linearized.py"
-LS, SIM, LIN = (
+LS, SIM, LIN, STEP = (
     "inference/least_squares.py",
     "models/sim2gp.py",
     "models/draws.py",
+    "data/one_step.py",
 )
 TABLE, GAUSS, MAPS = (
     "inference/parameters.py",
@@ -52,44 +53,50 @@ TABLE, GAUSS, MAPS = (
 )
 
 #: Where each quantity is formed.
-ROWS = "prior = jnp.concatenate(["
+ROWS = "return jnp.concatenate([jnp.eye(z.size"
 WHITEN = "solve_triangular(noise_scale, block, lower=True)"
 EVIDENCE = "return -0.5 * full[:, -1] @ full[:, -1] - log_det"
 RESIDUAL = "jnp.where(valid, value - s2[:d], 0.0)"
-POSTERIOR = "        fit.posterior(model.prior),\n"
+POSTERIOR = "        found.posterior,\n"
 BOX = "low + (high - low) * jax.nn.sigmoid(t), low, high"
 HESSIAN = """        Gaussian(
-            fit.posterior(model.prior).mean,
+            found.posterior.mean,
             model.prior.scale
             @ jnp.linalg.cholesky(
                 jnp.linalg.inv(
                     jax.hessian(
                         lambda z: 0.5
                         * jnp.sum(
-                            (_OneStep(model, data).rows(z)[0] / noise.sd[None]) ** 2
+                            (
+                                OneStepLikelihood(model.system, data, model.dt).rows(
+                                    model.prior.at(z), model.prior.scale
+                                )[0]
+                                / found.noise.sd[None]
+                            )
+                            ** 2
                         )
                         + 0.5 * z @ z
-                    )(fit.z)
+                    )(found.z())
                 )
             ),
         ),
 """
 
 MUTANTS = (
-    Mutant("prior counted twice", LS, ROWS, f"{ROWS[:8]}2.0**0.5 * {ROWS[8:]}", ORACLE),
+    Mutant("prior counted twice", LS, ROWS, f"{ROWS[:7]}2.0**0.5 * {ROWS[7:]}", ORACLE),
     Mutant(
         "prior twice in the model",
         LS,
         ROWS,
-        f"{ROWS[:8]}1.41421356 * {ROWS[8:]}",
+        f"{ROWS[:7]}1.41421356 * {ROWS[7:]}",
         MODEL,
     ),
-    Mutant("prior omitted", LS, ROWS, f"{ROWS[:8]}1e-9 * {ROWS[8:]}", ORACLE),
+    Mutant("prior omitted", LS, ROWS, f"{ROWS[:7]}1e-9 * {ROWS[7:]}", ORACLE),
     Mutant(
         "prior mean omitted",
         LS,
-        "z[:, None]], axis=1)\n    return stack(data, prior, *more)",
-        "0.0 * z[:, None]], axis=1)\n    return stack(data, prior, *more)",
+        "dtype=z.dtype), z[:, None]], axis=1)",
+        "dtype=z.dtype), 0.0 * z[:, None]], axis=1)",
         ORACLE,
     ),
     Mutant(
@@ -123,9 +130,9 @@ MUTANTS = (
     ),
     Mutant(
         "prior factor transposed",
-        SIM,
-        "model.prior.mean + model.prior.scale @ z",
-        "model.prior.mean + model.prior.scale.T @ z",
+        "inference/levenberg_marquardt.py",
+        "likelihood.blocks(about.at(z), e, about.scale)",
+        "likelihood.blocks(about.mean + about.scale.T @ z, e, about.scale.T)",
         MODEL,
     ),
     Mutant(
@@ -187,14 +194,14 @@ MUTANTS = (
     ),
     Mutant(
         "sign of the residual",
-        SIM,
+        STEP,
         RESIDUAL,
         RESIDUAL.replace("value - s2[:d]", "s2[:d] - value"),
         MODEL,
     ),
     Mutant(
         "rows that do not exist",
-        SIM,
+        STEP,
         RESIDUAL,
         RESIDUAL.replace("valid", "valid | True"),
         MODEL,

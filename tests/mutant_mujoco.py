@@ -23,8 +23,8 @@ ON_THE_HOST = (
     ),
     Mutant(
         "the host is asked for one column after the other",
-        "data/windows.py",
-        "at_once=on_host(system)",
+        "data/windows_likelihood.py",
+        "at_once=on_host(likelihood.system)",
         "at_once=False",
         ("test_black_box.py", "asked_for_once"),
     ),

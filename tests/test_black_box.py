@@ -8,11 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from descents import estimate_of
 from sim2gp.data.logs import Log
 from sim2gp.data.split_log import cut
 from sim2gp.data.transitions import Transitions
-from sim2gp.data.windows import WindowsBelief, linearise
+from sim2gp.data.windows_likelihood import WindowsLikelihood, linearise
 from sim2gp.errors import InputError
+from sim2gp.inference.arrowhead import Noise
 from sim2gp.inference.parameters import Parameter, Parameters
 from sim2gp.models import Sim2GP
 from sim2gp.planning import AbstractPlanner
@@ -148,13 +150,12 @@ def test_all_slopes_of_a_window_are_asked_for_once() -> None:
     found = []
     for system in boxes:
         windows, _ = cut([log], system, window=0.06, start_sd=None, floor=None)
-        prior, n, p = TABLE_OF.prior(), len(STATES), len(TABLE)
-        nothing = jnp.ones(1), jnp.zeros((p, p)), jnp.ones(1)
-        belief = WindowsBelief(
-            system, prior, prior, *nothing, jnp.zeros((1, n)), jnp.asarray(0.0)
-        )
+        prior, noise = TABLE_OF.prior(), Noise(jnp.ones(1), jnp.ones(1))
+        still = -windows.start / windows.start_sd
+        fitted = estimate_of(prior, prior, noise, jnp.asarray(still))
+        likelihood = WindowsLikelihood(system, windows)
         calls.clear()
-        found.append(linearise(belief, windows, prior.mean))
+        found.append(linearise(likelihood, fitted, prior.mean))
         if system is boxes[0]:
             assert 0 < len(calls) <= windows.span.shape[1]
     box, exact = found  # steps of 10 ms, and of 2

@@ -9,19 +9,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from descents import Found, minimise
 from linear_system import linear, windows_of
 from payload_arm import TRUTH, arm, log
-from sim2gp.data import windows as likelihood
 from sim2gp.data.logs import Log
 from sim2gp.data.split_log import cut
 from sim2gp.data.transitions import Transitions
-from sim2gp.data.windows import Windows, WindowsBelief, fit_windows
+from sim2gp.data.windows import Windows
+from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.errors import InputError
+from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.misfit.residuals import misfit_of_windows
 from sim2gp.inference.arrowhead import Noise
+from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
-from sim2gp.inference.levenberg_marquardt import Fit, minimise
 from sim2gp.inference.parameters import Parameter
+from sim2gp.inference.prior import ParameterPrior
 from sim2gp.models import Sim2GP
 from sim2gp.systems import (
     ODE,
@@ -53,10 +56,10 @@ def logs() -> tuple[Log, Log]:
 
 
 @in_float64
-def moments(belief: WindowsBelief) -> dict[str, tuple[float, float]]:
+def moments(system: AbstractSystem, belief: Estimate) -> dict[str, tuple[float, float]]:
     """Virtual mean and sd by column."""
     mean, sd = np.asarray(belief.posterior.mean), np.asarray(belief.posterior.sd())
-    names = belief.system.parameters.names
+    names = system.parameters.names
     return dict(zip(names, zip(mean.tolist(), sd.tolist(), strict=True), strict=True))
 
 
@@ -184,7 +187,7 @@ def test_a_linear_machine_has_the_closed_form() -> None:
     known[group == 0] = 0.5 * A[group == 0, :, 2]
     y = X @ np.asarray([*truth.values()]) + known + 0.1 * rng.normal(size=(N, d))
     belief = fit_windows(system, windows_of(A, y, group), key=KEY)
-    sd = np.asarray(belief.noise)
+    sd = np.asarray(belief.noise.sd)
     white = (X / sd[None, :, None]).reshape(-1, 4)
     mu0, sd0 = np.asarray([0.0, 0.0, 1.5, 0.0]), np.asarray([1.0, 1.0, 0.3, 1.0])
     precision = white.T @ white + np.diag(1.0 / sd0**2)
@@ -204,12 +207,14 @@ def test_a_linear_machine_has_the_closed_form() -> None:
 
 
 @eqx.filter_jit
-def descend(system: AbstractSystem, windows: Windows) -> Fit:
+def descend(system: AbstractSystem, windows: Windows) -> Found:
     prior = system.parameters.prior()
     W, n = windows.start.shape
     noise = Noise(jnp.asarray([1e-3]), jnp.ones(W))
-    model = likelihood.likelihood(system, prior, windows)
-    return minimise(model, jnp.zeros(prior.mean.size), jnp.zeros((W, n)), noise)
+    likelihood = WindowsLikelihood(system, windows)
+    about = ParameterPrior(prior, system.parameters)
+    start, e = jnp.zeros(prior.mean.size), jnp.zeros((W, n))
+    return minimise(likelihood, start, e, noise, about)
 
 
 @pytest.mark.nightly
@@ -227,29 +232,29 @@ def test_sharing_nothing_is_two_fits(logs: tuple[Log, Log]) -> None:
         part = jax.tree.map(lambda x, m=mine: x[m] if len(x) == len(m) else x, whole)
         one = descend(machine, jax.tree.map(jnp.asarray, part))
         at = [system.parameters.names.index(name) for name in columns]
-        scale = np.asarray(one.scale())
+        scale = np.asarray(one.about.scale())
         sd = np.sqrt(np.sum(scale**2, axis=1))
         # As near as a descent ends by its joint tolerance.
         np.testing.assert_allclose(np.asarray(both.z)[at] / sd, one.z / sd, atol=1e-4)
-        ours = np.asarray(both.scale())[at]
+        ours = np.asarray(both.about.scale())[at]
         np.testing.assert_allclose(ours @ ours.T, scale @ scale.T, rtol=1e-4)
-        cost, evidence = cost + one.cost, evidence + one.log_joint()
+        cost, evidence = cost + one.cost, evidence + one.about.log_joint()
     np.testing.assert_allclose(both.cost, cost, rtol=1e-10)
-    np.testing.assert_allclose(both.log_joint(), evidence, atol=1e-4)
+    np.testing.assert_allclose(both.about.log_joint(), evidence, atol=1e-4)
 
 
 @pytest.fixture(scope="module")
-def joined(logs: tuple[Log, Log]) -> tuple[WindowsBelief, Windows]:
+def joined(logs: tuple[Log, Log]) -> tuple[Any, Estimate, Windows]:
     system = joint(BARE, LOADED)
     windows, _ = cut(logs, system, window=0.2)
-    return fit_windows(system, windows, key=KEY), windows
+    return system, fit_windows(system, windows, key=KEY), windows
 
 
 def test_a_payload_is_found_and_the_arm_is_known_better(
-    joined: tuple[WindowsBelief, Windows],
+    joined: tuple[Any, Estimate, Windows],
 ) -> None:
-    belief, windows = joined
-    found, table = moments(belief), belief.system.parameters
+    system, belief, windows = joined
+    found, table = moments(system, belief), system.parameters
     for name, (mean, sd) in found.items():
         truth = table[name].unconstrain(TRUTH[name.split(" @ ")[0]])
         assert abs(mean - truth) < 3.5 * sd, name
@@ -260,7 +265,7 @@ def test_a_payload_is_found_and_the_arm_is_known_better(
     for k in (0, 1):
         mask = windows.mask & (windows.configuration == k)[:, None, None]
         part = dataclasses.replace(windows, mask=mask)
-        one = moments(fit_windows(belief.system, part, key=KEY))
+        one = moments(system, fit_windows(system, part, key=KEY))
         for name in SHARED:
             assert found[name][1] < one[name][1], name
         mean, sd = one["payload @ loaded"]
@@ -272,16 +277,18 @@ def test_a_payload_is_found_and_the_arm_is_known_better(
 
 @pytest.mark.nightly
 def test_a_value_that_is_wrong_is_seen(
-    joined: tuple[WindowsBelief, Windows],
+    joined: tuple[Any, Estimate, Windows],
 ) -> None:
     """0.15 kg were there; 0.05 are stated. The bare log says what the arm is."""
-    belief, windows = joined
-    assert not misfit_of_windows(belief, windows).alarm
+    system, belief, windows = joined
+    likelihood = WindowsLikelihood(system, windows)
+    assert not misfit_of_windows(likelihood, belief).alarm
     known = Variant("loaded", fixed=(("payload", 0.05),))
-    wrong = fit_windows(joint(BARE, known), windows, key=KEY)
-    assert wrong.system.parameters.names == SHARED
+    light = joint(BARE, known)
+    wrong = fit_windows(light, windows, key=KEY)
+    assert light.parameters.names == SHARED
     assert float(wrong.log_evidence) < float(belief.log_evidence) - 50.0
-    assert misfit_of_windows(wrong, windows).alarm
+    assert misfit_of_windows(WindowsLikelihood(light, windows), wrong).alarm
 
 
 @in_float64
@@ -301,10 +308,12 @@ def test_the_program_does_not_grow_with_configurations(
     counts = []
     for system in (machine, with_variants(machine, [BARE, LOADED, third])):
         prior = system.parameters.prior()
-        model = likelihood.likelihood(system, prior, jax.tree.map(jnp.asarray, windows))
-        nothing = jnp.zeros(prior.mean.size), jnp.zeros_like(windows.start)
+        likelihood, e = (
+            WindowsLikelihood(system, windows),
+            jnp.zeros(windows.start.shape),
+        )
         traced.clear()
-        jax.make_jaxpr(model.blocks)(*nothing)
+        jax.make_jaxpr(likelihood.blocks)(prior.mean, e, prior.scale)
         counts.append(len(traced))
     assert counts[0] == counts[1] > 0
 

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from descents import estimate_of
 from design_cases import (
     PERIOD,
     STEPS,
@@ -22,10 +23,11 @@ from design_cases import (
 from sim2gp import design as d
 from sim2gp.data.logs import Log
 from sim2gp.data.split_log import cut
-from sim2gp.data.windows import WindowsBelief, information_at
+from sim2gp.data.windows_likelihood import WindowsLikelihood, information_at
 from sim2gp.design import search
 from sim2gp.design.limits import excess, kept
 from sim2gp.errors import InputError
+from sim2gp.inference.arrowhead import Noise
 from simulated_logs import pendulum
 
 pytestmark = pytest.mark.usefixtures("float64")
@@ -43,7 +45,7 @@ ROWS = eqx.filter_jit(d.experiment.sensitivity_at)
 )
 @pytest.mark.nightly
 def test_it_tells_what_the_log_of_it_would(system) -> None:
-    """Against `data.windows`, on the log that the experiment would leave."""
+    """Against `data.windows_likelihood`, on the log that the experiment would leave."""
     e, U = experiment(system), commands()
     nowhere = jnp.zeros_like(e.belief.mean)
     states = TRAJECTORY(e, e.belief.at(nowhere), U)
@@ -60,17 +62,11 @@ def test_it_tells_what_the_log_of_it_would(system) -> None:
     sd = dict(zip(("theta", "alpha"), (0.05, 0.05), strict=True))
     sd |= {f"{n}.velocity": 1.0 for n in ("theta", "alpha")}
     windows, rows = cut([log], system, window=WINDOW * PERIOD, start_sd=sd)
-    belief = WindowsBelief(
-        system,
-        e.belief,
-        e.belief,
-        e.noise,
-        jnp.zeros((len(nowhere),) * 2),
-        jnp.ones(len(windows)),
-        jnp.asarray(y[[i for _, i in rows]]),
-        jnp.zeros(()),
-    )
-    theirs = np.asarray(information_at(belief, windows)(e.belief.mean))
+    starts = (y[[i for _, i in rows]] - windows.start) / windows.start_sd
+    noise = Noise(e.noise, jnp.ones(len(windows)))
+    fitted = estimate_of(e.belief, e.belief, noise, jnp.asarray(starts))
+    likelihood = WindowsLikelihood(system, windows)
+    theirs = np.asarray(information_at(likelihood, fitted)(e.belief.mean))
     ours = np.asarray(INFORMATION(e, nowhere, U, states))
     np.testing.assert_allclose(ours.T @ ours, theirs.T @ theirs, rtol=1e-6)
     scale = np.asarray(d.after(e.belief, jnp.asarray(ours)))

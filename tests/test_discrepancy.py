@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 import scipy.stats
 
+from descents import estimate_of
 from sim2gp.data.split_log import cut
-from sim2gp.data.windows import Windows, WindowsBelief, fit_windows
+from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.experiments.told_intervals import lacking_table, told_intervals
+from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.intervals import scatter as intervals
 from sim2gp.identification.intervals.discrepancy import _with, corrected_windows
 from sim2gp.identification.intervals.pulls import Pulls
@@ -24,6 +26,8 @@ from sim2gp.identification.intervals.scatter import (
     Corrected,
     corrected,
 )
+from sim2gp.inference.arrowhead import Noise
+from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.parameters import Parameter
 from sim2gp.systems import Delay, UniformRodArm, with_parts
@@ -149,7 +153,7 @@ def arms() -> ModuleType:
     return module
 
 
-Fitted = tuple[np.ndarray, WindowsBelief, Windows]
+Fitted = tuple[np.ndarray, Estimate, WindowsLikelihood]
 
 
 def fitted(arms: ModuleType, condition: str, s: int) -> Fitted:
@@ -157,7 +161,7 @@ def fitted(arms: ModuleType, condition: str, s: int) -> Fitted:
     data = arms.recordings(arms.CONDITIONS[condition], 20, 0)
     windows, _ = cut([data.log(s)], UniformRodArm(), window=0.2)
     belief = fit_windows(UniformRodArm(), windows, key=jax.random.key(0))
-    return data.truth[s], belief, windows
+    return data.truth[s], belief, WindowsLikelihood(UniformRodArm(), windows)
 
 
 def away(truth: np.ndarray, found: Gaussian) -> np.ndarray:
@@ -172,19 +176,19 @@ def test_friction_that_the_simulator_lacks_is_in_the_intervals(
     arms: ModuleType,
 ) -> None:
     """20 mN m in both joints: the damping takes it up, with a narrow interval."""
-    truth, belief, windows = fitted(arms, "friction20", 0)
-    one = np.zeros(len(windows), int)
+    truth, belief, likelihood = fitted(arms, "friction20", 0)
+    one = np.zeros(len(likelihood.windows), int)
     assert away(truth, belief.posterior).max() > 12.0
-    alone = corrected_windows(belief, windows, one, ())
+    alone = corrected_windows(likelihood, belief, one, ())
     assert alone.effects == ()
     assert away(truth, alone.posterior).max() > 7.0
-    found = corrected_windows(belief, windows, one)
+    found = corrected_windows(likelihood, belief, one)
     assert found.missing > 0.99
     assert {"q1.coulomb", "q2.coulomb"} <= set(found.effects)
     assert not any("back_emf" in name for name in found.effects)  # a damping, again
     assert found.posterior.scale.shape == (4, 4)
     assert away(truth, found.posterior).max() < 2.0
-    about = told_intervals(belief.system, found, {}, len(windows))
+    about = told_intervals(UniformRodArm(), found, {}, 50)
     for q in "q1", "q2":
         friction = about["allowed_for"][f"{q}.coulomb"]
         assert abs(friction["mean"] - 0.02) < 3.0 * friction["sd"]
@@ -199,19 +203,19 @@ def test_friction_that_the_simulator_lacks_is_in_the_intervals(
         other = dataclasses.replace(
             belief, posterior=Gaussian(at, belief.posterior.scale)
         )
-    again = corrected_windows(other, windows, one)
+    again = corrected_windows(likelihood, other, one)
     assert away(Plain(found.posterior).mean, again.posterior).max() < 0.1
 
 
 def test_a_sound_simulator_is_believed(arms: ModuleType) -> None:
-    truth, belief, windows = fitted(arms, "white", 0)
-    one = np.zeros(len(windows), int)
-    found = corrected_windows(belief, windows, one)
-    alone = corrected_windows(belief, windows, one, ())
+    truth, belief, likelihood = fitted(arms, "white", 0)
+    one = np.zeros(len(likelihood.windows), int)
+    found = corrected_windows(likelihood, belief, one)
+    alone = corrected_windows(likelihood, belief, one, ())
     assert found.missing < 0.3
-    assert lacking_table(told_intervals(belief.system, found, {}, 50)) == []
-    assert told_intervals(belief.system, alone, {}, 50)["missing"] is None
-    assert told_intervals(belief.system, alone, {}, 50)["allowed_for"] == {}
+    assert lacking_table(told_intervals(UniformRodArm(), found, {}, 50)) == []
+    assert told_intervals(UniformRodArm(), alone, {}, 50)["missing"] is None
+    assert told_intervals(UniformRodArm(), alone, {}, 50)["allowed_for"] == {}
     assert np.max(Plain(found.posterior).sd / Plain(alone.posterior).sd) < 1.3
     assert away(truth, found.posterior).max() < 3.0
 
@@ -227,11 +231,9 @@ def test_a_belief_keeps_its_constants_among_effects() -> None:
     prior = Gaussian(jnp.linspace(0.5, 1.0, p), scale)
     posterior = Gaussian(jnp.linspace(-1.0, -2.0, p), scale)
     none = jnp.zeros(1)
-    belief = WindowsBelief(
-        system, prior, posterior, none, scale, none, none[None], none[0]
-    )
-    whole, own = _with(belief, smooth_effects(system))
-    names = whole.system.parameters.names
+    belief = estimate_of(prior, posterior, Noise(none, none), none[None])
+    wider, whole, own = _with(system, belief, smooth_effects(system))
+    names = wider.parameters.names
     assert len(names) > p + 6
     assert tuple(names[k] for k in own) == system.parameters.names
     np.testing.assert_array_equal(whole.posterior.mean[own], posterior.mean)

@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from descents import estimate_of
 from sim2gp import systems as sy
 from sim2gp.experiments import explain_study as study
 from sim2gp.experiments.explain_words import candidate_rows, headline, table
-from sim2gp.identification.missing_physics.data import Fitted, OneStepData
+from sim2gp.identification.missing_physics.data import OneStepData
 from sim2gp.identification.missing_physics.explain import explain
 from sim2gp.identification.missing_physics.score import (
     Scored,
@@ -155,7 +156,7 @@ def found_with(*refits: tuple[str, float, float, int]) -> Search:
     system = sy.Furuta()
     prior = system.parameters.prior()
     noise = Noise(jnp.ones(4), jnp.ones(1))
-    bare = Fitted(system, prior, prior, noise, jnp.zeros((1, 0)), 0.0)
+    bare = estimate_of(prior, prior, noise, jnp.zeros((1, 0)))
     made = []
     for where, gain, value, sign in refits:
         candidate = sy.Candidate(sy.Spring(where, 1.0), sign=sign)

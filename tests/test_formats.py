@@ -16,8 +16,8 @@ import recordings as rec
 from recordings import Channel
 from sim2gp.data.logs import Column, Log, columns_of, read_log
 from sim2gp.data.split_log import cut
-from sim2gp.data.windows import fit_windows
 from sim2gp.errors import InputError
+from sim2gp.identification.fit import fit_windows
 from sim2gp.project import load_project
 from simulated_logs import FREE, simulated
 

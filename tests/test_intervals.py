@@ -14,9 +14,10 @@ from linear_system import Linear as Machine
 from linear_system import linear
 from sim2gp.data.logs import Log
 from sim2gp.data.split_log import cut
-from sim2gp.data.windows import Windows, WindowsBelief, fit_windows, linearise
+from sim2gp.data.windows_likelihood import WindowsLikelihood, linearise
 from sim2gp.errors import NotFinite
 from sim2gp.identification.exact_posterior.importance import DRAWS, check_windows
+from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.intervals import scatter as intervals
 from sim2gp.identification.intervals.discrepancy import corrected_windows
 from sim2gp.identification.intervals.pulls import (
@@ -26,6 +27,7 @@ from sim2gp.identification.intervals.pulls import (
     rows_of,
 )
 from sim2gp.identification.intervals.scatter import corrected
+from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.parameters import Parameter, Parameters
 
@@ -298,36 +300,37 @@ def recorded(system: Machine, rows: int, rate: list[float], error: np.ndarray) -
     )
 
 
-def cost_of_windows(belief: WindowsBelief, windows: Windows, tt: jax.Array) -> float:
-    return cost_of_rows(rows_of(belief, windows, tt), windows)
+def cost_of(likelihood: WindowsLikelihood, found: Estimate, tt: jax.Array) -> float:
+    return cost_of_rows(rows_of(likelihood, found, tt), likelihood.windows)
 
 
 @pytest.fixture(scope="module")
-def fitted() -> tuple[Windows, WindowsBelief]:
+def fitted() -> tuple[WindowsLikelihood, Estimate]:
     """A machine that is linear in constants and start states, three seconds of it."""
     system = linear(2, 1)
     noise = 0.02 * np.random.default_rng(21).standard_normal(31)
     windows, _ = cut([recorded(system, 31, [0.7, -0.4], noise)], system, window=0.6)
-    return windows, fit_windows(system, windows, key=jax.random.key(0))
+    found = fit_windows(system, windows, key=jax.random.key(0))
+    return WindowsLikelihood(system, windows), found
 
 
 def test_a_linear_machines_centre_is_where_the_gaussian_says(
-    fitted: tuple[Windows, WindowsBelief],
+    fitted: tuple[WindowsLikelihood, Estimate],
 ) -> None:
     """The misfit is the linear one, starts included, however far away."""
-    windows, belief = fitted
-    of = np.zeros(len(windows), int)
-    pulls = pulls_of_windows(belief, windows, of)
+    likelihood, belief = fitted
+    of = np.zeros(len(likelihood.windows), int)
+    pulls = pulls_of_windows(likelihood, belief, of)
     at = np.asarray(belief.posterior.mean)
     dz = np.array([0.8, -1.1])
     told = dz @ pulls.scores.sum(axis=0)
     told += 0.5 * np.sum((pulls.factors @ dz) ** 2)
     with jax.enable_x64(True):
         there, here = (
-            cost_of_windows(belief, windows, jnp.asarray(x)) for x in (at + dz, at)
+            cost_of(likelihood, belief, jnp.asarray(x)) for x in (at + dz, at)
         )
     assert there - here == pytest.approx(told, rel=1e-6)
-    ours = corrected_windows(belief, windows, of)
+    ours = corrected_windows(likelihood, belief, of)
     plain = corrected(belief.prior, belief.posterior, pulls)
     np.testing.assert_allclose(ours.posterior.mean, plain.posterior.mean, atol=1e-12)
 
@@ -342,13 +345,14 @@ def test_a_constant_at_its_bound_stays_where_the_data_are() -> None:
     drift = 0.05 * ar1(rng, 0.97).ravel()[:301]
     windows, _ = cut([recorded(system, 301, [0.7, 0.0], drift)], system, window=0.8)
     belief = fit_windows(system, windows, key=jax.random.key(0))
+    likelihood = WindowsLikelihood(system, windows)
     of = np.zeros(len(windows), int)
-    pulls = pulls_of_windows(belief, windows, of)
+    pulls = pulls_of_windows(likelihood, belief, of)
     naive = corrected(belief.prior, belief.posterior, pulls)
-    ours = corrected_windows(belief, windows, of)
+    ours = corrected_windows(likelihood, belief, of)
     with jax.enable_x64(True):
         best, bad, good = (
-            cost_of_windows(belief, windows, found.posterior.mean)
+            cost_of(likelihood, belief, found.posterior.mean)
             for found in (belief, naive, ours)
         )
     assert bad - best > 50.0 * naive.inflation
@@ -358,16 +362,17 @@ def test_a_constant_at_its_bound_stays_where_the_data_are() -> None:
 
 
 def test_pulls_are_those_of_the_dense_marginal(
-    fitted: tuple[Windows, WindowsBelief],
+    fitted: tuple[WindowsLikelihood, Estimate],
 ) -> None:
     """The start states integrated out: rows of covariance ``I + J_e J_e^T``."""
-    windows, belief = fitted
-    pulls = pulls_of_windows(belief, windows, np.zeros(len(windows), int))
-    found = linearise(belief, windows, belief.posterior.mean)
-    J = np.asarray(found.jacobian)[:, :, 0] / float(belief.noise[0])
-    r = np.asarray(found.residual)[..., 0] / float(belief.noise[0])
-    e = (np.asarray(belief.starts) - windows.start) / windows.start_sd
-    for w in range(len(windows)):
+    likelihood, belief = fitted
+    W = len(likelihood.windows)
+    pulls = pulls_of_windows(likelihood, belief, np.zeros(W, int))
+    found = linearise(likelihood, belief, belief.posterior.mean)
+    J = np.asarray(found.jacobian)[:, :, 0] / float(belief.noise.sd[0])
+    r = np.asarray(found.residual)[..., 0] / float(belief.noise.sd[0])
+    e = np.asarray(belief.nuisances)
+    for w in range(W):
         Jz, Je = J[w, :, :2], J[w, :, 2:]
         weight = np.linalg.inv(np.eye(len(Jz)) + Je @ Je.T)
         F = pulls.factors[w].T @ pulls.factors[w]
@@ -379,16 +384,17 @@ def test_pulls_are_those_of_the_dense_marginal(
     np.testing.assert_allclose(total, A.T @ A, rtol=1e-9)
     away = np.asarray(belief.posterior.mean - belief.prior.mean)
     np.testing.assert_allclose(pulls.scores.sum(axis=0), -away, atol=1e-6)
+    np.testing.assert_allclose(belief.scores.sum(axis=0), -away, atol=1e-6)
 
 
 def test_the_exact_posterior_of_a_linear_machine_is_laplaces(
-    fitted: tuple[Windows, WindowsBelief],
+    fitted: tuple[WindowsLikelihood, Estimate],
 ) -> None:
-    windows, belief = fitted
-    found = check_windows(belief, windows, key=jax.random.key(1))
+    likelihood, belief = fitted
+    found = check_windows(likelihood, belief, key=jax.random.key(1))
     assert found.draws == pytest.approx(DRAWS, rel=1e-6)
     np.testing.assert_allclose(found.shift, 0.0, atol=1e-6)
     plain = belief.posterior
     narrow = gaussian(np.asarray(plain.mean), 0.4 * np.asarray(plain.scale))
     wrong = dataclasses.replace(belief, posterior=narrow)
-    assert check_windows(wrong, windows, key=jax.random.key(1)).k > 0.7
+    assert check_windows(likelihood, wrong, key=jax.random.key(1)).k > 0.7

@@ -9,9 +9,10 @@ import pytest
 
 from linear_system import linear
 from sim2gp.data.logs import Log
-from sim2gp.data.windows import fit_windows
+from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.experiments.longer import TIMES, Longer, advice, lengthened
 from sim2gp.experiments.prediction import cut_logs
+from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.intervals.discrepancy import corrected_windows
 from sim2gp.identification.intervals.scatter import Corrected
 from sim2gp.identification.misfit.residuals import misfit_of_windows
@@ -48,8 +49,9 @@ def fitted(folder: Path, log: Log) -> tuple[Project, list[Log], Corrected]:
     project = dataclasses.replace(load_project(path), system=linear(2, 1))
     windows, of = cut_logs(project, [log])
     belief = fit_windows(project.system, windows, key=KEY)
-    assert not misfit_of_windows(belief, windows).alarm
-    return project, [log], corrected_windows(belief, windows, of)
+    likelihood = WindowsLikelihood(project.system, windows)
+    assert not misfit_of_windows(likelihood, belief).alarm
+    return project, [log], corrected_windows(likelihood, belief, of)
 
 
 def asked(folder: Path, log: Log, *, alarm: bool = False) -> Longer:

@@ -22,7 +22,7 @@ from sim2gp.design.signals import Free
 from sim2gp.design.signals import Multisine as Sines
 from sim2gp.errors import InputError
 from sim2gp.inference.gaussian import Gaussian
-from sim2gp.inference.linear_measurements import Weighed
+from sim2gp.inference.linear_measurements import LinearMeasurement
 from sim2gp.inference.parameters import Parameter, Parameters, prior_from_moments
 from sim2gp.planning import Chirp, Multisine, Observation, RandomInput, oracle, tasks
 from sim2gp.robot.export import export_model
@@ -104,7 +104,9 @@ IMPOSSIBLE = {
     "a value held at NaN": (lambda: Parameters((), (("mass", NAN),)), "E148"),
     "a value fixed at NaN": (lambda: Parameters((MASS,)).replace(mass=INF), "E148"),
     "measured sum": (
-        lambda: Weighed(("mass",), (1.0,), 0.5, -1.0).check({"mass": (0.0, 1.0)}),
+        lambda: LinearMeasurement(("mass",), (1.0,), 0.5, -1.0).check(
+            {"mass": (0.0, 1.0)}
+        ),
         "E144",
     ),
     # Machines

@@ -12,11 +12,12 @@ import scipy.stats
 
 from linear_system import linear, transitions
 from oracles import exact
+from oracles.hessian import full_hessian
+from sim2gp.data.one_step import FLOOR, NOISE_ROUNDS
 from sim2gp.data.transitions import Transitions
 from sim2gp.errors import DeadParameters, NotFinite
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.models import PointEstimate, PriorMean, Sim2GP
-from sim2gp.models import sim2gp as module
 
 P, D, N = 3, 2, 40
 KEY = jax.random.key(0)
@@ -94,11 +95,11 @@ def test_noise_follows_expectation_maximisation(case, belief):
     """sig^2 = (2 floor^2 + sum r^2 + (J Sq J^T)) / (2 + N), from the rms change."""
     change = np.sqrt(np.mean(case.y**2, axis=0))
     noise = change
-    for _ in range(module.NOISE_ROUNDS):
+    for _ in range(NOISE_ROUNDS):
         mean, cov = regression(case.J, case.y, noise, *case.prior)
         r = case.J @ mean - case.y
         spread = np.einsum("ndi,ij,ndj->d", case.J, cov, case.J)
-        prior = 2 * (module.FLOOR * change) ** 2
+        prior = 2 * (FLOOR * change) ** 2
         noise = np.sqrt((prior + np.sum(r**2, axis=0) + spread) / (2 + N))
     np.testing.assert_allclose(belief.noise, noise, rtol=1e-8)
 
@@ -288,7 +289,7 @@ def test_the_precision_is_gauss_newtons():
     r = (J[:, 0] @ (-1.0 + 4.0 * sigmoid) - y[:, 0]) / noise
     curved = 4.0 * sigmoid * (1 - sigmoid) * (1 - 2 * sigmoid)
     full = ggn + np.diag(r @ (J[:, 0] / noise) * curved)
-    got = np.asarray(module.full_hessian(belief, data))
+    got = np.asarray(full_hessian(belief, data))
     np.testing.assert_allclose(got, full, rtol=1e-8, atol=1e-8)
     assert np.max(np.abs(full / ggn - 1.0)) > 0.02
 

@@ -1,6 +1,5 @@
-"""Sums of constants that were weighed: closed forms, bounds, project files."""
+"""Measured sums of constants: closed forms, bounds, project files."""
 
-import dataclasses
 from pathlib import Path
 
 import jax
@@ -9,26 +8,27 @@ import numpy as np
 import pytest
 import scipy.optimize
 
+from descents import minimise
 from linear_system import linear, transitions, windows_of
-from sim2gp.data.windows import WindowsBelief, fit_windows
+from sim2gp.data.one_step import OneStepLikelihood
 from sim2gp.errors import InputError
-from sim2gp.identification.missing_physics.score import _Linear
+from sim2gp.identification.fit import fit_windows
+from sim2gp.identification.missing_physics.score import _LinearPrior
 from sim2gp.inference.arrowhead import Noise
-from sim2gp.inference.informed_prior import informed_prior
-from sim2gp.inference.levenberg_marquardt import minimise
-from sim2gp.inference.linear_measurements import Weighed
+from sim2gp.inference.estimate import Estimate
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.linear_measurements import LinearMeasurement
 from sim2gp.inference.parameters import Parameter, Parameters
-from sim2gp.models import Sim2GP
-from sim2gp.models.sim2gp import likelihood
+from sim2gp.inference.prior import ParameterPrior
 from sim2gp.project import load_project
 from sim2gp.systems import Coulomb, Delay, Variant, free_parts, with_variants
-from sim2gp.systems.assemble import with_weighed
+from sim2gp.systems.assemble import with_measurements
 from sim2gp.systems.machine import Machine
 from sim2gp.systems.plants.furuta import Furuta
 from sim2gp.types import in_float64
 
 KEY = jax.random.key(0)
-SUM = Weighed(("k0", "k1"), (1.0, 1.0), 3.0, 0.01)
+SUM = LinearMeasurement(("k0", "k1"), (1.0, 1.0), 3.0, 0.01)
 BOXES = (
     Parameter("a", "kg", "one", "box", 0.0, 2.0),
     Parameter("b", "kg", "other", "log_box", 0.1, 1.0, mean=0.5),
@@ -45,9 +45,9 @@ def data(getkey: object = None) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def belief() -> WindowsBelief:
+def belief() -> Estimate:
     J, y = data()
-    system = with_weighed(linear(3, 1), [SUM])
+    system = with_measurements(linear(3, 1), [SUM])
     return fit_windows(system, windows_of(J, y, np.zeros(25)), key=KEY)
 
 
@@ -64,8 +64,8 @@ def dense(sd: float) -> tuple[np.ndarray, np.ndarray, float]:
     return covariance @ X.T @ right, covariance, float(evidence)
 
 
-def test_a_sum_is_one_more_row_of_a_regression(belief: WindowsBelief) -> None:
-    mean, covariance, evidence = dense(float(belief.noise[0]))
+def test_a_sum_is_one_more_row_of_a_regression(belief: Estimate) -> None:
+    mean, covariance, evidence = dense(float(belief.noise.sd[0]))
     scale = np.asarray(belief.posterior.scale)
     np.testing.assert_allclose(scale @ scale.T, covariance, rtol=1e-7)
     np.testing.assert_allclose(belief.posterior.mean, mean, rtol=1e-8)
@@ -80,39 +80,44 @@ def test_a_sum_is_one_more_row_of_a_regression(belief: WindowsBelief) -> None:
 def test_its_pull_is_part_of_the_gradient() -> None:
     """At the MAP the sum and the prior pull against each other."""
     J, y = data()
-    model = Sim2GP(with_weighed(linear(3, 1), [SUM]), dt=1.0)
-    rows = jax.tree.map(jnp.asarray, transitions(J, y))
+    system = with_measurements(linear(3, 1), [SUM])
+    prior = ParameterPrior(system.parameters.prior(), system.parameters)
     noise = Noise(jnp.full(1, 0.1), jnp.ones(1))
-    one = likelihood(model, rows)
-    fit = jax.jit(lambda z: minimise(one, z, jnp.zeros((1, 0)), noise))(jnp.zeros(3))
+    one, none = OneStepLikelihood(system, transitions(J, y), 1.0), jnp.zeros((1, 0))
+    fit = jax.jit(lambda z: minimise(one, z, none, noise, prior))(jnp.zeros(3))
     mean, covariance, _ = dense(0.1)
     np.testing.assert_allclose(fit.z, mean, rtol=1e-9)
-    np.testing.assert_allclose(fit.scale() @ fit.scale().T, covariance, rtol=1e-7)
-    assert float(fit.gradient) < 1e-8
+    np.testing.assert_allclose(
+        fit.about.scale() @ fit.about.scale().T, covariance, rtol=1e-7
+    )
+    assert float(fit.ended.gradient) < 1e-8
 
 
 @in_float64
-def test_what_was_weighed_is_prior_to_the_logs(belief: WindowsBelief) -> None:
-    """Prior and information of `informed` make the same posterior."""
-    told = belief.informed()
+def test_what_was_weighed_is_prior_to_the_logs(belief: Estimate) -> None:
+    """Prior and information with the sums in them make the same posterior."""
+    known = belief.with_measurements(with_measurements(linear(3, 1), [SUM]).parameters)
     u = jnp.asarray([1.0, 1.0, 0.0])
     assert float(jnp.linalg.norm(u @ belief.prior.scale)) == pytest.approx(np.sqrt(2.0))
-    assert float(jnp.linalg.norm(u @ told.prior.scale)) == pytest.approx(0.01, rel=1e-4)
-    assert float(u @ told.prior.mean) == pytest.approx(3.0, abs=1e-3)
-    A, L0 = np.asarray(told.information), np.asarray(told.prior.scale)
+    assert float(jnp.linalg.norm(u @ known.prior.scale)) == pytest.approx(
+        0.01, rel=1e-4
+    )
+    assert float(u @ known.prior.mean) == pytest.approx(3.0, abs=1e-3)
+    A, L0 = np.asarray(known.information), np.asarray(known.prior.scale)
     posterior = L0 @ np.linalg.inv(A.T @ A + np.eye(3)) @ L0.T
     scale = np.asarray(belief.posterior.scale)
     np.testing.assert_allclose(posterior, scale @ scale.T, rtol=1e-7)
-    plain = dataclasses.replace(belief, system=linear(3, 1))
-    assert plain.informed() is plain
+    np.testing.assert_allclose(known.scores.sum(axis=0), -(known.z()), atol=1e-6)
+    assert belief.with_measurements(linear(3, 1).parameters) is belief
 
 
 @in_float64
 def test_bounded_constants_keep_their_sum() -> None:
     """The mode by scipy, the curvature by hand: the sum is not linear in ``tt``."""
-    x = Weighed(("a", "b", "c"), (1.0, 2.0, -1.0), 0.7, 0.02)
-    table = Parameters(BOXES, weighed=(x,))
-    prior, found = table.prior(), informed_prior(table)
+    x = LinearMeasurement(("a", "b", "c"), (1.0, 2.0, -1.0), 0.7, 0.02)
+    table = Parameters(BOXES, measurements=(x,))
+    prior = table.prior()
+    found = ParameterPrior(prior, table).at_mode()
 
     def cost(z: jax.Array) -> jax.Array:
         theta = table.constrain(prior.mean + prior.scale @ z)
@@ -138,14 +143,14 @@ def test_bounded_constants_keep_their_sum() -> None:
 
 def test_a_candidate_keeps_what_is_known() -> None:
     """Explain tries machines with one constant more."""
-    x = Weighed(("arm_mass", "pendulum_mass"), (1.0, 1.0), 0.119, 0.001)
+    x = LinearMeasurement(("arm_mass", "pendulum_mass"), (1.0, 1.0), 0.119, 0.001)
     heavy = Variant("heavy", own=("pendulum_mass",))
-    both = with_weighed(with_variants(Furuta(), [Variant("bare"), heavy]), [x])
+    both = with_measurements(with_variants(Furuta(), [Variant("bare"), heavy]), [x])
     machine = both
     for part in (Coulomb("theta", 0.01), Delay("voltage", 0.02)):
         machine = free_parts(machine, [part])
         assert isinstance(machine, Machine)
-        assert machine.parameters.weighed == (x,)
+        assert machine.parameters.measurements == (x,)
         assert machine.variants == both.variants
         assert {*machine.parameters.names} >= {*both.parameters.names, part.name}
     assert machine.longest_delay == 0.02
@@ -155,14 +160,18 @@ def test_a_candidate_keeps_what_is_known() -> None:
 
 @in_float64
 def test_a_linearised_likelihood_moves_its_sums() -> None:
-    table = Parameters(BOXES, weighed=(Weighed(("a", "c"), (1.0, 3.0), 2.0, 0.1),))
+    table = Parameters(
+        BOXES, measurements=(LinearMeasurement(("a", "c"), (1.0, 3.0), 2.0, 0.1),)
+    )
     z0, z = jnp.asarray([0.3, -0.2, 0.1]), jnp.asarray([0.31, -0.21, 0.12])
-    rows = table.known(table.prior(), z0)
-    linear_one = _Linear(jnp.zeros((1, 1, 4, 4)), z0, jnp.zeros((1, 0)), rows)
-    np.testing.assert_array_equal(linear_one.known(z0), rows)
-    exact = table.known(table.prior(), z)
-    np.testing.assert_array_equal(linear_one.known(z)[:, :-1], rows[:, :-1])
-    np.testing.assert_allclose(linear_one.known(z)[:, -1], exact[:, -1], atol=5e-3)
+    rows = table.measurement_rows(table.prior(), z0)
+    prior = _LinearPrior(Gaussian(jnp.zeros(3), jnp.eye(3)), rows, z0)
+    np.testing.assert_array_equal(prior.rows(z0)[3:], rows)
+    np.testing.assert_array_equal(prior.rows(z)[:3, -1], z)
+    exact = table.measurement_rows(table.prior(), z)
+    moved = prior.rows(z)[3:]
+    np.testing.assert_array_equal(moved[:, :-1], rows[:, :-1])
+    np.testing.assert_allclose(moved[:, -1], exact[:, -1], atol=5e-3)
     assert float(jnp.abs(rows - exact)[0, -1]) > 0.1
 
 
@@ -178,9 +187,11 @@ def test_a_project_file_says_what_was_weighed(tmp_path: Path) -> None:
     path = tmp_path / "arm.toml"
     path.write_text(ARM.format(value=1.24, sd=0.005))
     found = load_project(path).system.parameters
-    assert found.weighed == (Weighed(("m1", "m2"), (1.0, 1.0), 1.24, 0.005),)
+    assert found.measurements == (
+        LinearMeasurement(("m1", "m2"), (1.0, 1.0), 1.24, 0.005),
+    )
     path.write_text(ARM.format(value=0.2, sd=0.005) + "weights = [1.0, -0.5]\n")
-    (x,) = load_project(path).system.parameters.weighed
+    (x,) = load_project(path).system.parameters.measurements
     assert x.weights == (1.0, -0.5)
 
 

@@ -8,12 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim2gp.data import windows as likelihood
 from sim2gp.data.grid import evaluation_windows
 from sim2gp.data.logs import Log
 from sim2gp.data.split_log import cut
 from sim2gp.data.transitions import Transitions
-from sim2gp.data.windows import Windows, fit_windows
+from sim2gp.data.windows import Windows
+from sim2gp.data.windows_likelihood import WindowsLikelihood, start_states
+from sim2gp.identification.fit import fit_windows
 from sim2gp.inference import arrowhead
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.models import Sim2GP
@@ -38,9 +39,9 @@ def factor_at(system: Furuta, windows: Windows, z: np.ndarray, noise: np.ndarray
     """What remains after the elimination."""
     prior = system.parameters.prior()
     W, n = windows.start.shape
-    exact = jax.tree.map(jnp.asarray, windows)
     e = jnp.zeros((W, n))
-    blocks = likelihood._Windowed(system, prior, exact).blocks(jnp.asarray(z), e)
+    likelihood = WindowsLikelihood(system, windows)
+    blocks = likelihood.blocks(prior.at(jnp.asarray(z)), e, prior.scale)
     return arrowhead.eliminate(
         blocks, e, arrowhead.Noise(jnp.asarray(noise), jnp.ones(W))
     )
@@ -59,13 +60,13 @@ def test_elimination_is_one_dense_system(short: Log) -> None:
     W, n, p = len(windows), 4, 3
     with jax.enable_x64(True):
         prior = system.parameters.prior()
-        exact = jax.tree.map(jnp.asarray, windows)
-        model = likelihood._Windowed(system, prior, exact)
+        likelihood = WindowsLikelihood(system, windows)
 
         def residuals(x: jax.Array) -> jax.Array:
             e = x[p:].reshape(W, n)
-            r = exact.each(
-                lambda w, ei: model.residual(w, jnp.concatenate([x[:p], ei])), e
+            tt = prior.at(x[:p])
+            r = likelihood.windows.each(
+                lambda w, e: likelihood.simulated(w, tt, e)[0], e
             )
             return (r / noise[None, None]).reshape(-1)
 
@@ -112,7 +113,7 @@ def test_window_zero_is_the_one_step_fit() -> None:
         key = jax.random.key(0)
         one = model.fit(model.init(key), data, key=key)
     ours = fit_windows(system, windows, key=key)
-    noise = np.asarray(ours.noise)
+    noise = np.asarray(ours.noise.sd)
     np.testing.assert_allclose(noise, np.asarray(one.noise), rtol=1e-3)
     # At one noise and one z, the two factors are the same.
     arrow = factor_at(system, windows, np.array([0.2, 0.1, -0.3]), noise)
@@ -139,7 +140,7 @@ def test_window_zero_is_the_one_step_fit() -> None:
         atol=0.02 * sd.min(),
     )
     # Begun at the MAP, a descent ends there.
-    again = fit_windows(system, windows, key=key, near=ours)
+    again = fit_windows(system, windows, key=key, warm_start=ours)
     moved = np.asarray(again.posterior.mean) - np.asarray(ours.posterior.mean)
     assert np.all(np.abs(moved) < 1e-4 * sd)
 
@@ -242,7 +243,7 @@ def test_delay_is_recovered_without_velocities(jitter: float) -> None:
     assert spread["voltage.delay"] < 5e-4
     for name in FREE:
         assert abs(found[name] - table.nominal()[name]) < 3.5 * spread[name]
-    np.testing.assert_allclose(np.asarray(belief.noise), 5e-4, rtol=0.15)
+    np.testing.assert_allclose(np.asarray(belief.noise.sd), 5e-4, rtol=0.15)
 
 
 def test_delayed_inputs_are_smooth_in_the_delay(short: Log) -> None:
@@ -276,16 +277,17 @@ def test_a_fit_near_another_ends_where_its_own_windows_say(short: Log) -> None:
     half = eqx.tree_at(lambda w: w.mask, windows, windows.mask & seen[:, None, None])
     whole = fit_windows(system, windows, key=key, robust=True)
     alone = fit_windows(system, half, key=key, robust=True)
-    near = fit_windows(system, half, key=key, robust=True, near=whole)
+    warm = fit_windows(system, half, key=key, robust=True, warm_start=whole)
     with jax.enable_x64(True):
         sd = np.asarray(alone.posterior.sd())
-        moved = np.asarray(near.posterior.mean - alone.posterior.mean) / sd
+        moved = np.asarray(warm.posterior.mean - alone.posterior.mean) / sd
         away = np.asarray(whole.posterior.mean - alone.posterior.mean) / sd
     assert np.abs(moved).max() < 0.02
     assert np.abs(away).max() > 0.2
-    np.testing.assert_allclose(near.noise, alone.noise, rtol=2e-3)
-    np.testing.assert_allclose(near.weights, alone.weights, rtol=0.02)
-    np.testing.assert_allclose(near.starts, alone.starts, atol=1e-3)
+    np.testing.assert_allclose(warm.noise.sd, alone.noise.sd, rtol=2e-3)
+    np.testing.assert_allclose(warm.noise.weights, alone.noise.weights, rtol=0.02)
+    ours, theirs = (start_states(half, found) for found in (warm, alone))
+    np.testing.assert_allclose(ours, theirs, atol=1e-3)
 
 
 def test_gaussian_prior_comes_back_without_data(short: Log) -> None:

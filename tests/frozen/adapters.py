@@ -1,27 +1,35 @@
 """Where the library's parts stand today: the one file here that follows a rewrite."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 import machines
 import payload_arm
 import sim2gp as sg
 import simulated_logs
 from sim2gp import systems as sy
-from sim2gp.data import windows
+from sim2gp.data.one_step import OneStepLikelihood
 from sim2gp.data.split_log import cut
 from sim2gp.data.transitions import Transitions
-from sim2gp.data.windows import WindowsBelief, fit_windows, linearise
+from sim2gp.data.windows_likelihood import (
+    WindowsLikelihood,
+    linearise,
+    start_states,
+)
+from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.intervals.discrepancy import corrected_windows
 from sim2gp.identification.missing_physics.data import WindowData
 from sim2gp.identification.missing_physics.score import score
-from sim2gp.inference.linear_measurements import Weighed
-from sim2gp.models import sim2gp
-from sim2gp.systems.assemble import with_weighed
+from sim2gp.inference.estimate import Estimate
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.likelihood import AbstractLikelihood
+from sim2gp.inference.linear_measurements import LinearMeasurement
+from sim2gp.systems.assemble import with_measurements
 from sim2gp.types import in_float64
 
 
@@ -64,7 +72,8 @@ def windowed() -> dict[str, tuple[sg.AbstractSystem, list[Any], dict[str, Any]]]
             sy.Variant("loaded", own=("payload",)),
         ],
     )
-    known = with_weighed(arm, [Weighed(("weight", "payload"), (1.0, 9.81), 2.0, 0.05)])
+    both_weigh = LinearMeasurement(("weight", "payload"), (1.0, 9.81), 2.0, 0.05)
+    known = with_measurements(arm, [both_weigh])
     pair = [payload_arm.log(0, seed=1), payload_arm.log(1, seed=2)]
     return {
         "actuated": (actuated, [late], {"window": 0.2}),
@@ -75,36 +84,71 @@ def windowed() -> dict[str, tuple[sg.AbstractSystem, list[Any], dict[str, Any]]]
     }
 
 
+class Whitened(NamedTuple):
+    """A likelihood in units of the prior."""
+
+    likelihood: AbstractLikelihood
+    prior: Gaussian
+
+    def blocks(self, z: Array, e: Array) -> Array:
+        """The factors at a point."""
+        return self.likelihood.blocks(self.prior.at(z), e, self.prior.scale)
+
+
 def stacked(machine: sg.AbstractSystem, data: Transitions) -> tuple[Any, Any]:
     """The one-step likelihood of a machine, and its empty nuisances."""
-    exact = jax.tree.map(jnp.asarray, data)
-    return sim2gp.likelihood(sg.Sim2GP(machine), exact), jnp.zeros((1, 0))
+    likelihood = OneStepLikelihood(machine, data, 0.02)
+    return Whitened(likelihood, machine.parameters.prior()), jnp.zeros((1, 0))
 
 
 def of_windows(machine: sg.AbstractSystem, found: Any) -> tuple[Any, Any]:
     """The windows' likelihood, with its nuisances at nothing."""
-    exact = jax.tree.map(jnp.asarray, found)
-    likelihood = windows.likelihood(machine, machine.parameters.prior(), exact)
-    return likelihood, jnp.zeros(found.start.shape)
+    likelihood = WindowsLikelihood(machine, found)
+    prior = machine.parameters.prior()
+    return Whitened(likelihood, prior), jnp.zeros(found.start.shape)
+
+
+class Fitted(NamedTuple):
+    """A fit of windows."""
+
+    likelihood: WindowsLikelihood
+    estimate: Estimate
+    posterior: Gaussian
+    noise: Array
+    weights: Array
+    starts: np.ndarray
+    log_evidence: Array
 
 
 def cut_and_fit(
     machine: sg.AbstractSystem, logs: Sequence[Any], *, window: float, robust: bool
 ) -> tuple[Any, np.ndarray, Any]:
     """Windows, the log of each, and what was fitted."""
-    found, places = cut(logs, machine, window=window)
-    belief = fit_windows(machine, found, key=jax.random.key(5), robust=robust)
-    return found, np.asarray([k for k, _ in places]), belief
+    windows, places = cut(logs, machine, window=window)
+    found = fit_windows(machine, windows, key=jax.random.key(5), robust=robust)
+    fitted = Fitted(
+        WindowsLikelihood(machine, windows),
+        found,
+        found.posterior,
+        found.noise.sd,
+        found.noise.weights,
+        start_states(windows, found),
+        found.log_evidence,
+    )
+    return windows, np.asarray([k for k, _ in places]), fitted
 
 
-def intervals(belief: WindowsBelief, found: Any, of: np.ndarray) -> Any:
+def intervals(fitted: Fitted, windows: Any, of: np.ndarray) -> Any:
     """The corrected posterior."""
-    return corrected_windows(belief.informed(), found, of).posterior
+    table = fitted.likelihood.system.parameters
+    known = fitted.estimate.with_measurements(table)
+    return corrected_windows(fitted.likelihood, known, of).posterior
 
 
-def slopes(belief: WindowsBelief, found: Any) -> tuple[np.ndarray, np.ndarray]:
+def slopes(fitted: Fitted, windows: Any) -> tuple[np.ndarray, np.ndarray]:
     """Residuals and Jacobians of all rows at the prior's mean, from recorded starts."""
-    at = linearise(belief, found, belief.prior.mean)
+    found = fitted.estimate
+    at = linearise(fitted.likelihood, found, found.prior.mean)
     return np.asarray(at.residual), np.asarray(at.jacobian)
 
 

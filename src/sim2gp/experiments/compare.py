@@ -31,7 +31,7 @@ from sim2gp.data.one_step_log import (
     transitions,
 )
 from sim2gp.data.split_log import measured_states
-from sim2gp.data.windows import Windows, WindowsBelief, fit_windows
+from sim2gp.data.windows import Windows
 from sim2gp.errors import InputError
 from sim2gp.experiments import scoring
 from sim2gp.experiments.baselines import regression_errors
@@ -39,7 +39,9 @@ from sim2gp.experiments.compare_summary import Held, summarise
 from sim2gp.experiments.evaluate import check_horizon, windows_for
 from sim2gp.experiments.prediction import channels, cut_logs, recordings, subset
 from sim2gp.experiments.record import command, provenance
+from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.forecast import inflation_of
+from sim2gp.inference.estimate import Estimate
 from sim2gp.models import NLM, FunctionSpace, Residual, ResidualFunctionSpace, Sim2GP
 from sim2gp.models.auto import log_scores
 from sim2gp.models.ensemble import ensemble
@@ -254,7 +256,7 @@ def _trivial(setup: Setup, test: np.ndarray) -> np.ndarray:
     return np.stack([hold, regression_errors(train, tested, rows)])
 
 
-def _fit(setup: Setup, left: Sequence[int], key: jax.Array) -> WindowsBelief:
+def _fit(setup: Setup, left: Sequence[int], key: jax.Array) -> Estimate:
     """The simulator's constants from the windows of all logs but ``left``."""
     mask = np.asarray(setup.windows.mask) & ~np.isin(setup.of, left)[:, None, None]
     kept = eqx.tree_at(lambda w: w.mask, setup.windows, mask)

@@ -16,6 +16,8 @@ import jax
 import numpy as np
 
 from sim2gp.belief import AbstractModel
+from sim2gp.data.one_step import OneStepLikelihood
+from sim2gp.data.transitions import Transitions
 from sim2gp.experiments.record import provenance
 from sim2gp.identification import diagnose
 from sim2gp.identification.misfit.residuals import misfit_of_transitions
@@ -173,7 +175,7 @@ def _summarise(
             for m in methods
         },
         "noise": dict(zip(states, np.asarray(belief.noise).tolist(), strict=True)),
-        "misfit": misfit_of_transitions(belief, shown.data).as_dict(),
+        "misfit": _misfit(belief, shown.data),
         "log_evidence": float(belief.log_evidence),
         "n_transitions": int(belief.count),
         **found,
@@ -194,6 +196,12 @@ def _summarise(
     key = jax.random.fold_in(jax.random.key(seed), 1)
     arrays |= diagnose.arrays(table, belief.prior, belief.posterior, key=key)
     return summary, arrays
+
+
+def _misfit(belief: Sim2GPBelief, data: Transitions) -> dict[str, Any]:
+    likelihood = OneStepLikelihood(belief.system, data, belief.dt)
+    about = belief.prior, belief.posterior, belief.noise
+    return misfit_of_transitions(likelihood, *about).as_dict()
 
 
 def _animation(task: Task, machine: str, scores: np.ndarray) -> dict[str, Any]:

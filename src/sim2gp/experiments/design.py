@@ -36,8 +36,8 @@ from sim2gp.experiments.identified import Identified, used
 from sim2gp.experiments.prediction import units
 from sim2gp.experiments.record import command, provenance
 from sim2gp.identification.identifiability.table import physical_moments
-from sim2gp.inference.informed_prior import informed_prior
 from sim2gp.inference.parameters import unknown_parameter
+from sim2gp.inference.prior import ParameterPrior
 from sim2gp.models.features import Encoding
 from sim2gp.models.sim2gp import PRIOR_NOISE
 from sim2gp.project import Project
@@ -113,7 +113,8 @@ def setting(
     corrected = None
     if isinstance(source, Project):
         project, joint = source, source.system
-        belief, names = informed_prior(joint.parameters), _measured(project)
+        prior = ParameterPrior(joint.parameters.prior(), joint.parameters)
+        belief, names = prior.at_mode(), _measured(project)
         noise, period = _stated_noise(project, names), PERIOD
         notes.append("no log was used: what is believed is the project's priors")
     else:

@@ -66,7 +66,7 @@ def run(
             "candidates": candidates,
             "misfit": None if found.best is None else found.best.as_dict(),
             "misfit_as_it_is": None if found.bare is None else found.bare.as_dict(),
-            "log_evidence": found.search.bare.log_evidence,
+            "log_evidence": float(found.search.bare.log_evidence),
             "added": None,
             "warnings": [f"no fit with {name}" for name in found.search.failed],
             "tables": [table(found, candidates)],

@@ -15,7 +15,7 @@ from jaxtyping import Bool
 
 from sim2gp.data.grid import CURVE, PERIOD, Grid, steps_of
 from sim2gp.data.logs import Log
-from sim2gp.data.windows import Windows, WindowsBelief, fit_windows
+from sim2gp.data.windows import Windows
 from sim2gp.experiments.baselines import regression_errors
 from sim2gp.experiments.prediction import (
     Judged,
@@ -25,7 +25,9 @@ from sim2gp.experiments.prediction import (
     rows_for,
     subset,
 )
+from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.forecast import Band, Forecast, fit_band
+from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.project import Project
 from sim2gp.types import Key
@@ -100,20 +102,25 @@ def fold(
     *,
     key: Key,
     starts: int,
-    near: WindowsBelief | None = None,
+    warm_start: Estimate | None = None,
 ) -> Fold:
-    """The fit of what ``part`` may see, begun ``near`` another, judged by the rest.
+    """The fit of what ``part`` may see, begun at ``warm_start``, judged by the rest.
 
-    Raises as `sim2gp.data.windows.fit_windows` does.
+    Raises as `sim2gp.identification.fit.fit_windows` does.
     """
     rows = rows_for(horizon)
     mask = np.asarray(windows.mask) & part.train[:, None, None]
     kept = eqx.tree_at(lambda w: w.mask, windows, mask)
     robust = project.spec.likelihood.robust
-    belief = fit_windows(
-        project.system, kept, key=key, robust=robust, starts=starts, near=near
-    )
-    result = predicted(project.system, belief.posterior, grid, horizon)
+    posterior = fit_windows(
+        project.system,
+        kept,
+        key=key,
+        robust=robust,
+        starts=starts,
+        warm_start=warm_start,
+    ).posterior
+    result = predicted(project.system, posterior, grid, horizon)
     train, tested = subset(grid, part.known), subset(grid, part.test)
     curve = np.asarray([steps_of(h) for h in CURVE])
     before = train.since[:, None] + PERIOD * curve <= part.until
@@ -123,4 +130,4 @@ def fold(
     linear = regression_errors(train, tested, rows)
     result = result.of(part.test)
     found = judged(rows, tested, result, band, linear)
-    return Fold(belief.posterior, band, found, tested, result)
+    return Fold(posterior, band, found, tested, result)

@@ -15,7 +15,8 @@ import numpy as np
 
 from sim2gp.data.grid import CURVE, Grid, evaluation_windows
 from sim2gp.data.logs import Log, note_lines
-from sim2gp.data.windows import Windows, WindowsBelief, fit_windows, information_at
+from sim2gp.data.windows import Windows
+from sim2gp.data.windows_likelihood import WindowsLikelihood, information_at
 from sim2gp.experiments.configurations import told
 from sim2gp.experiments.identified import PROJECT, physical
 from sim2gp.experiments.longer import advice
@@ -37,6 +38,7 @@ from sim2gp.experiments.unseen import Unseen, unseen
 from sim2gp.identification import diagnose
 from sim2gp.identification.exact_posterior.importance import check_windows
 from sim2gp.identification.exact_posterior.nuts import sample_windows, sampler
+from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.forecast import Band, compile_forecast, fit_band
 from sim2gp.identification.intervals.discrepancy import (
     compile_corrected,
@@ -44,10 +46,14 @@ from sim2gp.identification.intervals.discrepancy import (
 )
 from sim2gp.identification.intervals.scatter import Corrected
 from sim2gp.identification.misfit.residuals import misfit_of_windows
+from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.parameters import Parameters
 from sim2gp.project import Project
 from sim2gp.runs import Progress, new_run
 
+#: Forecasts to draw: of whom, and what and where they are.
+Drawn = tuple[Gaussian, Picture, Grid]
 _SHORTEST = 4  # windows: a film of fewer held-out ones is not worth watching
 
 
@@ -81,23 +87,23 @@ def run(
         grid = evaluation_windows(logs, project.system, longest=CURVE[-1])
         compile_forecast(project.system, grid)
         compile_corrected(project.system, windows)
-        fitted = belief = fit_windows(project.system, windows, key=key, robust=robust)
+        fitted = fit_windows(project.system, windows, key=key, robust=robust)
         task.advance("posterior")
-        band, picture = _own_forecasts(belief, grid, logs)
-        belief = belief.informed()
-        honest = corrected_windows(belief, windows, of)
-        summary = _summarise(project, logs, windows, belief, honest, band, seed)
-        arrays = _stored(belief, honest.posterior, band, seed)
-        other = None
-        if held_out:
-            other = unseen(project, logs, windows, places, grid, belief)
-        said, drawings = _drawings(project, logs, belief, picture, grid, other)
+        band, own = _own_forecasts(project, fitted.posterior, grid, logs)
+        known = fitted.with_measurements(project.system.parameters)
+        likelihood = WindowsLikelihood(project.system, windows)
+        honest = corrected_windows(likelihood, known, of)
+        summary = _summarise(project, logs, likelihood, known, honest, band, seed)
+        arrays = _stored(project.system.parameters, known, honest.posterior, band, seed)
+        other = (
+            unseen(project, logs, windows, places, grid, known) if held_out else None
+        )
+        said, drawings = _drawings(project, logs, own, other)
         summary, arrays = summary | said, arrays | drawings
         task.advance("forecasts")
         asked = {"quick": not held_out, "check": check, "nuts": nuts, "longer": longer}
-        options = ["--out", out, "--seed", seed, *(f"--{k}" * asked[k] for k in asked)]
-        line = command("sim2gp", "identify", project.path, *options)
-        summary |= _held_against(fitted, windows, seed, check=check, nuts=nuts)
+        line = _command(project, out, seed, asked)
+        summary |= _held_against(likelihood, fitted, seed, check=check, nuts=nuts)
         if longer:
             progress.say("fitting longer windows")
         alarm = summary["misfit"]["alarm"]
@@ -113,6 +119,13 @@ def run(
     return summary
 
 
+def _command(project: Project, out: Path, seed: int, asked: dict[str, bool]) -> str:
+    """The line that makes such a run."""
+    flags = [f"--{name}" * yes for name, yes in asked.items()]
+    options = ["--out", out, "--seed", seed, *flags]
+    return command("sim2gp", "identify", project.path, *options)
+
+
 def _place(project: Project, out: Path) -> dict[str, str]:
     """Where the project file stands, seen from the run."""
     folder = Path(os.path.abspath(project.path)).parent
@@ -121,16 +134,21 @@ def _place(project: Project, out: Path) -> dict[str, str]:
 
 
 def _held_against(
-    belief: WindowsBelief, windows: Windows, seed: int, *, check: bool, nuts: bool
+    likelihood: WindowsLikelihood,
+    fitted: Estimate,
+    seed: int,
+    *,
+    check: bool,
+    nuts: bool,
 ) -> dict[str, Any]:
     """What the exact posterior says of Laplace's, where it is asked."""
-    names, key = belief.system.parameters.names, jax.random.key(seed)
+    names, key = likelihood.system.parameters.names, jax.random.key(seed)
     out: dict[str, Any] = {}
     if check:
-        weighed = check_windows(belief, windows, key=jax.random.fold_in(key, 2))
-        out["check"] = weighed.as_dict(names)
+        checked = check_windows(likelihood, fitted, key=jax.random.fold_in(key, 2))
+        out["check"] = checked.as_dict(names)
     if nuts:
-        sampled = sample_windows(belief, windows, key=jax.random.fold_in(key, 3))
+        sampled = sample_windows(likelihood, fitted, key=jax.random.fold_in(key, 3))
         out["nuts"] = sampled.as_dict(names)
     return out
 
@@ -138,14 +156,13 @@ def _held_against(
 def _drawings(
     project: Project,
     logs: Sequence[Log],
-    belief: WindowsBelief,
-    picture: Picture,
-    grid: Grid,
+    own: Drawn,
     other: Unseen | None,
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Forecasts of the fitted logs and of held-out data, and a film of the latter."""
-    arrays = trace_arrays(picture, grid, logs, channels(project.system, grid.windows))
-    posterior, shown, data = belief.posterior, grid, "fitted"
+    posterior, picture, shown = own
+    names = channels(project.system, shown.windows)
+    arrays, data = trace_arrays(picture, shown, logs, names), "fitted"
     summary: dict[str, Any] = {}
     if other is not None:
         summary["held_out"] = other.summary
@@ -159,29 +176,28 @@ def _drawings(
 
 
 def _own_forecasts(
-    belief: WindowsBelief, grid: Grid, logs: Sequence[Log]
-) -> tuple[Band, Picture]:
+    project: Project, posterior: Gaussian, grid: Grid, logs: Sequence[Log]
+) -> tuple[Band, Drawn]:
     """Of the logs that were fitted: the band made of them, and what is drawn."""
-    found = predicted(belief.system, belief.posterior, grid, CURVE[0])
+    found = predicted(project.system, posterior, grid, CURVE[0])
     rows = rows_for(CURVE[0])[1:]
     band = fit_band(found.at(rows), grid, len(set(recordings(logs))))
-    return band, drawn(found, band, grid)
+    return band, (posterior, drawn(found, band, grid), grid)
 
 
 def _stored(
-    belief: WindowsBelief, honest: Gaussian, band: Band, seed: int
+    table: Parameters, fitted: Estimate, honest: Gaussian, band: Band, seed: int
 ) -> dict[str, np.ndarray]:
-    table = belief.system.parameters
     key = jax.random.fold_in(jax.random.key(seed), 1)
     return {
-        "belief/mean": np.asarray(belief.posterior.mean),
-        "belief/theta": np.asarray(physical(table, belief.posterior.mean)),
-        "belief/scale": np.asarray(belief.posterior.scale),
-        "belief/prior_mean": np.asarray(belief.prior.mean),
-        "belief/prior_scale": np.asarray(belief.prior.scale),
-        "belief/information": np.asarray(belief.information),
-        "belief/noise": np.asarray(belief.noise),
-        "belief/weights": np.asarray(belief.weights),
+        "belief/mean": np.asarray(fitted.posterior.mean),
+        "belief/theta": np.asarray(physical(table, fitted.posterior.mean)),
+        "belief/scale": np.asarray(fitted.posterior.scale),
+        "belief/prior_mean": np.asarray(fitted.prior.mean),
+        "belief/prior_scale": np.asarray(fitted.prior.scale),
+        "belief/information": np.asarray(fitted.information),
+        "belief/noise": np.asarray(fitted.noise.sd),
+        "belief/weights": np.asarray(fitted.noise.weights),
         "intervals/mean": np.asarray(honest.mean),
         "intervals/theta": np.asarray(physical(table, honest.mean)),
         "intervals/scale": np.asarray(honest.scale),
@@ -191,30 +207,30 @@ def _stored(
         "band/rows": band.rows,
         "band/shape": band.shape,
         "band/inflation": np.asarray(band.inflation),
-        **diagnose.arrays(table, belief.prior, honest, key=key),
+        **diagnose.arrays(table, fitted.prior, honest, key=key),
     }
 
 
 def _summarise(
     project: Project,
     logs: Sequence[Log],
-    windows: Windows,
-    belief: WindowsBelief,
+    likelihood: WindowsLikelihood,
+    fitted: Estimate,
     honest: Corrected,
     band: Band,
     seed: int,
 ) -> dict[str, Any]:
-    system = project.system
+    system, windows = project.system, likelihood.windows
     names = channels(system, windows)
     found = diagnose.summary(
         system.parameters,
-        belief.prior,
-        belief.posterior,
-        belief.information,
-        fisher_at=information_at(belief, windows),
+        fitted.prior,
+        fitted.posterior,
+        fitted.information,
+        fisher_at=information_at(likelihood, fitted),
         corrected=honest.posterior,
     )
-    noise = dict(zip(names, np.asarray(belief.noise).tolist(), strict=True))
+    noise = dict(zip(names, np.asarray(fitted.noise.sd).tolist(), strict=True))
     rows = sum(len(log) for log in logs)
     actions = [channel.name for channel in system.actions]
     about = told_intervals(system, honest, found["parameters"], len(windows))
@@ -229,10 +245,10 @@ def _summarise(
         "noise": noise,
         "intervals": about,
         "misfit": {
-            **misfit_of_windows(belief, windows).as_dict(),
+            **misfit_of_windows(likelihood, fitted).as_dict(),
             "noise": _noise_words(names, noise, windows, units(system)),
         },
-        "log_evidence": float(belief.log_evidence),
+        "log_evidence": float(fitted.log_evidence),
         "n_rows": rows,
         "period": float(np.median(np.concatenate([np.diff(x.time) for x in logs]))),
         "n_logs": len(set(recordings(logs))),

@@ -12,9 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sim2gp.data.logs import Log
-from sim2gp.data.windows import WindowsBelief, fit_windows
+from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.errors import DeadParameters, InputError, NotConverged, NotFinite
 from sim2gp.experiments.prediction import cut_logs
+from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.intervals.discrepancy import corrected_windows
 from sim2gp.identification.intervals.scatter import Corrected
 from sim2gp.identification.misfit.residuals import misfit_of_windows
@@ -111,9 +112,12 @@ def lengthened(
         return no("the misfit tests find something in these windows already")
     try:  # the run is done, whatever becomes of this
         windows, of = cut_logs(project, logs, TIMES)
-        belief = fit_windows(project.system, windows, key=key, robust=stated.robust)
-        found = corrected_windows(belief.informed(), windows, of)
-        alarm = misfit_of_windows(belief, windows).alarm
+        system = project.system
+        fitted = fit_windows(system, windows, key=key, robust=stated.robust)
+        likelihood = WindowsLikelihood(system, windows)
+        alarm = misfit_of_windows(likelihood, fitted).alarm
+        fitted = fitted.with_measurements(system.parameters)
+        found = corrected_windows(likelihood, fitted, of)
     except (InputError, NotConverged, NotFinite, DeadParameters) as error:
         return no(f"they cannot be fitted ({error})")
     if not found.enough:
@@ -124,13 +128,12 @@ def lengthened(
             "noise, too slow to show in these. To look for it make likelihood.window "
             f"= {seconds:g}, run identify, and sim2gp explain on its run"
         )
-    return Longer(seconds, _ratios(belief, found, honest))
+    return Longer(seconds, _ratios(system.parameters.names, found, honest))
 
 
 @in_float64
 def _ratios(
-    belief: WindowsBelief, found: Corrected, honest: Corrected
+    names: tuple[str, ...], found: Corrected, honest: Corrected
 ) -> dict[str, float]:
     ratio = np.asarray(found.posterior.sd()) / np.asarray(honest.posterior.sd())
-    names = belief.system.parameters.names
     return dict(zip(names, ratio.tolist(), strict=True))

@@ -12,7 +12,7 @@ import numpy as np
 
 from sim2gp.data.grid import CURVE, Grid, steps_of
 from sim2gp.data.logs import Log
-from sim2gp.data.windows import Windows, WindowsBelief
+from sim2gp.data.windows import Windows
 from sim2gp.errors import DeadParameters, NotConverged, NotFinite
 from sim2gp.experiments.baselines import forecast_sentence
 from sim2gp.experiments.calibration import calibration
@@ -26,6 +26,7 @@ from sim2gp.experiments.prediction import (
     trace_arrays,
     units,
 )
+from sim2gp.inference.estimate import Estimate
 from sim2gp.project import Project
 
 PREFIX = "unseen"  # of the traces
@@ -46,7 +47,7 @@ def unseen(
     windows: Windows,
     places: Sequence[tuple[int, int]],
     grid: Grid,
-    whole: WindowsBelief,
+    whole: Estimate,
 ) -> Unseen:
     """A second fit, of a part of the windows, and its forecasts of the rest.
 
@@ -60,7 +61,7 @@ def unseen(
     try:
         key = jax.random.key(0)  # of starts that it does not draw
         found = fold(
-            project, windows, grid, part, horizon, key=key, starts=2, near=whole
+            project, windows, grid, part, horizon, key=key, starts=2, warm_start=whole
         )
     except (NotConverged, NotFinite, DeadParameters) as error:
         return _none(f"a fit without {part.words} failed ({error}).")

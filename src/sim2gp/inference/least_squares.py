@@ -39,12 +39,14 @@ def stack(*factors: Float[Array, "_ k"]) -> Float[Array, "k k"]:
     return triangular(jnp.concatenate(factors))
 
 
-def with_prior(
-    data: Factor, z: Float[Array, " p"], *more: Float[Array, "_ p1"]
-) -> Factor:
-    """Add the prior's rows ``[I z]``, and perhaps ``more``, to the data's factor."""
-    prior = jnp.concatenate([jnp.eye(z.size, dtype=z.dtype), z[:, None]], axis=1)
-    return stack(data, prior, *more)
+def prior_rows(z: Float[Array, " p"]) -> Float[Array, "p p1"]:
+    """``[I z]``: the prior of whitened unknowns, as rows."""
+    return jnp.concatenate([jnp.eye(z.size, dtype=z.dtype), z[:, None]], axis=1)
+
+
+def with_prior(data: Factor, z: Float[Array, " p"]) -> Factor:
+    """The factor of the data and the prior."""
+    return stack(data, prior_rows(z))
 
 
 def gauss_newton_step(full: Factor) -> Float[Array, " p"]:

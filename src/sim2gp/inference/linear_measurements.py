@@ -2,7 +2,7 @@
 
     sum_k w_k theta_k = value + eps,     eps ~ N(0, sd^2)
 
-A sum of constants is linear in ``theta`` and not in their virtual values, so it is one
+A sum of parameters is linear in ``theta`` and not in their virtual values, so it is one
 more row of the least squares, not a change of the independent prior.
 """
 
@@ -18,8 +18,8 @@ from sim2gp.types import Scalar
 
 
 @dataclass(frozen=True)
-class Weighed:
-    """A measured sum of constants, each times its weight, and the scale's sd."""
+class LinearMeasurement:
+    """A measured sum of parameters, each times its weight, and its sd."""
 
     of: tuple[str, ...]
     weights: tuple[float, ...]
@@ -27,7 +27,7 @@ class Weighed:
     sd: float
 
     def check(self, ranges: Mapping[str, tuple[float, float]]) -> None:
-        """That the constants can make up the sum, within ``ranges`` (E142, E144)."""
+        """That the parameters can make up the sum, within ``ranges`` (E142, E144)."""
         checks.moments(f"the measured {' + '.join(self.of)}", self.value, self.sd)
         pairs = list(zip(self.of, self.weights, strict=True))
         low, high = (
@@ -46,11 +46,11 @@ class Weighed:
 
 
 def residuals(
-    weighed: Sequence[Weighed], values: Mapping[str, Scalar], like: Array
+    measurements: Sequence[LinearMeasurement], values: Mapping[str, Scalar], like: Array
 ) -> Float[Array, " q"]:
     """How far each sum is from what was measured, in sd."""
     rows = []
-    for x in weighed:
+    for x in measurements:
         terms = zip(x.weights, x.of, strict=True)
         rows.append((sum(w * values[name] for w, name in terms) - x.value) / x.sd)
     return jnp.stack(rows) if rows else jnp.zeros(0, like.dtype)

@@ -22,7 +22,7 @@ from sim2gp import checks
 from sim2gp.errors import InputError, nearest
 from sim2gp.inference import bijections
 from sim2gp.inference.gaussian import Gaussian
-from sim2gp.inference.linear_measurements import Weighed, residuals
+from sim2gp.inference.linear_measurements import LinearMeasurement, residuals
 from sim2gp.types import Scalar
 
 #: Standard deviation of a boxed parameter's virtual value: the box is nearly uniform
@@ -218,13 +218,13 @@ def _impossible(p: Parameter, mean: float, sd: float, expected: str) -> InputErr
 class Parameters(eqx.Module):
     """The table of a system's constants: those to be learned, and those held fixed.
 
-    Sums of constants that were ``weighed`` are part of every fit. Raises `InputError`
-    E148 for a value held fixed that is not finite.
+    Measured sums of constants, ``measurements``, are part of every fit. Raises
+    `InputError` E148 for a value held fixed that is not finite.
     """
 
     free: tuple[Parameter, ...] = eqx.field(static=True)
     fixed: tuple[tuple[str, float], ...] = eqx.field(static=True, default=())
-    weighed: tuple[Weighed, ...] = eqx.field(static=True, default=())
+    measurements: tuple[LinearMeasurement, ...] = eqx.field(static=True, default=())
 
     def __check_init__(self) -> None:
         checks.finite("the constants held fixed", **dict(self.fixed))
@@ -284,12 +284,14 @@ class Parameters(eqx.Module):
         values = {name: jnp.asarray(v, tt.dtype) for name, v in self.fixed}
         return values | {p.name: theta[i] for i, p in enumerate(self.free)}
 
-    def known(self, prior: Gaussian, z: Float[Array, " p"]) -> Float[Array, "q p1"]:
-        """Rows ``[K r]`` of what was weighed, in its sd, at ``tt = mu0 + L0 z``."""
+    def measurement_rows(
+        self, prior: Gaussian, z: Float[Array, " p"]
+    ) -> Float[Array, "q p1"]:
+        """Rows ``[K r]`` of the measured sums, in their sd, at ``tt = mu0 + L0 z``."""
 
         def r(z: Array) -> Array:
             values = self.values(prior.mean + prior.scale @ z)
-            return residuals(self.weighed, values, z)
+            return residuals(self.measurements, values, z)
 
         return jnp.concatenate([jax.jacfwd(r)(z), r(z)[:, None]], axis=1)
 
@@ -331,7 +333,7 @@ class Parameters(eqx.Module):
 
     def merge(self, other: "Parameters") -> "Parameters":
         """Both tables as one, this one's constants first."""
-        mine, more = ((x.free, x.fixed, x.weighed) for x in (self, other))
+        mine, more = ((x.free, x.fixed, x.measurements) for x in (self, other))
         return Parameters(*(a + b for a, b in zip(mine, more, strict=True)))  # type: ignore[arg-type]
 
     def _groups(self, dtype: Any) -> list[tuple[str, np.ndarray, Any, Any]]:

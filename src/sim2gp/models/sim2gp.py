@@ -16,23 +16,26 @@ from jaxtyping import Array, Float, Int
 
 from sim2gp import checks
 from sim2gp.belief import AbstractBelief, AbstractModel
+from sim2gp.data.one_step import NOISE_ROUNDS, OneStepLikelihood
 from sim2gp.data.transitions import Transitions
 from sim2gp.inference import linearized
-from sim2gp.inference.arrowhead import Blocks, Noise
-from sim2gp.inference.expectation_maximisation import expectation
-from sim2gp.inference.gaussian import LOG_2PI, Gaussian
+from sim2gp.inference.estimate import (
+    Estimate,
+    drawn_starts,
+    estimate,
+    estimate_noise,
+)
+from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.information import Sensitivity
-from sim2gp.inference.least_squares import factor, gauss_newton_step, over, stack
-from sim2gp.inference.levenberg_marquardt import AbstractLikelihood, Fit, multi_start
+from sim2gp.inference.least_squares import gauss_newton_step, over, stack
 from sim2gp.inference.linalg import triangular
+from sim2gp.inference.prior import ParameterPrior
 from sim2gp.models import draws
 from sim2gp.models.features import Encoding
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import Action, Dynamics, Key, Scalar, State, double, in_float64
 
-NOISE_ROUNDS = 5  # EM; the last change of sig is below 1e-3 relative from here on
 STARTS = 4
-FLOOR = 1e-3  # prior guess of the noise, relative to each channel's rms change
 PRIOR_NOISE = 1e-3  # before any data, of half of a channel's box
 
 
@@ -150,18 +153,16 @@ class Sim2GP(AbstractModel):
         Raises `NotConverged`, `NotFinite` or `DeadParameters`.
         """
         assert isinstance(belief, Sim2GPBelief)
+        rows = jax.tree.map(jnp.asarray, data)
         if self.frozen:
-            return _noise_alone(self, jax.tree.map(jnp.asarray, data))
-        p = self.prior.mean.size
-        warm = jax.scipy.linalg.solve(
-            self.prior.scale, belief.posterior.mean - self.prior.mean
-        )
-        spread = 0.7 * jax.random.normal(key, (STARTS - 2, p))
-        starts = jnp.concatenate([warm[None], jnp.zeros((1, p)), spread])
-        fit, fitted = _fit(self, jax.tree.map(jnp.asarray, data), starts)
+            return _belief(self, _noise_alone(self, rows), rows)
+        away = belief.posterior.mean - self.prior.mean
+        warm = jnp.linalg.solve(self.prior.scale, away)
+        first = jnp.stack([warm, jnp.zeros_like(warm)])
+        found = _fit(self, rows, drawn_starts(first, STARTS, key))
         names = self.system.parameters.names
-        fit.raise_unless_converged(names, f"{data.count} transitions")
-        return fitted
+        found.convergence.check(names, f"{data.count} transitions")
+        return _belief(self, found, rows)
 
     def update(
         self, belief: AbstractBelief, s: State, a: Action, s2: State
@@ -187,114 +188,36 @@ def _predict(belief: Sim2GPBelief, s: Array, a: Array) -> Gaussian:
     return _latent(belief, s, a).plus(noise)
 
 
-class _OneStep(AbstractLikelihood):
-    """The one-step likelihood: exact states, independent noise on each increment."""
-
-    model: Sim2GP
-    data: Transitions
-
-    def rows(
-        self, z: Float[Array, " p"]
-    ) -> tuple[Float[Array, "N d"], Float[Array, "N d p"]]:
-        """Residuals ``f - y`` and their Jacobian in ``z``; masked rows are zero."""
-        model, d = self.model, len(self.model.system.physical_states)
-
-        def one(
-            s: Array, a: Array, s2: Array, valid: Array, which: Array | None
-        ) -> tuple[Array, Array]:
-            def f(z: Array) -> Array:
-                tt = model.prior.mean + model.prior.scale @ z
-                return model.system.transition(tt, s, a, model.dt, which)[:d]
-
-            value, J = linearized.value_and_jacobian(f, z)
-            return jnp.where(valid, value - s2[:d], 0.0), jnp.where(valid, J, 0.0)
-
-        data = self.data
-        rows = data.state, data.action, data.next_state, data.mask, data.configuration
-        return jax.vmap(one)(*rows)
-
-    def blocks(self, z: Float[Array, " p"], e: Float[Array, "1 0"]) -> Blocks:
-        """All data as one window; a step of exact states has no nuisances ``e``."""
-        del e
-        r, J = self.rows(z)
-        return jax.vmap(factor, in_axes=1)(J, r)[None]
-
-    def known(self, z: Float[Array, " p"]) -> Float[Array, "q p1"]:
-        """Of sums that were weighed."""
-        return self.model.system.parameters.known(self.model.prior, z)
-
-    def curvature(
-        self, z: Float[Array, " p"], gradient: Float[Array, " p"]
-    ) -> Float[Array, "p p"]:
-        """Of the table's maps."""
-        model = self.model
-        return model.system.parameters.curvature(model.prior, z, gradient)
-
-
-def likelihood(model: Sim2GP, data: Transitions) -> AbstractLikelihood:
-    """The likelihood that `Sim2GP.fit` descends, for whoever linearises it himself."""
-    return _OneStep(model, data)
-
-
 @eqx.filter_jit
 def _fit(
     model: Sim2GP, data: Transitions, starts: Float[Array, "starts p"]
-) -> tuple[Fit, Sim2GPBelief]:
-    d, N = len(model.system.physical_states), jnp.sum(data.mask, dtype=float)
-    change, count = _rms_change(data, d), jnp.full((1, d), N)
-
-    # Start from a large noise, so that the first MAP is not trapped.
-    fit, noise, _ = multi_start(
-        likelihood(model, data),
-        starts,
-        jnp.zeros((1, 0)),
-        Noise(change, jnp.ones(1)),
-        expectation(count, FLOOR * change),
+) -> Estimate:
+    likelihood = OneStepLikelihood(model.system, data, model.dt)
+    return estimate(
+        likelihood,
+        ParameterPrior(model.prior, model.system.parameters),
+        starts=starts,
+        nuisances=jnp.zeros((1, 0)),
+        noise=likelihood.large_noise(),
         rounds=NOISE_ROUNDS,
     )
-    belief = Sim2GPBelief(
-        model.system,
-        model.prior,
-        fit.posterior(model.prior),
-        noise.sd,
-        fit.data[:-1, :-1],
-        fit.log_evidence(noise, count),
-        jnp.sum(data.mask),
-        model.dt,
-        model.linear,
-    )
-    return fit, belief
-
-
-def _rms_change(data: Transitions, d: int) -> Float[Array, " d"]:
-    """Of each physical state in one step; 1 where nothing moves."""
-    N = jnp.sum(data.mask, dtype=float)
-    y = jnp.where(data.mask[:, None], data.delta()[:, :d], 0.0)
-    change = jnp.sqrt(jnp.sum(y**2, axis=0) / jnp.maximum(N, 1.0))
-    return jnp.where(change > 0.0, change, 1.0)
 
 
 @eqx.filter_jit
-def _noise_alone(model: Sim2GP, data: Transitions) -> Sim2GPBelief:
-    """The noise by one step of EM, exact where the constants' posterior is given.
+def _noise_alone(model: Sim2GP, data: Transitions) -> Estimate:
+    likelihood = OneStepLikelihood(model.system, data, model.dt)
+    prior = ParameterPrior(model.prior, model.system.parameters)
+    return estimate_noise(likelihood, prior)
 
-    The log evidence is that of the data at the constants' mean.
-    """
-    d, N = len(model.system.physical_states), jnp.sum(data.mask, dtype=float)
-    p = model.prior.mean.size
-    r, J = _OneStep(model, data).rows(jnp.zeros(p))
-    floor = FLOOR * _rms_change(data, d)
-    squares = jnp.sum(r**2, axis=0)
-    total = 2.0 * floor**2 + squares + jnp.sum(J**2, axis=(0, 2))
-    noise = jnp.sqrt(total / (2.0 + N))
-    normaliser = N * jnp.sum(jnp.log(noise) + 0.5 * LOG_2PI)
+
+def _belief(model: Sim2GP, found: Estimate, data: Transitions) -> Sim2GPBelief:
     return Sim2GPBelief(
         model.system,
-        model.prior,
-        model.prior,
-        noise,
-        jnp.zeros((p, p)),
-        -0.5 * jnp.sum(squares / noise**2) - normaliser,
+        found.prior,
+        found.posterior,
+        found.noise.sd,
+        found.information,
+        found.log_evidence,
         jnp.sum(data.mask),
         model.dt,
         model.linear,
@@ -325,27 +248,3 @@ def _update(belief: Sim2GPBelief, s: Array, a: Array, s2: Array) -> Sim2GPBelief
     return eqx.tree_at(
         lambda b: (b.posterior, b.information, b.log_evidence, b.count), belief, new
     )
-
-
-@eqx.filter_jit
-def _hessian(belief: Sim2GPBelief, data: Transitions) -> Float[Array, "p p"]:
-    model = Sim2GP(belief.system, dt=belief.dt, prior=belief.prior)
-    likelihood = _OneStep(model, data)
-
-    def loss(z: Array) -> Scalar:
-        r = likelihood.rows(z)[0] / belief.noise[None]
-        apart = likelihood.known(z)[:, -1]
-        return 0.5 * (jnp.sum(r**2) + z @ z + apart @ apart)
-
-    offset = belief.posterior.mean - belief.prior.mean
-    return jax.hessian(loss)(jnp.linalg.solve(belief.prior.scale, offset))
-
-
-@in_float64
-def full_hessian(belief: Sim2GPBelief, data: Transitions) -> Float[Array, "p p"]:
-    """Hessian of the negative log posterior in whitened coordinates: a diagnostic.
-
-    It equals the Gauss-Newton precision up to residuals times curvature, and may be
-    indefinite away from a good fit; it is never used as a posterior.
-    """
-    return _hessian(belief, jax.tree.map(jnp.asarray, data))

@@ -11,13 +11,13 @@ the prior of its constant, or of ``[parameters."body/hand/mass @ payload"]``.
 from collections.abc import Mapping
 
 from sim2gp.errors import InputError
-from sim2gp.inference.linear_measurements import Weighed
+from sim2gp.inference.linear_measurements import LinearMeasurement
 from sim2gp.inference.parameters import Parameter, unknown_parameter
 from sim2gp.project.priors import located, prior
 from sim2gp.project.schema import ParameterSpec, ProjectSpec
 from sim2gp.project.source import Source
 from sim2gp.systems import AbstractSystem, Variant, with_variants
-from sim2gp.systems.assemble import with_weighed
+from sim2gp.systems.assemble import with_measurements
 from sim2gp.systems.function_checks import names_of
 from sim2gp.systems.variants import AT
 
@@ -82,9 +82,9 @@ def weighed(
                 expected=f"{len(stated.of)}, one for each constant",
                 fix="state one for each, or leave weights out",
             )
-        found = Weighed(tuple(stated.of), weights, stated.value, stated.sd)
+        found = LinearMeasurement(tuple(stated.of), weights, stated.value, stated.sd)
         try:
-            system = with_weighed(system, [found])
+            system = with_measurements(system, [found])
         except InputError as error:
             raise located(error, where) from error
     return system

@@ -25,8 +25,9 @@ from jaxtyping import Array, Float, Int
 from sim2gp.data.logs import Column, Log
 from sim2gp.data.logs.units import factor
 from sim2gp.data.split_log import cut
-from sim2gp.data.windows import Windows, fit_windows
+from sim2gp.data.windows import Windows
 from sim2gp.errors import NotConverged, NotFinite
+from sim2gp.identification.fit import fit_windows
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.simulate import simulate
 from sim2gp.types import Key, in_float64

@@ -8,7 +8,7 @@ import numpy as np
 
 from sim2gp.errors import InputError
 from sim2gp.inference.gaussian import Gaussian
-from sim2gp.inference.linear_measurements import Weighed
+from sim2gp.inference.linear_measurements import LinearMeasurement
 from sim2gp.inference.parameters import Parameter, Parameters, unknown_parameter
 from sim2gp.systems.actuators import AbstractActuator
 from sim2gp.systems.base import AbstractSystem
@@ -93,7 +93,9 @@ def with_variants(
     return replace(machine, variants=tuple(variants), parameters=table)
 
 
-def with_weighed(system: AbstractSystem, sums: Sequence[Weighed]) -> Machine:
+def with_measurements(
+    system: AbstractSystem, sums: Sequence[LinearMeasurement]
+) -> Machine:
     """The machine, of which some sums of constants were measured.
 
     Of a machine in several variants a sum names columns. Raises `InputError` E142 for a
@@ -117,7 +119,7 @@ def with_weighed(system: AbstractSystem, sums: Sequence[Weighed]) -> Machine:
                 fix="state its weight" if doubled else "give one of them a prior",
             )
         x.check(ranges)
-    more = replace(table, weighed=(*table.weighed, *sums))
+    more = replace(table, measurements=(*table.measurements, *sums))
     return replace(as_machine(system), parameters=more)
 
 

@@ -1,6 +1,6 @@
 """Is the posterior as Laplace says? Importance sampling against the exact one.
 
-Draws ``z_i`` of Laplace's Gaussian ``q`` are weighed by the likelihood that the fit
+Draws ``z_i`` of Laplace's Gaussian ``q`` are weighted by the likelihood that the fit
 descended, at the fit's noise,
 
     log w_i = log p(z_i | data) - log q(z_i),
@@ -25,10 +25,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from sim2gp.data.windows import Windows, WindowsBelief, at_map
+from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.identification.words import digits, finite_or_none, listed
 from sim2gp.inference.arrowhead import Noise, eliminate
-from sim2gp.inference.levenberg_marquardt import AbstractLikelihood
+from sim2gp.inference.estimate import Estimate
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.likelihood import AbstractLikelihood
+from sim2gp.inference.prior import AbstractPrior, ParameterPrior
 from sim2gp.types import Key, in_float64
 
 DRAWS = 256
@@ -122,28 +125,33 @@ def moments(
     }
 
 
-def directions(belief: WindowsBelief) -> Float[np.ndarray, "p p"]:
+def directions(posterior: Gaussian) -> Float[np.ndarray, "p p"]:
     """A row for each constant: its direction among the standardised unknowns."""
-    scale = np.asarray(belief.posterior.scale)
+    scale = np.asarray(posterior.scale)
     found: np.ndarray = scale / np.linalg.norm(scale, axis=1)[:, None]
     return found
 
 
 @in_float64
-def check_windows(belief: WindowsBelief, cut: Windows, *, key: Key) -> Checked:
+def check_windows(
+    likelihood: WindowsLikelihood, fitted: Estimate, *, key: Key
+) -> Checked:
     """Laplace's posterior of a fit against the exact one, given the fit's noise."""
-    likelihood, z, e, noise = at_map(belief, cut)
+    prior = ParameterPrior(fitted.prior, likelihood.system.parameters)
+    z, e = fitted.z(), fitted.nuisances
     white = jax.random.normal(key, (DRAWS, z.size))
-    scale = jnp.linalg.solve(belief.prior.scale, belief.posterior.scale)
-    found = _log_posterior(likelihood, z[None] + white @ scale.T, e, noise)
+    scale = jnp.linalg.solve(fitted.prior.scale, fitted.posterior.scale)
+    draws = z[None] + white @ scale.T
+    found = _log_posterior(likelihood, prior, draws, e, fitted.noise)
     log_weights = np.asarray(found) + 0.5 * np.sum(np.asarray(white) ** 2, axis=1)
-    unit = directions(belief)
+    unit = directions(fitted.posterior)
     return checked(log_weights, np.asarray(white) @ unit.T)
 
 
 @eqx.filter_jit
 def _log_posterior(
     likelihood: AbstractLikelihood,
+    prior: AbstractPrior,
     draws: Float[Array, "S p"],
     e: Float[Array, "W n"],
     noise: Noise,
@@ -151,13 +159,13 @@ def _log_posterior(
     """Of each draw, the start states integrated around their best."""
 
     def one(z: Array) -> Array:
-        apart = likelihood.known(z)[:, -1]
+        offset, about = prior.rows(z)[:, -1], prior.gaussian
 
         def step(e: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
-            blocks = likelihood.blocks(z, e)
+            blocks = likelihood.blocks(about.at(z), e, about.scale)
             arrow = eliminate(blocks, e, noise)
             r = noise.scale(blocks)[..., -1]
-            cost = 0.5 * (jnp.sum(r**2) + jnp.sum(e**2) + z @ z + apart @ apart)
+            cost = 0.5 * (jnp.sum(r**2) + jnp.sum(e**2) + offset @ offset)
             pivots = jnp.diagonal(arrow.R11, axis1=1, axis2=2)
             return e - arrow.slope[..., -1], (cost, jnp.sum(jnp.log(pivots)))
 

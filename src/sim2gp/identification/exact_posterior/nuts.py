@@ -29,7 +29,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from sim2gp.data.windows import Windows, WindowsBelief, at_map
+from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.errors import missing_extra
 from sim2gp.identification.exact_posterior.importance import (
     different,
@@ -39,9 +39,12 @@ from sim2gp.identification.exact_posterior.importance import (
 )
 from sim2gp.identification.words import finite_or_none, listed
 from sim2gp.inference.arrowhead import Noise, eliminate
-from sim2gp.inference.least_squares import with_prior
-from sim2gp.inference.levenberg_marquardt import AbstractLikelihood, point
+from sim2gp.inference.estimate import Estimate
+from sim2gp.inference.least_squares import stack
+from sim2gp.inference.levenberg_marquardt import evaluate
+from sim2gp.inference.likelihood import AbstractLikelihood
 from sim2gp.inference.linalg import solve_triangular
+from sim2gp.inference.prior import AbstractPrior, ParameterPrior
 from sim2gp.types import Key, in_float64
 
 CHAINS, WARM_UP, DRAWS = 4, 200, 250  # draws of each chain
@@ -107,19 +110,23 @@ def sampler() -> ModuleType:
 
 
 @in_float64
-def sample_windows(belief: WindowsBelief, cut: Windows, *, key: Key) -> Sampled:
+def sample_windows(
+    likelihood: WindowsLikelihood, fitted: Estimate, *, key: Key
+) -> Sampled:
     """The posterior of a fit by NUTS against Laplace's, given the fit's noise.
 
     Raises E135 without the extra ``mcmc``.
     """
-    likelihood, z, e, noise = at_map(belief, cut)
-    draws, divergent = sampled(likelihood, z, e, noise, key)
-    unit = directions(belief)
+    prior = ParameterPrior(fitted.prior, likelihood.system.parameters)
+    at = fitted.z(), fitted.nuisances, fitted.noise
+    draws, divergent = sampled(likelihood, prior, *at, key)
+    unit = directions(fitted.posterior)
     return judged(np.asarray(draws), np.asarray(divergent), unit)
 
 
 def sampled(
     likelihood: AbstractLikelihood,
+    prior: AbstractPrior,
     z: Float[Array, " p"],
     e: Float[Array, "W n"],
     noise: Noise,
@@ -128,20 +135,21 @@ def sampled(
     """Draws of ``a`` about the MAP ``z, e``, and which paths diverged."""
     # Not the user's setting: the sampler adds integers to floats.
     with jax.numpy_dtype_promotion("standard"):
-        found: tuple[Array, Array] = _chains(likelihood, z, e, noise, key)
+        found: tuple[Array, Array] = _chains(likelihood, prior, z, e, noise, key)
     return found
 
 
 @eqx.filter_jit
 def _chains(
     likelihood: AbstractLikelihood,
+    prior: AbstractPrior,
     z: Float[Array, " p"],
     e: Float[Array, "W n"],
     noise: Noise,
     key: Key,
 ) -> tuple[Array, Array]:
     blackjax = sampler()
-    density = _density(likelihood, z, e, noise)
+    density = _density(likelihood, prior, z, e, noise)
 
     def chain(key: Key) -> tuple[Array, Array]:
         first, warm, rest = jax.random.split(key, 3)
@@ -167,20 +175,22 @@ def _chains(
 
 def _density(
     likelihood: AbstractLikelihood,
+    prior: AbstractPrior,
     z0: Float[Array, " p"],
     e0: Float[Array, "W n"],
     noise: Noise,
 ) -> Callable[[Array], Array]:
     """``-L`` of the standardised unknowns, with the fit's own gradient."""
-    arrow = eliminate(likelihood.blocks(z0, e0), e0, noise)
-    R = with_prior(arrow.data, z0, likelihood.known(z0))[:-1, :-1]
+    here = evaluate(likelihood, prior, z0, e0, noise)
+    arrow = eliminate(here.blocks, e0, noise)
+    R = stack(arrow.data, here.prior)[:-1, :-1]
 
     @jax.custom_vjp
     def density(z: Array, e: Array) -> Array:
         return forward(z, e)[0]
 
     def forward(z: Array, e: Array) -> tuple[Array, tuple[Array, Array]]:
-        at = point(z, e, likelihood.blocks(z, e), likelihood.known(z), noise)
+        at = evaluate(likelihood, prior, z, e, noise)
         return -at.cost, (at.by_z, at.by_e)
 
     def backward(by: tuple[Array, Array], g: Array) -> tuple[Array, Array]:

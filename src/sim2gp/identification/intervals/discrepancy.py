@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from sim2gp.data.windows import Windows, WindowsBelief, compile_linearise
+from sim2gp.data.windows import Windows
+from sim2gp.data.windows_likelihood import WindowsLikelihood, compile_linearise
 from sim2gp.identification.intervals.pulls import (
     Pulls,
     cost_of_rows,
@@ -24,6 +25,7 @@ from sim2gp.identification.intervals.pulls import (
 )
 from sim2gp.identification.intervals.scatter import Corrected, corrected
 from sim2gp.identification.missing_physics.score import sine_to
+from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.systems.assemble import free_parts
 from sim2gp.systems.base import AbstractSystem
@@ -35,7 +37,7 @@ from sim2gp.types import in_float64
 #: another shape, such as dry friction's with another width.
 DISGUISE = 0.02
 TRUSTED = 1.0  # nats that a centre may cost beyond what the linear misfit says
-GAINED = 0.5  # of a gain that the linear misfit promises: what may fail to come
+GAIN = 0.5  # of a gain that the linear misfit predicts: what may fail to come
 HALVINGS = 6
 ROUNDS = 6  # linearisations
 SETTLED = 0.1  # of its sd: what no constant's centre moves by any more
@@ -54,8 +56,8 @@ def compile_corrected(system: AbstractSystem, cut: Windows) -> None:
 
 @in_float64
 def corrected_windows(
-    belief: WindowsBelief,
-    cut: Windows,
+    likelihood: WindowsLikelihood,
+    fitted: Estimate,
     group: Int[np.ndarray, " W"],
     effects: Sequence[AbstractPart] | None = None,
 ) -> Corrected:
@@ -64,23 +66,25 @@ def corrected_windows(
     ``effects`` are what it may lack, with their prior sd: None is its library, which a
     model of the user's own does not have. Raises `NotFinite` E203.
     """
-    p = belief.prior.mean.size
-    given = smooth_effects(belief.system) if effects is None else tuple(effects)
-    whole, own = _with(belief, given)
+    p, cut = fitted.prior.mean.size, likelihood.windows
+    system = likelihood.system
+    given = smooth_effects(system) if effects is None else tuple(effects)
+    system, whole, own = _with(system, fitted, given)
+    wider = WindowsLikelihood(system, cut)
     at = np.asarray(whole.posterior.mean)
-    rows = rows_of(whole, cut, whole.posterior.mean)
+    rows = rows_of(wider, whole, whole.posterior.mean)
     pulls = pulls_of_rows(rows, cut, group)
-    order = np.concatenate([own, _told_apart(pulls, own)])
+    order = np.concatenate([own, _distinct(pulls, own)])
     lacking = np.arange(len(order)) >= p
     prior = Gaussian(whole.prior.mean[order], whole.prior.scale[np.ix_(order, order)])
     for _ in range(ROUNDS):
         here = Gaussian(jnp.asarray(at[order]), prior.scale)
         found = corrected(prior, here, pulls.of(order), lacking)
         if not found.enough:
-            return replace(found, posterior=belief.posterior)
+            return replace(found, posterior=fitted.posterior)
         to = at.copy()
         to[order] = np.asarray(found.posterior.mean)
-        to, rows = _trusted(whole, cut, rows, pulls, at, to, found.inflation)
+        to, rows = _trusted(wider, whole, rows, pulls, at, to, found.inflation)
         moved = np.abs(to - at)[order] / np.asarray(found.posterior.sd())
         at = to
         if len(order) == p or np.max(moved) <= SETTLED:
@@ -90,7 +94,7 @@ def corrected_windows(
     if len(order) == p:
         return replace(found, posterior=both)
     mine = Gaussian(both.mean[:p], both.scale[:p]).triangular()
-    names = whole.system.parameters.names
+    names = system.parameters.names
     return replace(
         found,
         posterior=Gaussian(both.mean[:p], mine),
@@ -100,26 +104,26 @@ def corrected_windows(
 
 
 def _with(
-    belief: WindowsBelief, effects: Sequence[AbstractPart]
-) -> tuple[WindowsBelief, Int[np.ndarray, " p"]]:
-    """The belief of the machine with effects, all at nothing; its own constants."""
+    machine: AbstractSystem, fitted: Estimate, effects: Sequence[AbstractPart]
+) -> tuple[AbstractSystem, Estimate, Int[np.ndarray, " p"]]:
+    """The machine with effects, its estimate with all at nothing; its own columns."""
     if not effects:
-        return belief, np.arange(belief.prior.mean.size)
-    system = free_parts(belief.system, effects)
+        return machine, fitted, np.arange(fitted.prior.mean.size)
+    system = free_parts(machine, effects)
     names, prior = system.parameters.names, system.parameters.prior()
-    own = np.asarray([names.index(name) for name in belief.system.parameters.names])
-    scale = prior.scale.at[np.ix_(own, own)].set(belief.prior.scale)
+    own = np.asarray([names.index(name) for name in machine.parameters.names])
+    scale = prior.scale.at[np.ix_(own, own)].set(fitted.prior.scale)
     whole = replace(
-        belief,
-        system=system,
-        prior=Gaussian(prior.mean.at[own].set(belief.prior.mean), scale),
-        posterior=Gaussian(prior.mean.at[own].set(belief.posterior.mean), scale),
+        fitted,
+        prior=Gaussian(prior.mean.at[own].set(fitted.prior.mean), scale),
+        posterior=Gaussian(prior.mean.at[own].set(fitted.posterior.mean), scale),
         information=jnp.zeros_like(scale),  # of another machine
+        scores=jnp.zeros((len(fitted.scores), len(scale))),
     )
-    return whole, own
+    return system, whole, own
 
 
-def _told_apart(pulls: Pulls, own: Int[np.ndarray, " p"]) -> Int[np.ndarray, " k"]:
+def _distinct(pulls: Pulls, own: Int[np.ndarray, " p"]) -> Int[np.ndarray, " k"]:
     """The other columns that show, and that no constants of the machine mimic."""
     A = np.asarray(np.linalg.qr(np.concatenate(list(pulls.factors)), mode="r"))
     others = np.setdiff1d(np.arange(A.shape[1]), own)
@@ -128,8 +132,8 @@ def _told_apart(pulls: Pulls, own: Int[np.ndarray, " p"]) -> Int[np.ndarray, " k
 
 
 def _trusted(
-    belief: WindowsBelief,
-    cut: Windows,
+    likelihood: WindowsLikelihood,
+    fitted: Estimate,
     rows: Float[np.ndarray, "W k npr"],
     pulls: Pulls,
     at: Float[np.ndarray, " p"],
@@ -143,14 +147,15 @@ def _trusted(
     more than the linear one, to `TRUSTED` nats of data that count as often as they
     should, or half of what is gained.
     """
-    dz = np.linalg.solve(np.asarray(belief.prior.scale), to - at)
+    cut = likelihood.windows
+    dz = np.linalg.solve(np.asarray(fitted.prior.scale), to - at)
     score, F = pulls.scores.sum(axis=0), pulls.fisher.sum(axis=0)
     before = cost_of_rows(rows, cut)
     for share in 0.5 ** np.arange(HALVINGS):
         there = at + share * (to - at)
-        found = rows_of(belief, cut, jnp.asarray(there))
-        told = share * dz @ (score + 0.5 * share * F @ dz)
-        slack = TRUSTED * max(inflation, 1.0) + GAINED * max(-told, 0.0)
-        if cost_of_rows(found, cut) - before - told <= slack:
+        found = rows_of(likelihood, fitted, jnp.asarray(there))
+        linear = share * dz @ (score + 0.5 * share * F @ dz)
+        slack = TRUSTED * max(inflation, 1.0) + GAIN * max(-linear, 0.0)
+        if cost_of_rows(found, cut) - before - linear <= slack:
             return there, found
     return at, rows

@@ -11,8 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sim2gp.data.windows import Windows, WindowsBelief, linearise
+from sim2gp.data.windows import Windows
+from sim2gp.data.windows_likelihood import WindowsLikelihood, linearise
 from sim2gp.identification.misfit.tests import must_be_finite
+from sim2gp.inference.estimate import Estimate
 from sim2gp.types import in_float64
 
 
@@ -45,13 +47,14 @@ class Pulls:
 
 @in_float64
 def pulls_of_windows(
-    belief: WindowsBelief, cut: Windows, group: Int[np.ndarray, " W"]
+    likelihood: WindowsLikelihood, fitted: Estimate, group: Int[np.ndarray, " W"]
 ) -> Pulls:
     """Of a fit and its windows, start states eliminated; ``group`` numbers their logs.
 
     Raises `NotFinite` E203.
     """
-    return pulls_of_rows(rows_of(belief, cut, belief.posterior.mean), cut, group)
+    rows = rows_of(likelihood, fitted, fitted.posterior.mean)
+    return pulls_of_rows(rows, likelihood.windows, group)
 
 
 def pulls_of_rows(
@@ -80,18 +83,16 @@ def cost_of_rows(rows: Float[np.ndarray, "W k npr"], cut: Windows) -> float:
 
 
 def rows_of(
-    belief: WindowsBelief, cut: Windows, tt: Array
+    likelihood: WindowsLikelihood, fitted: Estimate, tt: Array
 ) -> Float[np.ndarray, "W k npr"]:
     """Of each window ``[J_e J_z r]``, whitened, the start's prior in its last rows."""
-    p, n = belief.prior.mean.size, cut.start.shape[1]
-    found = linearise(belief, cut, tt)
-    weight = np.sqrt(np.asarray(belief.weights))[:, None, None]
-    scale = weight / np.asarray(belief.noise)
+    e, p = np.asarray(fitted.nuisances), fitted.prior.mean.size
+    n = e.shape[1]
+    found = linearise(likelihood, fitted, tt)
+    weight = np.sqrt(np.asarray(fitted.noise.weights))[:, None, None]
+    scale = weight / np.asarray(fitted.noise.sd)
     r, J = np.asarray(found.residual) * scale, np.asarray(found.jacobian)
     J = J * scale[..., None]
-    sd = np.asarray(cut.start_sd)
-    away = np.asarray(belief.starts) - np.asarray(cut.start)
-    e = np.divide(away, sd, out=np.zeros_like(away), where=sd > 0.0)
     rows = np.concatenate([J[..., p:], J[..., :p], r[..., None]], axis=-1)
     own = np.zeros((len(e), n, n + p + 1))
     own[..., :n], own[..., -1] = np.eye(n), e

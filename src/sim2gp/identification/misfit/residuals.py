@@ -8,16 +8,15 @@ raise the alarm as a rule: that is right, the posterior counts every sample as n
 """
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sim2gp.data.transitions import Transitions
-from sim2gp.data.windows import Windows, WindowsBelief, linearise
+from sim2gp.data.one_step import OneStepLikelihood
+from sim2gp.data.windows import Windows
+from sim2gp.data.windows_likelihood import WindowsLikelihood, linearise
 from sim2gp.identification.misfit.tests import Misfit, misfit
-from sim2gp.inference.linearized import jacobian_by_columns
-from sim2gp.models.sim2gp import Sim2GPBelief
+from sim2gp.inference.estimate import Estimate
+from sim2gp.inference.gaussian import Gaussian
 from sim2gp.systems.base import Channel
 from sim2gp.types import in_float64
 
@@ -25,15 +24,21 @@ PAST = 3  # earlier inputs that are tried beside the present one: a delay shows 
 
 
 @in_float64
-def misfit_of_transitions(belief: Sim2GPBelief, data: Transitions) -> Misfit:
+def misfit_of_transitions(
+    likelihood: OneStepLikelihood,
+    prior: Gaussian,
+    posterior: Gaussian,
+    noise: Float[Array, " d"],
+) -> Misfit:
     """Of a one-step fit and the transitions it was fitted to.
 
     An episode goes on where a row starts in the state in which the last one ended.
     """
-    system, N = belief.system, data.count
-    exact = jax.tree.map(jnp.asarray, data)
-    r, J = (np.asarray(x)[:N] for x in _one_step(belief, exact))
-    sd = np.asarray(belief.noise)
+    system, data = likelihood.system, likelihood.data
+    N = data.count
+    found = _rows(likelihood, posterior.mean, prior.scale)
+    r, J = (np.asarray(x)[:N] for x in found)
+    sd = np.asarray(noise)
     s, a, s2 = (np.asarray(x)[:N] for x in (data.state, data.action, data.next_state))
     episode = _episodes(s, s2)
     states = system.physical_states
@@ -48,19 +53,19 @@ def misfit_of_transitions(belief: Sim2GPBelief, data: Transitions) -> Misfit:
 
 
 @in_float64
-def misfit_of_windows(belief: WindowsBelief, cut: Windows) -> Misfit:
+def misfit_of_windows(likelihood: WindowsLikelihood, fitted: Estimate) -> Misfit:
     """Of a fit and its windows.
 
     One-step windows have no start state of their own, and are tested as transitions.
     """
-    system = belief.system
-    found = linearise(belief, cut, belief.posterior.mean)
+    system, cut = likelihood.system, likelihood.windows
+    found = linearise(likelihood, fitted, fitted.posterior.mean)
     r, J, s, a = (np.asarray(x).reshape(-1, *x.shape[2:]) for x in found)
-    weight = np.sqrt(np.repeat(np.asarray(belief.weights), cut.mask.shape[1]))
-    scale = weight[:, None] / np.asarray(belief.noise)
+    weight = np.sqrt(np.repeat(np.asarray(fitted.noise.weights), cut.mask.shape[1]))
+    scale = weight[:, None] / np.asarray(fitted.noise.sd)
     mask = np.asarray(cut.mask).reshape(r.shape)
     kept = mask.any(axis=1)
-    p = belief.prior.mean.size
+    p = fitted.prior.mean.size
     free = bool(np.any(np.asarray(cut.start_sd) > 0.0))
     number = np.arange(len(cut)) if free else _successive(cut)
     group = np.repeat(number, cut.mask.shape[1])[kept]
@@ -115,15 +120,8 @@ def _episodes(
 
 
 @eqx.filter_jit
-def _one_step(belief: Sim2GPBelief, data: Transitions) -> tuple[Array, Array]:
+def _rows(
+    likelihood: OneStepLikelihood, tt: Array, scale: Array
+) -> tuple[Array, Array]:
     """Residuals ``f - s'`` and their Jacobian, per prior standard deviation."""
-    system, prior, d = belief.system, belief.prior, belief.noise.size
-
-    def residual(z: Array) -> tuple[Array]:
-        tt = belief.posterior.mean + prior.scale @ z
-        f = jax.vmap(lambda s, a, c: system.transition(tt, s, a, belief.dt, c))
-        found = f(data.state, data.action, data.configuration)
-        return ((found - data.next_state)[:, :d],)
-
-    J, (r,) = jacobian_by_columns(residual, jnp.zeros_like(prior.mean))
-    return r, J
+    return likelihood.rows(tt, scale)

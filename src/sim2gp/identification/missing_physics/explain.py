@@ -57,6 +57,7 @@ def explain(
     ``candidates`` take the library's place. Raises what the bare machine's fit raises.
     """
     found = search(data, candidates, refits=refits, on_step=on_step)
-    bare = data.misfit(found.bare)
-    best = bare if found.best is None else data.misfit(found.best.fitted)
+    best = bare = data.misfit(data.system, found.bare)
+    if found.best is not None:
+        best = data.misfit(found.best.scored.system, found.best.fitted)
     return Explanation(found, bare, best)

@@ -17,24 +17,26 @@ variance (a sandwich over clusters): the likelihood is tempered to what rows are
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sim2gp.identification.missing_physics.data import AbstractData, Fitted, scores_of
-from sim2gp.inference.arrowhead import Blocks, Noise, eliminate
-from sim2gp.inference.expectation_maximisation import expectation
-from sim2gp.inference.levenberg_marquardt import AbstractLikelihood, Fit, multi_start
+from sim2gp.identification.missing_physics.data import AbstractData
+from sim2gp.inference.arrowhead import Blocks, eliminate
+from sim2gp.inference.estimate import Estimate, estimate
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.least_squares import prior_rows
+from sim2gp.inference.likelihood import AbstractLikelihood
 from sim2gp.inference.linalg import triangular
+from sim2gp.inference.prior import AbstractPrior
 from sim2gp.systems.assemble import free_parts
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.effects.registry import Candidate
-from sim2gp.types import Scalar, in_float64
+from sim2gp.types import in_float64
 
 ROUNDS = 5  # EM for the noise, of a linearised fit
 ALIAS = 1e-5  # sine of the angle to the others' span below which nothing can tell
@@ -67,24 +69,30 @@ class Scored:
 
 @in_float64
 def score(
-    data: AbstractData, bare: Fitted, candidates: Sequence[Candidate]
+    data: AbstractData, bare: Estimate, candidates: Sequence[Candidate]
 ) -> list[Scored]:
     """Every candidate by its linearisation at the bare machine's MAP."""
-    names, n = bare.system.parameters.names, bare.nuisances.shape[1]
+    machine, n = data.system, bare.nuisances.shape[1]
+    names, likelihood = machine.parameters.names, data.likelihood(machine)
     smooth = [c.effect for c in candidates if c.smooth]
     # One machine with all of these: one compilation, one simulation.
-    whole = free_parts(bare.system, smooth)
-    z = _extended(bare, whole, {e.name: 0.0 for e in smooth})
+    whole = free_parts(machine, smooth)
+    mode = dict(zip(names, np.asarray(bare.z()).tolist(), strict=True))
+    z = _extended(mode, whole, {e.name: 0.0 for e in smooth})
     every = np.asarray(data.blocks(whole, z[None], bare.nuisances)[0])
+
+    def linear(blocks: np.ndarray, z: np.ndarray) -> _Linear:
+        return _linear(data, likelihood, bare, blocks, z)
+
     plain = _columns(every, whole, [*names, None], n)
-    without = _linear(data, bare, plain, np.append(np.asarray(bare.whitened()), 0.0))
+    without = linear(plain, np.asarray([*mode.values(), 0.0]))
     out = []
     for candidate in candidates:
         period = data.period or None
-        system = free_parts(bare.system, [candidate.effect], period=period)
+        system = free_parts(machine, [candidate.effect], period=period)
         order = [*names, candidate.name]
         z = np.stack(
-            [_extended(bare, system, {candidate.name: x}) for x in candidate.grid]
+            [_extended(mode, system, {candidate.name: x}) for x in candidate.grid]
         )
         if candidate.smooth:
             found = _columns(every, whole, order, n)[None]
@@ -92,9 +100,7 @@ def score(
             each = np.asarray(data.blocks(system, z, bare.nuisances))
             found = np.stack([_columns(b, system, order, n) for b in each])
         own = [system.parameters.names.index(name) for name in order]
-        fits = [
-            _linear(data, bare, b, x) for b, x in zip(found, z[:, own], strict=True)
-        ]
+        fits = [linear(b, x) for b, x in zip(found, z[:, own], strict=True)]
         gains = [
             tempered(f.evidence - without.evidence, f.inflation, f.sd) for f in fits
         ]
@@ -105,15 +111,15 @@ def score(
         starts = np.zeros((2 * len(z), len(own)))
         starts[:, own] = np.concatenate([steps, z[ranked][:, own]])
         best = int(ranked[0])
-        sine, partners = _alias(found[best], bare)
-        near = tuple(names[j] for j in partners)
-        out.append(Scored(candidate, system, gains[best], sine, near, starts))
+        sine, shared = _alias(found[best], bare)
+        partners = tuple(names[j] for j in shared)
+        out.append(Scored(candidate, system, gains[best], sine, partners, starts))
     return out
 
 
 @dataclass(frozen=True)
-class _Linearised:
-    """Log evidence, MAP, and the last unknown's sd and inflation."""
+class _Linear:
+    """A linearised fit: log evidence, MAP, the last unknown's sd and inflation."""
 
     evidence: float
     z: Float[np.ndarray, " p"]
@@ -122,40 +128,66 @@ class _Linearised:
 
 
 def _linear(
-    data: AbstractData, bare: Fitted, blocks: np.ndarray, z: np.ndarray
-) -> _Linearised:
+    data: AbstractData,
+    likelihood: AbstractLikelihood,
+    bare: Estimate,
+    blocks: np.ndarray,
+    z: np.ndarray,
+) -> _Linear:
     """The fit of a likelihood that is linear around ``z``."""
-    rows = bare.system.parameters.known(bare.prior, bare.whitened())
+    rows = data.system.parameters.measurement_rows(bare.prior, bare.z())
     rows = jnp.insert(rows, -1, 0.0, axis=1)  # no sum has the candidate in it
-    fit, noise, value = _linear_fit(
-        _Linear(jnp.asarray(blocks), jnp.asarray(z), bare.nuisances, rows),
-        bare.noise,
-        jnp.asarray(data.count),
-        jnp.asarray(data.floor),
-        jnp.asarray(data.freedom),
+    counts, floor = likelihood.counts, likelihood.floor
+    z0 = jnp.asarray(z)
+    standard = Gaussian(jnp.zeros_like(z0), jnp.eye(z0.size))
+    found = estimate(
+        _LinearLikelihood(counts, floor, jnp.asarray(blocks), z0, bare.nuisances),
+        _LinearPrior(standard, rows, z0),
+        starts=z0[None],
+        nuisances=bare.nuisances,
+        noise=bare.noise,
+        rounds=ROUNDS,
+        freedom=jnp.asarray(data.freedom),
     )
-    root = np.asarray(fit.scale())
+    root = np.asarray(found.posterior.scale)
     row = root @ root[-1]
-    inflation = inflation_of(scores_of(fit, noise), data.cluster, row, -1)
-    return _Linearised(float(value), np.array(fit.z), math.sqrt(row[-1]), inflation)
+    inflation = inflation_of(np.asarray(found.scores), data.cluster, row, -1)
+    z = np.array(found.posterior.mean)
+    return _Linear(float(found.log_evidence), z, math.sqrt(row[-1]), inflation)
 
 
-class _Linear(AbstractLikelihood):
-    """A likelihood that is its own linearisation at ``(z0, e0)``."""
+class _LinearLikelihood(AbstractLikelihood):
+    """A likelihood that is its own linearisation at ``(z0, e0)``, whitened already."""
 
+    counts: Float[Array, "W c"]
+    floor: Float[Array, " c"]
     base: Blocks
     z0: Float[Array, " p"]
     e0: Float[Array, "W n"]
-    rows: Float[Array, "q p1"]  # of what was weighed
 
-    def known(self, z: Float[Array, " p"]) -> Float[Array, "q p1"]:
-        return self.rows.at[:, -1].add(self.rows[:, :-1] @ (z - self.z0))
-
-    def blocks(self, z: Float[Array, " p"], e: Float[Array, "W n"]) -> Blocks:
-        away = jnp.broadcast_to(z - self.z0, (len(e), z.size))
+    def blocks(
+        self,
+        tt: Float[Array, " p"],
+        e: Float[Array, "W n"],
+        scale: Float[Array, "p p"],
+    ) -> Blocks:
+        del scale
+        away = jnp.broadcast_to(tt - self.z0, (len(e), tt.size))
         step = jnp.concatenate([e - self.e0, away], axis=1)
         moved = jnp.einsum("wckj,wj->wck", self.base[..., :-1], step)
         return self.base.at[..., -1].add(moved)
+
+
+class _LinearPrior(AbstractPrior):
+    """Whitened already; the rows of measured sums are linear around ``z0``."""
+
+    gaussian: Gaussian
+    measured: Float[Array, "q p1"]
+    z0: Float[Array, " p"]
+
+    def rows(self, z: Float[Array, " p"]) -> Float[Array, "q p1"]:
+        change = self.measured[:, :-1] @ (z - self.z0)
+        return jnp.concatenate([prior_rows(z), self.measured.at[:, -1].add(change)])
 
     def curvature(
         self, z: Float[Array, " p"], gradient: Float[Array, " p"]
@@ -163,32 +195,13 @@ class _Linear(AbstractLikelihood):
         return jnp.zeros((z.size, z.size))
 
 
-@eqx.filter_jit
-def _linear_fit(
-    likelihood: _Linear,
-    noise: Noise,
-    count: Float[Array, "W c"],
-    floor: Float[Array, " c"],
-    freedom: Scalar,
-) -> tuple[Fit, Noise, Scalar]:
-    fit, noise, _ = multi_start(
-        likelihood,
-        likelihood.z0[None],
-        likelihood.e0,
-        noise,
-        expectation(count, floor, freedom),
-        rounds=ROUNDS,
-    )
-    return fit, noise, fit.log_evidence(noise, count)
-
-
-def _alias(blocks: np.ndarray, bare: Fitted) -> tuple[float, list[int]]:
+def _alias(blocks: np.ndarray, bare: Estimate) -> tuple[float, list[int]]:
     """Sine between the last column and the others' span, and who lies closest."""
     noise, e = bare.noise, bare.nuisances
     R = np.asarray(eliminate(jnp.asarray(blocks), e, noise).data)[:, :-1]
-    left, share = sine_to(R[:, :-1], R[:, -1])
+    sine, share = sine_to(R[:, :-1], R[:, -1])
     order = np.argsort(-np.abs(share))
-    return left, [int(j) for j in order[:3] if abs(share[j]) > SHARED]
+    return sine, [int(j) for j in order[:3] if abs(share[j]) > SHARED]
 
 
 def sine_to(
@@ -251,12 +264,10 @@ def widened(inflation: float, sd: float) -> float:
 
 
 def _extended(
-    bare: Fitted, system: AbstractSystem, added: dict[str, float]
+    mode: Mapping[str, float], system: AbstractSystem, added: Mapping[str, float]
 ) -> Float[np.ndarray, " p"]:
     """The bare MAP and physical values of what is added, whitened by the prior."""
-    own = np.asarray(bare.whitened()).tolist()
-    known = dict(zip(bare.system.parameters.names, own, strict=True))
-    table = system.parameters
+    known, table = dict(mode), system.parameters
     for name, x in added.items():
         known[name] = (table[name].unconstrain(x) - table[name].mean) / table[name].sd
     return np.asarray([known[name] for name in table.names])

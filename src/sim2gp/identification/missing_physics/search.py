@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sim2gp.errors import NotConverged, NotFinite
-from sim2gp.identification.missing_physics.data import AbstractData, Fitted
+from sim2gp.identification.missing_physics.data import AbstractData
 from sim2gp.identification.missing_physics.score import (
     Scored,
     inflation_of,
@@ -20,6 +20,7 @@ from sim2gp.identification.missing_physics.score import (
     tempered,
     widened,
 )
+from sim2gp.inference.estimate import Estimate
 from sim2gp.systems.effects.registry import Candidate
 from sim2gp.systems.effects.registry import candidates as registered
 from sim2gp.types import in_float64
@@ -37,7 +38,7 @@ class Refitted:
     """
 
     scored: Scored
-    fitted: Fitted
+    fitted: Estimate
     gain: float
     value: float
     sd: float
@@ -53,7 +54,7 @@ class Refitted:
 class Search:
     """Everything that was tried; refits by falling gain."""
 
-    bare: Fitted
+    bare: Estimate
     scored: tuple[Scored, ...]
     refitted: tuple[Refitted, ...]
     failed: tuple[str, ...] = field(default=())
@@ -78,9 +79,9 @@ class Search:
         best = self.best
         if best is None:
             return ()
-        near = best.gain - math.log(ODDS)
+        least = best.gain - math.log(ODDS)
         return tuple(
-            r for r in self.refitted if r is not best and r.physical and r.gain > near
+            r for r in self.refitted if r is not best and r.physical and r.gain > least
         )
 
 
@@ -116,7 +117,7 @@ def search(
     return Search(bare, tuple(scored), tuple(found), tuple(failed))
 
 
-def _refit(data: AbstractData, bare: Fitted, scored: Scored) -> Refitted:
+def _refit(data: AbstractData, bare: Estimate, scored: Scored) -> Refitted:
     fitted = data.refit(scored.system, scored.starts, bare)
     table, name = scored.system.parameters, scored.candidate.name
     j = table.names.index(name)
@@ -124,9 +125,10 @@ def _refit(data: AbstractData, bare: Fitted, scored: Scored) -> Refitted:
     middle = table[name].constrain(float(mean[j]))
     ends = [table[name].constrain(float(mean[j]) + k * sd) for k in (-1.0, 1.0)]
     white = np.linalg.solve(fitted.prior.scale, fitted.posterior.scale)
-    assert fitted.scores is not None
-    inflation = inflation_of(fitted.scores, data.cluster, white @ white[j], j)
-    raw = fitted.log_evidence - bare.log_evidence
+    inflation = inflation_of(
+        np.asarray(fitted.scores), data.cluster, white @ white[j], j
+    )
+    raw = float(fitted.log_evidence - bare.log_evidence)
     relative = sd / table[name].sd
     gain = tempered(raw, inflation, relative)
     half = 0.5 * (ends[1] - ends[0]) * widened(inflation, relative)

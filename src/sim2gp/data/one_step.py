@@ -1,0 +1,84 @@
+"""The likelihood of exact states: independent noise on each increment.
+
+y_n = s'_n - s_n = f(x_n, tt) + eps_n,   eps ~ N(0, diag(sig^2))
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sim2gp.data.transitions import Transitions
+from sim2gp.inference import linearized
+from sim2gp.inference.arrowhead import Blocks, Noise
+from sim2gp.inference.least_squares import factor
+from sim2gp.inference.likelihood import AbstractLikelihood
+from sim2gp.systems.base import AbstractSystem
+from sim2gp.types import in_float64
+
+NOISE_ROUNDS = 5  # EM; the last change of sig is below 1e-3 relative from here on
+FLOOR = 1e-3  # prior guess of the noise, relative to each channel's rms change
+
+
+class OneStepLikelihood(AbstractLikelihood):
+    """Transitions of a machine every ``dt`` s, as one window without nuisances."""
+
+    system: AbstractSystem
+    data: Transitions
+    counts: Float[Array, "1 d"]
+    floor: Float[Array, " d"]
+    dt: float = eqx.field(static=True)
+
+    @in_float64
+    def __init__(self, system: AbstractSystem, data: Transitions, dt: float) -> None:
+        self.system, self.dt = system, dt
+        self.data = jax.tree.map(jnp.asarray, data)
+        d = len(system.physical_states)
+        self.counts = jnp.full((1, d), jnp.sum(self.data.mask, dtype=float))
+        self.floor = FLOOR * _rms_change(self.data, d)
+
+    def rows(
+        self, tt: Float[Array, " p"], scale: Float[Array, "p p"]
+    ) -> tuple[Float[Array, "N d"], Float[Array, "N d p"]]:
+        """Residuals ``f - y`` and their Jacobian along each column of ``scale``.
+
+        Masked rows are zero.
+        """
+        system, d = self.system, len(self.system.physical_states)
+
+        def one(
+            s: Array, a: Array, s2: Array, valid: Array, which: Array | None
+        ) -> tuple[Array, Array]:
+            def f(x: Array) -> Array:
+                return system.transition(tt + scale @ x, s, a, self.dt, which)[:d]
+
+            nowhere = jnp.zeros(scale.shape[1])
+            value, J = linearized.value_and_jacobian(f, nowhere)
+            return jnp.where(valid, value - s2[:d], 0.0), jnp.where(valid, J, 0.0)
+
+        data = self.data
+        rows = data.state, data.action, data.next_state, data.mask, data.configuration
+        return jax.vmap(one)(*rows)
+
+    def blocks(
+        self,
+        tt: Float[Array, " p"],
+        e: Float[Array, "1 0"],
+        scale: Float[Array, "p p"],
+    ) -> Blocks:
+        del e
+        r, J = self.rows(tt, scale)
+        return jax.vmap(factor, in_axes=1)(J, r)[None]
+
+    def large_noise(self) -> Noise:
+        """The states' own change in a step: it traps no first MAP."""
+        d = self.floor.size
+        return Noise(_rms_change(self.data, d), jnp.ones(1))
+
+
+def _rms_change(data: Transitions, d: int) -> Float[Array, " d"]:
+    """Of each physical state in one step; 1 where nothing moves."""
+    N = jnp.sum(data.mask, dtype=float)
+    y = jnp.where(data.mask[:, None], data.delta()[:, :d], 0.0)
+    change = jnp.sqrt(jnp.sum(y**2, axis=0) / jnp.maximum(N, 1.0))
+    return jnp.where(change > 0.0, change, 1.0)

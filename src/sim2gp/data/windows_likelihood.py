@@ -1,0 +1,175 @@
+"""The likelihood of real logs: open-loop windows whose start states are unknown.
+
+A log is cut into windows that do not overlap. Within one, the machine is simulated from
+an unknown start state under the recorded inputs, and every measured sample is compared
+once with the simulation at its own time stamp:
+
+    y_j = x_out(t_j; theta, x0) + eps_j,    eps ~ N(0, diag(sig^2) / w)
+    x0  = m0 + S0 e,                        e ~ N(0, I)
+
+Velocities need not be measured, rates need not be known, rows may be missing. The start
+states are the nuisances that `sim2gp.inference.arrowhead` eliminates window by window,
+so memory and time are linear in the data. ``w`` is one Student-t weight per window (1
+if off). ``window = 0`` is the paper's one-step likelihood: two rows, and ``S0 = 0``.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sim2gp.compilation import ahead
+from sim2gp.data.windows import Windows
+from sim2gp.inference.arrowhead import Blocks, Noise, eliminate
+from sim2gp.inference.estimate import Estimate
+from sim2gp.inference.least_squares import factor
+from sim2gp.inference.likelihood import AbstractLikelihood
+from sim2gp.inference.linearized import jacobian_by_columns, value_and_jacobian
+from sim2gp.systems.base import AbstractSystem
+from sim2gp.systems.plants.external import on_host
+from sim2gp.systems.simulate import inputs_of, simulate
+from sim2gp.types import in_float64
+
+
+class WindowsLikelihood(AbstractLikelihood):
+    """Windows of a machine's logs: per-window functions, vmapped at the edge."""
+
+    system: AbstractSystem
+    windows: Windows
+    counts: Float[Array, "W c"]
+    floor: Float[Array, " c"]
+
+    @in_float64
+    def __init__(self, system: AbstractSystem, windows: Windows) -> None:
+        self.system, self.windows = system, jax.tree.map(jnp.asarray, windows)
+        mask = self.windows.mask.astype(self.windows.y.dtype)
+        self.counts, self.floor = jnp.sum(mask, axis=1), self.windows.floor
+
+    def simulated(
+        self, window: Windows, tt: Float[Array, " p"], e: Float[Array, " n"]
+    ) -> tuple[Float[Array, "L c"], Float[Array, "L n"], Float[Array, " m"]]:
+        """One window: ``prediction - y``, zero where masked; states; input delays."""
+        values = self.system.values(tt, window.configuration)
+        params = self.system.record(values)
+        x0 = window.start + window.start_sd * e
+        states = simulate(self.system, params, window, x0)
+        r = states[:, np.asarray(window.outputs)] - window.y
+        r = jnp.where(window.mask, r, 0.0)
+        return r, states, self.system.delays(params)
+
+    def blocks(
+        self,
+        tt: Float[Array, " p"],
+        e: Float[Array, "W n"],
+        scale: Float[Array, "p p"],
+    ) -> Blocks:
+        n, p = e.shape[1], scale.shape[1]
+
+        def one(window: Windows, e: Array) -> Array:
+            def residual(x: Array) -> Array:
+                return self.simulated(window, tt + scale @ x[n:], e + x[:n])[0]
+
+            r, J = value_and_jacobian(residual, jnp.zeros(n + p))
+            return jax.vmap(factor, in_axes=1)(J, r)
+
+        found: Array = self.windows.each(one, e)
+        return found
+
+    @eqx.filter_jit
+    def large_noise(self) -> Noise:
+        """The measurements' sd about each window's mean: it traps no first MAP."""
+        windows = self.windows
+        mask = windows.mask.astype(windows.y.dtype)
+        y = jnp.where(windows.mask, windows.y, 0.0)
+        mean = jnp.sum(y, axis=1) / jnp.maximum(jnp.sum(mask, axis=1), 1)
+        squares = jnp.sum(mask * (y - mean[:, None]) ** 2, axis=(0, 1))
+        mean_square = squares / jnp.maximum(jnp.sum(mask, axis=(0, 1)), 1)
+        return Noise(jnp.sqrt(mean_square) + self.floor, jnp.ones(len(windows)))
+
+
+def start_states(windows: Windows, fitted: Estimate) -> Float[np.ndarray, "W n"]:
+    """The smoothed start state of each window."""
+    e = np.asarray(fitted.nuisances)
+    return np.asarray(windows.start) + np.asarray(windows.start_sd) * e
+
+
+class Linearised(NamedTuple):
+    """Every row of every window at one vector of constants, windows from their starts.
+
+    ``jacobian`` is that of the residuals in the constants and in the window's own start
+    state, per prior sd of each. Masked entries of both are zero.
+    """
+
+    residual: Float[Array, "W L c"]
+    jacobian: Float[Array, "W L c pn"]
+    state: Float[Array, "W L n"]
+    input: Float[Array, "W L m"]
+
+
+@in_float64
+def linearise(
+    likelihood: WindowsLikelihood, fitted: Estimate, tt: Float[Array, " p"]
+) -> Linearised:
+    """The windows' simulation at virtual values ``tt``, and its derivatives."""
+    e, tt = jnp.asarray(fitted.nuisances), jnp.asarray(tt, float)
+    return _linearise(likelihood, e, tt, fitted.prior.scale)
+
+
+@in_float64
+def compile_linearise(system: AbstractSystem, windows: Windows) -> None:
+    """Start to compile `linearise` for windows like these and a fit to come."""
+    prior, likelihood = system.parameters.prior(), WindowsLikelihood(system, windows)
+    e = jnp.zeros(windows.start.shape)
+    _linearise.compile_for(likelihood, e, prior.mean, prior.scale)
+
+
+@ahead
+def _linearise(
+    likelihood: WindowsLikelihood,
+    e: Float[Array, "W n"],
+    tt: Float[Array, " p"],
+    scale: Float[Array, "p p"],
+) -> Linearised:
+    n, p = e.shape[1], scale.shape[1]
+
+    def rows(x: Array) -> tuple[Array, ...]:
+        def one(window: Windows, e: Array) -> tuple[Array, ...]:
+            at = tt + scale @ x[:p], e + x[p:]
+            r, states, delays = likelihood.simulated(window, *at)
+            return r, states, inputs_of(window, delays)
+
+        found: tuple[Array, ...] = likelihood.windows.each(one, e)
+        return found
+
+    J, (r, states, inputs) = jacobian_by_columns(
+        rows, jnp.zeros(p + n), at_once=on_host(likelihood.system)
+    )
+    return Linearised(r, J, states, inputs)
+
+
+def information_at(
+    likelihood: WindowsLikelihood, fitted: Estimate
+) -> Callable[[Float[Array, " p"]], Float[Array, "p p"]]:
+    """The factor of the data's Fisher, whitened by the prior, at any virtual vector.
+
+    The start states stay where their windows put them, the noise as it was learned.
+    """
+    n = fitted.nuisances.shape[1]
+
+    def information(tt: Float[Array, " p"]) -> Float[Array, "p p"]:
+        found = linearise(likelihood, fitted, tt)
+        return _information(found.jacobian, found.residual, fitted.noise, n)
+
+    return in_float64(information)
+
+
+@eqx.filter_jit
+def _information(J: Array, r: Array, noise: Noise, n: int) -> Float[Array, "p p"]:
+    """Start states eliminated."""
+    J = jnp.roll(J, n, axis=-1)  # the start's columns first
+    blocks = jax.vmap(jax.vmap(factor, in_axes=1))(J, r)
+    return eliminate(blocks, jnp.zeros((len(J), n)), noise).data[:-1, :-1]

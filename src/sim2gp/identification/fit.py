@@ -1,0 +1,69 @@
+"""The posterior of a machine's parameters, from windows of its logs."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sim2gp import checks
+from sim2gp.data.windows import Windows
+from sim2gp.data.windows_likelihood import WindowsLikelihood
+from sim2gp.inference.estimate import Estimate, drawn_starts, estimate
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.prior import ParameterPrior
+from sim2gp.systems.base import AbstractSystem
+from sim2gp.types import Key, in_float64
+
+NOISE_ROUNDS = 8  # fewer leave noise and starts of real logs short of a fixed point
+WARM_ROUNDS = 3  # of a fit that begins with the noise of another one
+FREEDOM = 4.0  # degrees of freedom of the Student-t weight
+
+
+@in_float64
+def fit_windows(
+    system: AbstractSystem,
+    windows: Windows,
+    *,
+    key: Key,
+    prior: Gaussian | None = None,
+    robust: bool = False,
+    starts: int = 2,
+    warm_start: Estimate | None = None,
+) -> Estimate:
+    """Posterior of the parameters given windows of logs.
+
+    Noise by EM, one Student-t weight per window where ``robust``. A ``prior`` is what
+    is believed but for measured sums. The descent begins at the prior's mean and
+    elsewhere, or at the ``warm_start``, another fit of windows like these: that is
+    quick, and with as many ``starts`` compiles nothing. Raises `NotConverged`,
+    `NotFinite` or `DeadParameters`, and `InputError` E148 for no starts, E140 for a
+    prior of another number of parameters.
+    """
+    checks.count("fit_windows", starts=starts)
+    prior = system.parameters.prior() if prior is None else prior
+    p = len(system.parameters)
+    checks.same_shape("fit_windows", (p,), prior=prior.mean)
+    likelihood = WindowsLikelihood(system, windows)
+    if warm_start is None:
+        first = drawn_starts(jnp.zeros((1, p)), starts, key)
+        e, noise = jnp.zeros(windows.start.shape), likelihood.large_noise()
+        rounds = NOISE_ROUNDS
+    else:
+        z = jnp.linalg.solve(prior.scale, warm_start.posterior.mean - prior.mean)
+        first = jnp.full((starts, p), jnp.nan).at[0].set(z)
+        e, noise, rounds = warm_start.nuisances, warm_start.noise, WARM_ROUNDS
+    begin = first, e, noise, rounds, FREEDOM if robust else np.inf
+    # By way of NumPy: JAX compiles again for numbers whose type it calls weak.
+    begin = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)), begin)
+    first, e, noise, needed, freedom = begin
+    found = estimate(
+        likelihood,
+        ParameterPrior(prior, system.parameters),
+        starts=first,
+        nuisances=e,
+        noise=noise,
+        rounds=NOISE_ROUNDS,
+        freedom=freedom,
+        needed=needed,
+    )
+    found.convergence.check(system.parameters.names, f"{len(windows)} windows")
+    return found

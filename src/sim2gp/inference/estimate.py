@@ -1,0 +1,303 @@
+"""The one fit: the MAP, the noise by EM, and Laplace's posterior about it.
+
+A likelihood (`AbstractLikelihood`) and a prior (`AbstractPrior`) are least squares in
+whitened parameters ``z`` and nuisances ``e``. `estimate` descends to the MAP from
+several starts, learns the noise in turns with it, and returns the Gaussian about the
+MAP with the log evidence:
+
+    sig_c^2 = (2 floor_c^2 + sum_w w_w E||r_wc||^2 / mean(w)) / (2 + count_c)
+    w_w     = (1 + count_w / freedom) / (1 + ||r_w||^2 / freedom)
+
+The prior on the noise counts as two samples at the floor. Weights are Student-t's; an
+infinite number of degrees of ``freedom`` makes them 1. Their mean, over windows with
+data, is 1 where the update rests. Without it (EM proper) weights take back what the
+noise gains, and hundreds of rounds are needed where a window has many samples:
+parameter expansion, Liu, Rubin and Wu 1998, Biometrika 85.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from sim2gp.errors import DeadParameters, NotConverged, NotFinite
+from sim2gp.inference.arrowhead import Elimination, Noise, eliminate
+from sim2gp.inference.gaussian import LOG_2PI, Gaussian
+from sim2gp.inference.least_squares import (
+    Factor,
+    gauss_newton_step,
+    log_joint,
+    posterior,
+    stack,
+)
+from sim2gp.inference.levenberg_marquardt import (
+    GRADIENT_TOLERANCE,
+    JOINT_TOLERANCE,
+    Point,
+    evaluate,
+    multi_start,
+)
+from sim2gp.inference.likelihood import AbstractLikelihood
+from sim2gp.inference.linalg import solve_triangular
+from sim2gp.inference.parameters import Parameters
+from sim2gp.inference.prior import AbstractPrior, ParameterPrior
+from sim2gp.types import Key, Scalar, in_float64
+
+CONVERGED, STALLED, NOT_FINITE, DEAD = 0, 1, 2, 3
+SPREAD = 0.7  # prior sd, of starts that are drawn
+
+
+class Laplace(eqx.Module):
+    """The Gaussian about a point, in whitened coordinates, from its factors."""
+
+    at: Point
+    arrow: Elimination
+    full: Factor  # of data and prior
+
+    @property
+    def R(self) -> Float[Array, "p p"]:
+        """Factor of the posterior precision: ``R^T R = Sigma_z^-1``."""
+        return self.full[:-1, :-1]
+
+    def scale(self) -> Float[Array, "p p"]:
+        """Square root of ``Sigma_z``: ``R^-1``."""
+        return solve_triangular(self.R, jnp.eye(len(self.R), dtype=self.R.dtype))
+
+    def log_joint(self) -> Scalar:
+        """``-L - 1/2 logdet(S0 Sq^-1)``, nats, over ``z`` and the nuisances.
+
+        The Laplace evidence, but for the normalisation of the noise.
+        """
+        pivots = jnp.diagonal(self.arrow.R11, axis1=1, axis2=2)
+        return log_joint(self.full) - jnp.sum(jnp.log(pivots))
+
+    def squares(self) -> tuple[Float[Array, "W c"], Float[Array, "W c"]]:
+        """Squared residuals, and squares that the posterior's own spread adds."""
+        n = self.at.e.shape[1]
+        own, rest = self.at.blocks[..., :n], self.at.blocks[..., n:]
+        # Rows of (z, r) with the nuisances at their best.
+        reduced = rest - own @ self.arrow.slope[:, None]
+        eye = jnp.eye(n)
+        root = jax.vmap(lambda R11: solve_triangular(R11, eye))(self.arrow.R11)
+        spread = jnp.sum((reduced[..., :-1] @ self.scale()) ** 2, axis=(2, 3))
+        spread = spread + jnp.sum((own @ root[:, None]) ** 2, axis=(2, 3))
+        return jnp.sum(reduced[..., -1] ** 2, axis=2), spread
+
+    def newton_step_sd(self) -> Scalar:
+        """The largest entry of the undamped step, each in its own posterior sd."""
+        dz = gauss_newton_step(self.full)  # R dz = -c
+        de = self.arrow.slope[..., -1] + self.arrow.slope[..., :-1] @ dz
+        own = jnp.einsum("wij,wj->wi", self.arrow.R11, de)
+        entries = self.full[:-1, -1], own
+        largest = (jnp.max(jnp.abs(x), initial=0.0) for x in entries)
+        return jnp.maximum(*largest)
+
+    def convergence(self, steps: Int[Array, ""]) -> "Convergence":
+        """Whether a descent of so many steps has ended at a MAP."""
+        gradient, step_sd = self.at.gradient, self.newton_step_sd()
+        there = (gradient <= GRADIENT_TOLERANCE) | (step_sd <= GRADIENT_TOLERANCE)
+        flat, short = JOINT_TOLERANCE
+        there |= (gradient <= flat) & (step_sd <= short)
+        status = jnp.where(there, CONVERGED, STALLED)
+        data = self.arrow.data
+        dead = jnp.all(data[:, :-1] == 0.0) & jnp.any(data[:, -1] != 0.0)
+        status = jnp.where(dead, DEAD, status)
+        finite = jnp.isfinite(self.at.cost) & jnp.all(jnp.isfinite(self.full))
+        status = jnp.where(finite, status, NOT_FINITE)
+        return Convergence(status, gradient, step_sd, steps)
+
+
+def laplace(at: Point, noise: Noise) -> Laplace:
+    """The Gaussian about a point, given the noise."""
+    arrow = eliminate(at.blocks, at.e, noise)
+    return Laplace(at, arrow, stack(arrow.data, at.prior))
+
+
+class Convergence(eqx.Module):
+    """How a descent ended; ``newton_step_sd`` is the undamped step that remains."""
+
+    status: Int[Array, ""]
+    gradient: Scalar  # ``||g||_inf / (1 + cost)``
+    newton_step_sd: Scalar  # its largest entry, in posterior sd
+    steps: Int[Array, ""]
+
+    def check(self, names: tuple[str, ...], where: str) -> None:
+        """Raise a typed error on the host, naming what to look at."""
+        status = int(self.status)
+        if status == NOT_FINITE:
+            raise NotFinite(
+                "E203",
+                "the simulation is not finite at any start of the fit",
+                where=where,
+                fix="narrow the priors, or shorten the step",
+            )
+        if status == DEAD:
+            raise DeadParameters(
+                "E146",
+                "no parameter reaches the data",
+                where=where,
+                got=f"zero sensitivity to {', '.join(names)}",
+                expected="data that depend on one of them at least",
+                fix="check the columns, the excitation and what is fixed",
+            )
+        if status == STALLED:
+            step = f"{float(self.newton_step_sd):.1e} posterior sd"
+            raise NotConverged(
+                "E201",
+                "the MAP did not converge",
+                where=where,
+                got=f"scaled gradient {float(self.gradient):.1e} "
+                f"({step}) after {int(self.steps)} steps",
+                expected=f"at most {GRADIENT_TOLERANCE:.0e}",
+                fix="check units and bounds, or add starts",
+            )
+
+
+class Estimate(eqx.Module):
+    """A Gaussian over virtual parameters, and the noise, from data and a prior.
+
+    noise: each channel's sd in its unit, and each window's weight.
+    nuisances: each window's own unknowns at the MAP, whitened by their prior.
+    information: factor of the data's Fisher information, whitened by the prior.
+    scores: what each window's data add to the gradient at the MAP, whitened by the
+        prior; they sum to minus the prior's part.
+    log_evidence: Laplace's, nats.
+    """
+
+    prior: Gaussian
+    posterior: Gaussian
+    noise: Noise
+    nuisances: Float[Array, "W n"]
+    information: Float[Array, "p p"]
+    scores: Float[Array, "W p"]
+    log_evidence: Scalar
+    convergence: Convergence
+
+    def z(self) -> Float[Array, " p"]:
+        """The MAP, whitened by the prior; call it under `in_float64`."""
+        away = self.posterior.mean - self.prior.mean
+        return jnp.linalg.solve(self.prior.scale, away)
+
+    @in_float64
+    def with_measurements(self, table: Parameters) -> "Estimate":
+        """The same, with the measured sums of the table counted as prior."""
+        if not table.measurements:
+            return self
+        prior = ParameterPrior(self.prior, table).linearised(self.posterior.mean)
+        change = jnp.linalg.solve(self.prior.scale, prior.scale)
+        return dataclasses.replace(
+            self,
+            prior=prior,
+            information=self.information @ change,
+            scores=self.scores @ change,
+        )
+
+
+def drawn_starts(
+    first: Float[Array, "k p"], count: int, key: Key
+) -> Float[Array, "count p"]:
+    """Whitened starts: these first, the others drawn about the prior's mean."""
+    k, p = first.shape
+    return jnp.concatenate([first, SPREAD * jax.random.normal(key, (count - k, p))])
+
+
+@eqx.filter_jit
+def estimate(
+    likelihood: AbstractLikelihood,
+    prior: AbstractPrior,
+    *,
+    starts: Float[Array, "starts p"],
+    nuisances: Float[Array, "W n"],
+    noise: Noise,
+    rounds: int,
+    freedom: float | Scalar = jnp.inf,
+    needed: Int[Array, ""] | None = None,
+) -> Estimate:
+    """Descend from each of the whitened ``starts``, then ``rounds`` of EM.
+
+    ``noise`` is where EM begins: a large one traps no first MAP. Rounds beyond those
+    ``needed``, and starts that are no number, are compiled and not taken. What did not
+    converge is reported by `Convergence.check`.
+    """
+    counts, floor = likelihood.counts, likelihood.floor
+
+    def update(at: Point, noise: Noise) -> Noise:
+        squares, spread = laplace(at, noise).squares()
+        return expected_noise(noise, squares, spread, counts, floor, freedom)
+
+    at, noise, steps, _ = multi_start(
+        likelihood,
+        prior,
+        starts,
+        nuisances,
+        noise,
+        update,
+        rounds=rounds,
+        needed=needed,
+    )
+    found = laplace(at, noise)
+    return Estimate(
+        prior.gaussian,
+        posterior(found.full, at.z, prior.gaussian),
+        noise,
+        at.e,
+        found.arrow.data[:-1, :-1],
+        at.scores,
+        found.log_joint() + log_normaliser(noise, counts),
+        found.convergence(steps),
+    )
+
+
+@eqx.filter_jit
+def estimate_noise(likelihood: AbstractLikelihood, prior: AbstractPrior) -> Estimate:
+    """The noise alone, of data without nuisances; the prior is the posterior.
+
+    One step of EM is exact where the parameters' posterior is given. The log evidence
+    is that of the data at the parameters' mean.
+    """
+    W, c = likelihood.counts.shape
+    p = prior.gaussian.mean.size
+    unit = Noise(jnp.ones(c), jnp.ones(W))
+    at = evaluate(likelihood, prior, jnp.zeros(p), jnp.zeros((W, 0)), unit)
+    found = Laplace(at, eliminate(at.blocks, at.e, unit), jnp.eye(p + 1))
+    squares, spread = found.squares()
+    counts, floor = likelihood.counts, likelihood.floor
+    noise = expected_noise(unit, squares, spread, counts, floor)
+    misfit, zero = jnp.sum(squares / noise.sd[None] ** 2), jnp.zeros(())
+    return Estimate(
+        prior.gaussian,
+        prior.gaussian,
+        noise,
+        at.e,
+        jnp.zeros((p, p)),
+        jnp.zeros((W, p)),
+        -0.5 * misfit + log_normaliser(noise, counts),
+        Convergence(jnp.asarray(CONVERGED), zero, zero, jnp.zeros((), int)),
+    )
+
+
+def expected_noise(
+    noise: Noise,
+    squares: Float[Array, "W c"],
+    spread: Float[Array, "W c"],
+    counts: Float[Array, "W c"],
+    floor: Float[Array, " c"],
+    freedom: float | Scalar = jnp.inf,
+) -> Noise:
+    """EM's update of noise and weights, from squares expected under the posterior."""
+    seen = jnp.sum(counts, axis=1) > 0
+    mean = jnp.mean(noise.weights, where=seen)
+    expected = noise.weights @ (squares + spread) / jnp.where(mean > 0, mean, 1.0)
+    sd = jnp.sqrt((2.0 * floor**2 + expected) / (2.0 + jnp.sum(counts, axis=0)))
+    misfit = jnp.sum(squares / sd[None] ** 2, axis=1)
+    weights = (1.0 + jnp.sum(counts, axis=1) / freedom) / (1.0 + misfit / freedom)
+    return Noise(sd, weights)
+
+
+def log_normaliser(noise: Noise, counts: Float[Array, "W c"]) -> Scalar:
+    """``-sum_wc count_wc [log sig_c + 1/2 log(2 pi) - 1/2 log w_w]``, nats."""
+    N = jnp.sum(counts, axis=0)
+    of_noise = jnp.sum(N * (jnp.log(noise.sd) + 0.5 * LOG_2PI))
+    return 0.5 * jnp.sum(jnp.sum(counts, axis=1) * jnp.log(noise.weights)) - of_noise

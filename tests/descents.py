@@ -1,0 +1,122 @@
+"""Descents as tests ask for them, and estimates that they put together themselves."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from sim2gp.inference.arrowhead import Blocks, Noise
+from sim2gp.inference.estimate import (
+    CONVERGED,
+    Convergence,
+    Estimate,
+    Laplace,
+    laplace,
+)
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.least_squares import factor, prior_rows
+from sim2gp.inference.levenberg_marquardt import multi_start
+from sim2gp.inference.likelihood import AbstractLikelihood
+from sim2gp.inference.prior import AbstractPrior
+
+
+class Standard(AbstractPrior):
+    """A standard normal prior of parameters without bounds."""
+
+    gaussian: Gaussian
+
+    def rows(self, z: Float[Array, " p"]) -> Float[Array, "q p1"]:
+        return prior_rows(z)
+
+    def curvature(
+        self, z: Float[Array, " p"], gradient: Float[Array, " p"]
+    ) -> Float[Array, "p p"]:
+        return jnp.zeros((z.size, z.size))
+
+
+def standard(p: int) -> Standard:
+    return Standard(Gaussian(jnp.zeros(p), jnp.eye(p)))
+
+
+class Whitened(AbstractLikelihood):
+    """Residuals of unit noise without nuisances: one window, one channel."""
+
+    counts: Float[Array, "1 1"]
+    floor: Float[Array, " 1"]
+    residual: Callable = eqx.field(static=True)
+
+    def blocks(
+        self, tt: Float[Array, " p"], e: Float[Array, "1 0"], scale: Float[Array, "p p"]
+    ) -> Blocks:
+        J, r = jax.jacfwd(self.residual)(tt), self.residual(tt)
+        return factor(J @ scale, r)[None, None]
+
+
+def whitened(residual: Callable) -> Whitened:
+    return Whitened(jnp.ones((1, 1)), jnp.zeros(1), residual)
+
+
+class Found(eqx.Module):
+    """Where a descent ended."""
+
+    about: Laplace
+    noise: Noise
+    costs: Float[Array, " starts"]
+    ended: Convergence
+
+    @property
+    def z(self) -> Array:
+        return self.about.at.z
+
+    @property
+    def e(self) -> Array:
+        return self.about.at.e
+
+    @property
+    def cost(self) -> Array:
+        return self.about.at.cost
+
+
+def descend(likelihood, starts, e, noise, update, prior=None, **options) -> Found:
+    """The best of several descents, and the noise by ``update``."""
+    prior = standard(starts.shape[1]) if prior is None else prior
+    at, noise, steps, costs = multi_start(
+        likelihood, prior, starts, e, noise, update, **options
+    )
+    about = laplace(at, noise)
+    return Found(about, noise, costs, about.convergence(steps))
+
+
+def minimise(
+    likelihood: AbstractLikelihood,
+    start: Float[Array, " p"],
+    e: Float[Array, "W n"],
+    noise: Noise,
+    prior: AbstractPrior | None = None,
+) -> Found:
+    """One descent."""
+    one = start[None]
+    return descend(likelihood, one, e, noise, lambda _, x: x, prior, rounds=0)
+
+
+def estimate_of(
+    prior: Gaussian,
+    posterior: Gaussian,
+    noise: Noise,
+    nuisances: Float[Array, "W n"],
+    log_evidence: float = 0.0,
+) -> Estimate:
+    """What a fit would have found, without data."""
+    p, zero = prior.mean.size, jnp.zeros(())
+    return Estimate(
+        prior,
+        posterior,
+        noise,
+        nuisances,
+        jnp.zeros((p, p)),
+        jnp.zeros((len(nuisances), p)),
+        zero + log_evidence,
+        Convergence(jnp.asarray(CONVERGED), zero, zero, jnp.zeros((), int)),
+    )
