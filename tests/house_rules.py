@@ -27,7 +27,6 @@ SIBLINGS: frozenset[tuple[str, str]] = frozenset(
         ("compilation", "types"),
         ("belief", "data"),
         ("identification", "models"),
-        ("planning", "models"),
     }
 )
 #: Never loaded by importing sim2gp, so never imported at the top of a module.
