@@ -150,7 +150,7 @@ def theirs(task: Task, oracle: float, seed: int, most: float) -> Any:
 
 def speed_ours(world: World, width: int) -> float:
     """Steps with as many updates, per second, compiled before."""
-    sac = SAC(hidden=(width, width), worlds=64, updates=64, steps=40)
+    sac = SAC(hidden=(width, width), num_envs=64, updates=64, steps=40)
     key = jax.random.key(0)
     n, m = world.reset(key).size, world.actions.low.size
     nothing = Transitions.empty(1, n, m)
@@ -161,7 +161,7 @@ def speed_ours(world: World, width: int) -> float:
         learner = sac.prepare(learner, world, nothing, key=jax.random.fold_in(key, i))
         jax.block_until_ready(learner.updates)
         seconds.append(time.perf_counter() - started)
-    return sac.worlds * sac.steps / min(seconds[1:])
+    return sac.num_envs * sac.steps / min(seconds[1:])
 
 
 def speed_theirs(world: World, width: int, worlds: int) -> float:

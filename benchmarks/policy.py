@@ -24,7 +24,7 @@ WIDTHS = (64, 128)
 
 def exported(width: int) -> NumpyPolicy:
     """As it begins: what a step costs does not depend on what was learned."""
-    sac = SAC(hidden=(width, width), capacity=1, worlds=1, steps=1)
+    sac = SAC(hidden=(width, width), capacity=1, num_envs=1, steps=1)
     learner = sac.init(oracle_world(furuta_swingup()), key=jax.random.key(0))
     with tempfile.TemporaryDirectory() as folder:
         export_policy(learner.policy, Path(folder) / "policy", Furuta())

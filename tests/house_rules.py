@@ -26,7 +26,6 @@ SIBLINGS: frozenset[tuple[str, str]] = frozenset(
         ("types", "checks"),
         ("compilation", "types"),
         ("belief", "data"),
-        ("planning", "models"),
     }
 )
 #: Never loaded by importing sim2gp, so never imported at the top of a module.

@@ -152,7 +152,7 @@ NETWORKS = (
     ),
     Mutant(
         "start: the factor is not made triangular",
-        "models/function_space.py",
+        "models/function_space_training.py",
         "kept = jax.vmap(lower_factor)(head.layer.scale) *",
         "kept = head.layer.scale *",
         ("test_function_space.py", "update_conditions"),
@@ -181,7 +181,7 @@ NETWORKS = (
     Mutant(
         "loops: draws from all that is believed",
         "planning/loop.py",
-        "belief.learnable().sample(",
+        "belief.untempered().sample(",
         "belief.sample(",
         ("test_loops.py", "can_settle"),
     ),
@@ -201,8 +201,8 @@ NETWORKS = (
     ),
     Mutant(
         "RES-FS: one row makes tempered constants sure",
-        "models/residual_function_space.py",
-        "jnp.where(fitted, 0.0, before.scale)",
+        "models/hybrid.py",
+        "jnp.where(fixed, 0.0, before.scale)",
         "before.scale",
         ("test_function_space.py", "layer_alone"),
     ),

@@ -42,7 +42,7 @@ OFF_POLICY = (
     Mutant(
         "sac: the slow critics never follow",
         SAC,
-        "old + sac.slow * (new - old)",
+        "old + sac.tau * (new - old)",
         "old",
         ("test_sac.py", "discounted or no_end"),
     ),

@@ -111,7 +111,7 @@ def test_it_acts_on_what_each_would(runs):
     wide = eqx.tree_at(
         lambda b: b.beliefs[1].physics.scale, doubtful, replace_fn=lambda x: 9.0 * x
     )
-    found = wide.learnable()
+    found = wide.untempered()
     np.testing.assert_array_equal(
         found.beliefs[0].posterior.scale, wide.beliefs[0].posterior.scale
     )

@@ -113,7 +113,7 @@ def test_a_policy_that_is_trained_has_cells_of_its_own():
     ],
 )
 def test_policies_are_trained_where_no_episode_changes_anything(method, monkeypatch):
-    small = SAC(hidden=(8,), worlds=4, steps=5, updates=1)
+    small = SAC(hidden=(8,), num_envs=4, steps=5, updates=1)
     monkeypatch.setitem(swingup.PLANNERS, "sac", small)
     cell = Cell("cartpole", "mismatch", method, 0, 2, planning="sac")
     flown = swingup.learner_cell(cell, 0)

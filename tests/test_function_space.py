@@ -13,7 +13,8 @@ from sim2gp.errors import InputError, NotFinite
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.models import FunctionSpace, ResidualFunctionSpace, Sim2GP, features
 from sim2gp.models import function_space as module
-from sim2gp.models import function_space_loss as matching
+from sim2gp.models import function_space_loss as loss_module
+from sim2gp.models import function_space_training as training
 from sim2gp.models.function_space_loss import OBJECTIVES, Objective
 
 P, D, M = 3, 2, 5
@@ -32,7 +33,7 @@ def a_q(seed=0, m=M, outputs=D, dtype=jnp.float64):
     factor = np.tril(rng.standard_normal((outputs, m, m)))
     mean, noise = rng.standard_normal((outputs, m)), rng.uniform(-2, 0, outputs)
     arrays = (jnp.asarray(x, dtype) for x in (mean, factor, noise))
-    return matching.Variational(network, *arrays)
+    return loss_module.Variational(network, *arrays)
 
 
 def joint(q, X, noise):
@@ -59,7 +60,7 @@ def a_target(b, seed=1, groups=2):
         rng.standard_normal((groups * b, D, P)),
     )
     noise = np.array([0.3, 0.7])
-    target = matching.targets(*(jnp.asarray(x) for x in (X, mean, A, noise)), b)
+    target = loss_module.targets(*(jnp.asarray(x) for x in (X, mean, A, noise)), b)
     dense = []
     for g in range(groups):
         rows = slice(g * b, (g + 1) * b)
@@ -86,7 +87,7 @@ def test_divergence_is_that_of_dense_gaussians(b):
             mean=target.mean.astype(float),
             whiten=target.whiten.astype(float),
         )
-        got = float(matching.divergence(q, noise, exact, jnp.asarray(g)))
+        got = float(loss_module.divergence(q, noise, exact, jnp.asarray(g)))
         assert got == pytest.approx(expected, rel=1e-5)
         assert got > 0.0
 
@@ -98,7 +99,7 @@ def test_divergence_vanishes_at_equality_and_only_there():
     noise = jnp.asarray([0.2, 0.5])
     p = joint(q, X, noise)
     inverse = jax.scipy.linalg.solve_triangular(p.scale, jnp.eye(8), lower=True)
-    target = matching.Targets(
+    target = loss_module.Targets(
         X[None],
         p.mean.reshape(1, 4, D),
         inverse.reshape(1, 8, 4, D),
@@ -106,7 +107,7 @@ def test_divergence_vanishes_at_equality_and_only_there():
     )
 
     def kl(q, noise):
-        return matching.divergence(q, noise, target, jnp.asarray(0))
+        return loss_module.divergence(q, noise, target, jnp.asarray(0))
 
     assert abs(float(kl(q, noise))) <= 1e-12 * 8
     slope = jax.grad(kl)(q, noise)
@@ -132,11 +133,11 @@ def test_gradients_against_differences(objective):
     valid = jnp.arange(6) < 5
 
     def loss(q):
-        kl = matching.mean_divergence(q, target, objective, KEY)
-        return 0.1 * kl - matching.expected_log_likelihood(q, X, Y, valid)
+        kl = loss_module.mean_divergence(q, target, objective, KEY)
+        return 0.1 * kl - loss_module.expected_log_likelihood(q, X, Y, valid)
 
     def alone(q):
-        return matching.mean_divergence(q, target, objective, KEY)
+        return loss_module.mean_divergence(q, target, objective, KEY)
 
     slope = jax.grad(alone)(q).log_noise
     assert bool(jnp.all(slope == 0.0)) is not objective.own_noise
@@ -171,7 +172,7 @@ def test_expected_log_likelihood():
             mean, V = Phi[n] @ np.asarray(q.mean[k]), np.sum((L.T @ Phi[n]) ** 2)
             total -= 0.5 * np.log(2 * np.pi * sd[k] ** 2)
             total -= 0.5 * ((Y[n, k] - mean) ** 2 + V) / sd[k] ** 2
-    got = matching.expected_log_likelihood(
+    got = loss_module.expected_log_likelihood(
         q, jnp.asarray(X), jnp.asarray(Y), jnp.arange(4) < 3
     )
     assert float(got) == pytest.approx(total / 3, rel=1e-10)
@@ -181,7 +182,7 @@ def test_inputs_fill_the_box_and_surround_the_data():
     encoding = features.Encoding.of(linear(1, 1), {"x0": 2.0, "a0": 3.0})
     rows = transitions(np.full((4, 1, 1), 1.5), np.zeros((4, 1)))
     data = jax.tree.map(jnp.asarray, rows)
-    S, A = matching.inputs(KEY, encoding, data, 6000)
+    S, A = loss_module.inputs(KEY, encoding, data, 6000)
     near = np.abs(np.asarray(A[:, 0]) - 1.5) < 0.9  # three sd of the jitter
     expected = 1 / 3 + 2 / 3 * 1.8 / 6.0
     assert np.mean(near) == pytest.approx(expected, abs=0.03)
@@ -189,7 +190,7 @@ def test_inputs_fill_the_box_and_surround_the_data():
     assert np.max(np.abs(A)) <= 3.0
     assert np.min(A) < -2.9
     none = dataclasses.replace(data, mask=jnp.zeros(4, bool))
-    _, A = matching.inputs(KEY, encoding, none, 6000)
+    _, A = loss_module.inputs(KEY, encoding, none, 6000)
     assert np.mean(np.asarray(A)) == pytest.approx(0.0, abs=0.1)
 
 
@@ -322,7 +323,7 @@ def test_an_update_conditions_the_layer_alone(fitted):
         got.covariance(), left + B @ apart @ B.T, rtol=1e-7, atol=1e-12
     )
     # A later fit starts from that posterior in its own coordinates.
-    q = module.start(later, later.sim, later.head.output_scale, 0.3)
+    q = training.starting_point(later, later.sim, later.head.output_scale, 0.3)
     L, S = np.asarray(q.factor, float), np.asarray(later.head.layer.scale)
     np.testing.assert_allclose(
         L @ L.swapaxes(1, 2), S @ S.swapaxes(1, 2), rtol=1e-4, atol=1e-6
@@ -344,7 +345,7 @@ def test_growing_data_retrace_nothing(fitted):
     """Refits share the first fit's trace; the scale of a network's outputs stays."""
     recipe, _, belief = fitted
     traces = []
-    inner = matching.train
+    inner = training.train
 
     def counted(*args):
         traces.append(1)
@@ -353,7 +354,7 @@ def test_growing_data_retrace_nothing(fitted):
     J, y = make(100)
     scales = [np.asarray(belief.head.output_scale)]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(matching, "train", counted)
+        patch.setattr(training, "train", counted)
         for count in (20, 50):
             data = padded(J[:count], y[:count])
             belief = recipe.fit(belief, data, key=jax.random.key(count))

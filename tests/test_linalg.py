@@ -26,6 +26,7 @@ from sim2gp.models import (
     residual_function_space,
     sim2gp,
 )
+from sim2gp.models.function_space_training import Schedule
 from sim2gp.systems import Furuta
 
 pytestmark = pytest.mark.usefixtures("float64")
@@ -101,7 +102,7 @@ def program(name):
     """The compiled function of a model's fit, and arguments of the usual size."""
     data = jax.tree.map(jnp.asarray, Transitions.empty(2500, 4, 1))
     sim = Sim2GP(Furuta())
-    steps, budget = jnp.asarray(100), function_space.budget_of(100, 100, 1e-3)
+    steps, schedule = jnp.asarray(100), Schedule.of(100, 100, 1e-3, 0.1)
     if name == "SIM2GP":
         return sim2gp._fit, (sim, data, jnp.zeros((4, sim.prior.mean.size)))
     if name == "NLM":
@@ -118,7 +119,7 @@ def program(name):
     model = kind(sim)
     several = (physics,) * (2 if kind is FunctionSpace else 1)
     return room._fit, (
-        model.init(KEY), *several, data, KEY, budget, model.objective
+        model.init(KEY), *several, data, KEY, schedule, model.objective
     )  # fmt: skip
 
 

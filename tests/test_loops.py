@@ -61,7 +61,7 @@ def test_posterior_sampling_learns_the_gain_and_reaches_the_oracle() -> None:
 class Doubtful(GainBelief):
     """Doubts its simulator: what it believes is wider than what it acts on."""
 
-    def learnable(self) -> GainBelief:
+    def untempered(self) -> GainBelief:
         return GainBelief(self.mean, self.sd)
 
     def sample(self, key: Key) -> Any:

@@ -51,7 +51,7 @@ def test_a_policy_sees_the_machine_and_not_its_constants() -> None:
     x = here.reset(KEY)
     other = x.at[4:].add(1.0)
     np.testing.assert_array_equal(here.observe(x), here.observe(other))
-    planner = SAC(hidden=(8,), worlds=4, steps=3, updates=1)
+    planner = SAC(hidden=(8,), num_envs=4, steps=3, updates=1)
     learner = planner.init(here, key=KEY)
     policy = learner.policy
     np.testing.assert_array_equal(policy(x), policy(x[:4]))

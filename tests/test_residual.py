@@ -94,9 +94,12 @@ def test_a_belief_keeps_its_shape(fits, mode):
     for old, new in zip(jax.tree.leaves(before), jax.tree.leaves(belief), strict=True):
         assert old.aval.strip_weak_type() == new.aval.strip_weak_type()
         assert old.weak_type == new.weak_type
-    assert jax.tree.structure(before.sample(KEY)) == jax.tree.structure(belief.point())
-    leaves = jax.tree.leaves(belief.sample(KEY))
-    assert {x.dtype for x in leaves} == {jnp.dtype("float32")}
+    for one, two in (
+        (before.sample(KEY), belief.sample(KEY)),
+        (before.point(), belief.point()),
+    ):
+        assert jax.tree.structure(one) == jax.tree.structure(two)
+        assert {x.dtype for x in jax.tree.leaves(two)} == {jnp.dtype("float32")}
 
 
 @pytest.mark.parametrize("mode", module.MODES)

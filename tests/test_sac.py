@@ -20,7 +20,7 @@ from sim2gp.types import Box
 
 KEY = jax.random.key(0)
 SMALL = SAC(
-    hidden=(32,), worlds=16, steps=60, updates=20, batch=64, rate=3e-3, slow=0.02
+    hidden=(32,), num_envs=16, steps=60, updates=20, batch=64, rate=3e-3, tau=0.02
 )
 NOTHING = Transitions.empty(1, 1, 1)
 

@@ -181,7 +181,7 @@ IMPOSSIBLE = {
     "no lengths": (lambda: sg.MPC(lengths=()), "E148"),
     "every": (lambda: sg.MPC(every=0), "E148"),
     "sac's discount": (lambda: sg.SAC(discount=1.1), "E148"),
-    "sac's worlds": (lambda: sg.SAC(worlds=0), "E148"),
+    "sac's episodes": (lambda: sg.SAC(num_envs=0), "E148"),
     "sac's rate": (lambda: sg.SAC(rate=-1e-3), "E148"),
     "sac's width": (lambda: sg.SAC(hidden=(64, 0)), "E148"),
     "sac's share": (lambda: sg.SAC(replayed=-0.1), "E148"),
@@ -200,7 +200,6 @@ IMPOSSIBLE = {
     ),
     # Models, windows, designs
     "model's period": (lambda: sim(dt=0.0), "E148"),
-    "model's draws": (lambda: sim(draws="straight"), "E145"),
     "model's prior": (lambda: sim(prior=Gaussian(jnp.zeros(3), jnp.eye(3))), "E140"),
     "no layer": (lambda: sg.NLM(linear(2, 2), hidden=()), "E148"),
     "no width": (lambda: sg.NLM(linear(2, 2), hidden=(8, 0)), "E148"),

@@ -16,8 +16,9 @@ from sim2gp.inference.estimate import CONVERGED
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.least_squares import RANK_TOLERANCE
 from sim2gp.inference.prior import ParameterPrior
-from sim2gp.models import Sim2GP
+from sim2gp.models import Sim2GP, draws
 from sim2gp.systems import CartPole, Furuta, UniformRodArm
+from sim2gp.systems.base import Bound
 
 KEY = jax.random.key(0)
 DT = 0.02
@@ -60,7 +61,7 @@ def test_a_linearised_draw_is_its_formula():
     system = Furuta()
     rng = np.random.default_rng(0)
     tt, delta = (jnp.asarray(rng.standard_normal(8)) for _ in range(2))
-    draw = linearized.LinearizedDraw(system, tt, delta, DT)
+    draw = draws.LinearizedDraw(system, tt, delta, DT)
     s, a = inputs(system, 20, 1)
 
     def expected(s, a):
@@ -71,9 +72,18 @@ def test_a_linearised_draw_is_its_formula():
 
     got = jax.jit(jax.vmap(draw))(s, a)
     np.testing.assert_allclose(got, jax.jit(jax.vmap(expected))(s, a), atol=1e-8)
-    nonlinear = jax.jit(jax.vmap(linearized.NonlinearDraw(system, tt + delta, DT)))
-    there = stepper(system)(tt + delta, s, a)
-    np.testing.assert_allclose(nonlinear(s, a), there, atol=1e-12)
+
+
+def test_the_point_is_the_simulator_at_the_map():
+    """In single precision, without a tangent."""
+    system = Furuta()
+    belief = Sim2GP(system).init(KEY)
+    s, a = inputs(system, 20, 1)
+    expected = stepper(system)(belief.posterior.mean, s, a)
+    point, s, a = belief.point(), s.astype("f4"), a.astype("f4")
+    np.testing.assert_allclose(jax.vmap(point)(s, a), expected, rtol=1e-5, atol=1e-6)
+    assert "jvp" not in str(jax.make_jaxpr(point)(s[0], a[0]))
+    assert isinstance(point, Bound)
 
 
 @pytest.mark.nightly

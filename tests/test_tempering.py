@@ -202,7 +202,7 @@ def test_the_residual_model_is_as_wide_as_its_data_disagree(bent):
 def test_what_no_data_settle_is_not_acted_upon(bent):
     """Draws to act on: constants as wide as the rows say, the layer as it is."""
     belief, alone, (wide, _) = bent
-    to_act, plain = belief.learnable(), alone.posterior
+    to_act, plain = belief.untempered(), alone.posterior
     np.testing.assert_allclose(
         to_act.physics.covariance(), plain.covariance(), rtol=1e-6
     )
@@ -218,5 +218,5 @@ def test_what_no_data_settle_is_not_acted_upon(bent):
     # Nothing was tempered: itself.
     certain = eqx.tree_at(lambda b: b.kappa, belief, jnp.ones(()))
     np.testing.assert_array_equal(
-        certain.learnable().physics.scale, belief.physics.scale
+        certain.untempered().physics.scale, belief.physics.scale
     )

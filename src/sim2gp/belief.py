@@ -47,9 +47,9 @@ class AbstractBelief(eqx.Module):
 
     @abstractmethod
     def point(self) -> Dynamics:
-        """The best single function, of the same type as a draw."""
+        """The best single function: plain physics where there is any; float32."""
 
-    def learnable(self) -> "AbstractBelief":
+    def untempered(self) -> "AbstractBelief":
         """What posterior sampling draws from: only as wide as more data would settle.
 
         The belief itself, unless it is wider because its simulator is wrong: acting to

@@ -16,6 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 from jaxtyping import Array, Float
 
 from sim2gp import checks
@@ -31,7 +32,7 @@ from sim2gp.design.goals import AbstractGoal
 from sim2gp.design.limits import Limits, excess
 from sim2gp.design.signals import AbstractSignal, Multisine
 from sim2gp.errors import InputError, NotFinite
-from sim2gp.models.training import Moments, adam, descend
+from sim2gp.models.training import ADAMW, descend
 from sim2gp.types import Key, in_float64, single
 
 GRID, SUBSTEP = 0.01, 0.0025  # s, the shortest period and substep that a search sees
@@ -227,13 +228,13 @@ def _climber(
     def beyond(C: Array) -> Array:
         return _checked(experiment, inner, signal.commands(C, limits), trials)[1]
 
-    def block(C: Array, state: Moments, guards: Array, i: int) -> Any:
+    def block(C: Array, state: optax.OptState, guards: Array, i: int) -> Any:
         cost, at = jnp.asarray(costs[i], jnp.float32), jnp.asarray(BLOCK * i)
         about = signal, experiment, goal, limits, draws, guards
         return *about, cost, C, state, at, total
 
     nothing = jnp.zeros((signal.coefficients, inputs), jnp.float32)
-    _climb.compile_for(*block(nothing, adam(nothing), trials[:GUARDS], 0))
+    _climb.compile_for(*block(nothing, ADAMW.init(nothing), trials[:GUARDS], 0))
 
     def improved(key: Key) -> Array:
         C = BEGIN * signal.random(key, inputs).astype(jnp.float32)
@@ -243,7 +244,7 @@ def _climber(
                 break
             C = 0.8 * C
             far = beyond(C)
-        state = adam(C)
+        state = ADAMW.init(C)
         for i in range(BLOCKS):
             # Of a machine that is lost no gradient can be had.
             near = jnp.where(jnp.isfinite(far), far, -jnp.inf)
@@ -255,7 +256,9 @@ def _climber(
             if jnp.mean(then < LOST) > 1.0 - LEAVING:
                 C, state, far = moved, after, then
             else:
-                state = adam(C)
+                # Nothing is remembered, but how many steps there have been.
+                count = jnp.asarray(BLOCK * (i + 1), jnp.int32)
+                state = optax.tree.set(ADAMW.init(C), count=count)
         return C
 
     return improved
@@ -271,10 +274,10 @@ def _climb(
     guards: Float[Array, "G p"],
     cost: Array,
     C: Float[Array, "k m"],
-    state: Moments,
+    state: optax.OptState,
     first: Array,
     total: Array,
-) -> tuple[Float[Array, "k m"], Moments]:
+) -> tuple[Float[Array, "k m"], optax.OptState]:
     """Steps of Adam on the worth at one draw after the other, less what guards pay."""
     beyond = _beyond_of(experiment, _narrowed(limits))
 

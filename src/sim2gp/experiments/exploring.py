@@ -204,7 +204,7 @@ def learner_cell(cell: Cell, oracle: Mapping[str, Any]) -> dict[str, Any]:
     def note(done: Episode) -> None:
         nonlocal before
         S, A, _ = done.trajectory.transitions(history)
-        about = before.learnable()
+        about = before.untempered()
         gained = about.trajectory_information_gain(jnp.asarray(S), jnp.asarray(A))
         states = jnp.asarray(done.trajectory.state)
         told = {

@@ -57,9 +57,16 @@ def in_stages(
     return values
 
 
+#: Arguments that stored cells have under an earlier name.
+STORED_AS = {"num_envs": "worlds", "tau": "slow"}
+
+
 def described(value: Any) -> Any:
     """Its type and every argument, defaults as well: those may change."""
     if not is_dataclass(value):
         return value
-    arguments = {f.name: described(getattr(value, f.name)) for f in fields(value)}
+    arguments = {
+        STORED_AS.get(f.name, f.name): described(getattr(value, f.name))
+        for f in fields(value)
+    }
     return {"type": type(value).__name__} | arguments

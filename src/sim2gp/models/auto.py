@@ -72,9 +72,9 @@ class AutoBelief(AbstractBelief):
     def sample(self, key: Key) -> Dynamics:
         return AutoDraw(tuple(b.sample(key) for b in self.beliefs), self.index)
 
-    def learnable(self) -> "AutoBelief":
+    def untempered(self) -> "AutoBelief":
         """That of each."""
-        each = tuple(b.learnable() for b in self.beliefs)
+        each = tuple(b.untempered() for b in self.beliefs)
         return eqx.tree_at(lambda b: b.beliefs, self, each)
 
     def point(self) -> Dynamics:

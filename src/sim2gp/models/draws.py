@@ -1,8 +1,9 @@
-"""Draws of a linearised simulator, as simulators (paper, eq. 2).
+"""Functions that a simulator's belief gives: linearised draws, and physics at the MAP.
 
 A draw of ``tt`` is a whole function; evaluating it costs one ``jvp``. Linearised draws
 stay right on ridges: along a flat direction the tangent moves ``tt`` and not ``f``,
-while the nonlinear function at the same ``tt`` leaves the ridge's curve.
+while the nonlinear function at the same ``tt`` leaves the ridge's curve. All are in
+float32, for planning.
 """
 
 import equinox as eqx
@@ -10,9 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from sim2gp.inference.gaussian import Gaussian
-from sim2gp.systems.base import AbstractSystem
-from sim2gp.types import Action, Key, State
+from sim2gp.systems.base import AbstractSystem, Bound
+from sim2gp.types import Action, State, single
 
 
 class LinearizedDraw(eqx.Module):
@@ -31,26 +31,14 @@ class LinearizedDraw(eqx.Module):
         return mean + slope
 
 
-class NonlinearDraw(eqx.Module):
-    """``f(x, tt)`` at a drawn ``tt``: for identifiable models, where physics must hold.
-
-    On ridges it under-fits (the Gaussian is tangent to a curved ridge).
-    """
-
-    system: AbstractSystem
-    tt: Float[Array, " p"]
-    dt: float = eqx.field(static=True)
-
-    def __call__(self, s: State, a: Action) -> State:
-        return self.system.transition(self.tt, s, a, self.dt)
+def linearized(
+    system: AbstractSystem, tt: Float[Array, " p"], delta: Float[Array, " p"], dt: float
+) -> LinearizedDraw:
+    """The draw ``tt + delta``, linearised at ``tt``."""
+    return LinearizedDraw(system, tt.astype(jnp.float32), delta.astype(jnp.float32), dt)
 
 
-def draw(
-    system: AbstractSystem, posterior: Gaussian, dt: float, key: Key, *, linear: bool
-) -> LinearizedDraw | NonlinearDraw:
-    """One float32 function from the parameter posterior."""
-    tt = posterior.sample(key)
-    if not linear:
-        return NonlinearDraw(system, tt.astype(jnp.float32), dt)
-    delta = (tt - posterior.mean).astype(jnp.float32)
-    return LinearizedDraw(system, posterior.mean.astype(jnp.float32), delta, dt)
+def physics_at(system: AbstractSystem, tt: Float[Array, " p"], dt: float) -> Bound:
+    """The plain simulator at the virtual parameters ``tt``."""
+    record = system.record(system.parameters.values(tt))
+    return system.bind(single(record), dt)

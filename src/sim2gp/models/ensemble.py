@@ -72,21 +72,15 @@ def _ensemble(
         states = jax.lax.scan(step, s, (actions, noises))[1]
         return states[at][:, np.asarray(outputs)]
 
-    def one(each: tuple[Dynamics, Array, Array]) -> Array:
-        f, key, spread = each  # the point has no spread
-        begin, process = jax.random.split(key)
-        starts = spread * start_sd[None] * jax.random.normal(begin, (W, d), jnp.float32)
-        steps = spread * noise * jax.random.normal(process, (W, K, d), jnp.float32)
-        every = jax.vmap(lambda s, a, e: rolled(f, s, a, e))
-        return every(start.at[:, :d].add(starts), action, steps)
+    def every(f: Dynamics, starts: Array, noises: Array) -> Array:
+        return jax.vmap(lambda s, a, e: rolled(f, s, a, e))(starts, action, noises)
 
-    function, own = jax.vmap(jax.random.split, out_axes=1)(keys)
-    # The point stands first among the draws: one rollout is compiled, not two.
-    functions = jax.tree.map(
-        lambda point, drawn: jnp.concatenate([point[None], drawn]),
-        belief.point(),
-        jax.vmap(belief.sample)(function),
-    )
-    spread = jnp.ones(len(keys) + 1, jnp.float32).at[0].set(0.0)
-    found = jax.lax.map(one, (functions, jnp.concatenate([own[:1], own]), spread))
-    return found[0], found[1:]
+    def one(each: tuple[Key, Key]) -> Array:
+        which, own = each
+        begin, process = jax.random.split(own)
+        starts = start_sd[None] * jax.random.normal(begin, (W, d), jnp.float32)
+        noises = noise * jax.random.normal(process, (W, K, d), jnp.float32)
+        return every(belief.sample(which), start.at[:, :d].add(starts), noises)
+
+    point = every(belief.point(), start, jnp.zeros((W, K, d), jnp.float32))
+    return point, jax.lax.map(one, tuple(jax.vmap(jax.random.split, out_axes=1)(keys)))

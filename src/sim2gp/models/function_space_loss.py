@@ -1,4 +1,4 @@
-"""Training a last layer's posterior to agree with data and, elsewhere, with physics.
+"""The loss of a last layer that agrees with data and, elsewhere, with physics.
 
     q(W) = prod_k N(m_k, L_k L_k^T),   mu_q = m^T phi,   V_q = diag_k ||L_k^T phi||^2
 
@@ -11,25 +11,18 @@ because marginals say nothing of correlations, and function samples need them. T
 targets do not depend on what is trained: their whitening is computed once, in float64.
 """
 
-from collections.abc import Callable
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp.data.transitions import Transitions
-from sim2gp.inference import linear_regression as last_layer
 from sim2gp.inference.gaussian import LOG_2PI, log_det_factor, lower_factor
 from sim2gp.inference.linalg import solve_triangular
 from sim2gp.models import features
 from sim2gp.models.features import Encoding, Network
-from sim2gp.models.training import adam, chosen, descend
 from sim2gp.types import Key, Scalar
 
-BLOCK = 100
-BATCH = 256
 NOISE_FLOOR = 3e-3  # while training, in units of the output's scale
 POINTS = 64  # inputs compared at each step
 REPLAY = 3  # one input in so many is near the data, the others fill the box
@@ -142,9 +135,8 @@ def divergence(
     U = U.astype(noise.dtype)
     K = jnp.einsum("dij,dkj->dik", U, U)
     K = K + (noise**2)[:, None, None] * jnp.eye(b, dtype=noise.dtype)[None]
-    C = jnp.linalg.cholesky(
-        K
-    )  # too small a batch to be cut (`sim2gp.inference.linalg`)
+    # Too small a batch to be cut (`sim2gp.inference.linalg`).
+    C = jnp.linalg.cholesky(K)
     log_det = jnp.sum(jnp.log(jnp.diagonal(C, axis1=1, axis2=2)))
     return 0.5 * (quadratic - b * d) + target.log_det[g] - log_det
 
@@ -173,111 +165,3 @@ def expected_log_likelihood(
     each = -jnp.log(sd) - 0.5 * LOG_2PI - 0.5 * (error**2 + variance) / sd**2
     rows = jnp.maximum(jnp.sum(valid, dtype=Y.dtype), 1.0)
     return jnp.sum(jnp.where(valid[:, None], each, 0.0)) / rows
-
-
-class Budget(eqx.Module):
-    """Steps: agreement alone; with four fifths of the data; with all, noise kept."""
-
-    alone: Int[Array, ""]
-    most: Int[Array, ""]
-    all: Int[Array, ""]
-    rate: float = eqx.field(static=True)
-
-
-def train(
-    q: Variational,
-    X: Float[Array, "N e"],
-    Y: Float[Array, "N d"],
-    mask: Bool[Array, " N"],
-    target: Targets,
-    objective: Objective,
-    budget: Budget,
-    key: Key,
-) -> tuple[Variational, Float[Array, " d"]]:
-    """The trained posterior and its recalibrated noise, one loop over three phases."""
-    out = features.held_out_rows(mask)
-    X32, N = X.astype(jnp.float32), jnp.sum(mask, dtype=Y.dtype)
-    first, second = budget.alone // BLOCK, (budget.alone + budget.most) // BLOCK
-    last = second + budget.all // BLOCK
-    rates = jax.tree.map(lambda _: budget.rate, q)
-    rates = eqx.tree_at(lambda q: q.log_noise, rates, 5.0 * budget.rate)
-
-    def block(i: Array, carry: tuple) -> tuple:
-        q, moments, noise = carry
-        rows = jnp.where(i < second, mask & ~out, mask)
-        batches = features.Minibatches.shuffled(jax.random.fold_in(key, i), rows)
-        begin = jnp.where(i < first, 0, jnp.where(i < second, first, second))
-        end = jnp.where(i < first, first, jnp.where(i < second, second, last))
-        moments = chosen(i == begin, adam(q), moments)
-        gradient = _gradient(X32, Y, batches, target, objective, N, i < first)
-
-        def masked(q: Variational, t: Array, key: Key) -> Variational:
-            grads = gradient(q, t, key)
-            learns = (i >= first) & (i < second)
-            slope = jnp.where(learns, grads.log_noise, 0.0)
-            return eqx.tree_at(lambda g: g.log_noise, grads, slope)
-
-        q, moments = descend(
-            masked,
-            q,
-            moments,
-            rates,
-            steps=BLOCK,
-            start=(i - begin) * BLOCK,
-            total=(end - begin) * BLOCK,
-            key=jax.random.fold_in(key, i),
-        )
-        noise = jax.lax.cond(
-            i + 1 == second, lambda: held_out_noise(q, X, Y, out), lambda: noise
-        )
-        settled = jnp.log(noise)
-        log_noise = jnp.where(i + 1 >= second, settled, q.log_noise)
-        return eqx.tree_at(lambda q: q.log_noise, q, log_noise), moments, noise
-
-    start = (q, adam(q), q.noise)
-    q, _, noise = jax.lax.fori_loop(0, last, block, start)
-    return q, noise
-
-
-def held_out_noise(
-    q: Variational,
-    X: Float[Array, "N e"],
-    Y: Float[Array, "N d"],
-    out: Bool[Array, " N"],
-) -> Float[Array, " d"]:
-    """The noise that best predicts the held-out rows; the trained one without any."""
-    Phi = jax.vmap(q.network)(X)
-    mean = Phi @ q.mean.T.astype(X.dtype)
-    factor = jnp.tril(q.factor).astype(X.dtype)
-    variance = jnp.sum(jnp.einsum("nm,dmj->ndj", Phi, factor) ** 2, axis=2)
-    noise, losses = last_layer.recalibrated(variance, Y - mean, out, q.noise)
-    return jnp.where(jnp.isfinite(losses) & jnp.any(out), noise, q.noise)
-
-
-def _gradient(
-    X: Float[Array, "N e"],
-    Y: Float[Array, "N d"],
-    batches: features.Minibatches,
-    target: Targets,
-    objective: Objective,
-    N: Scalar,
-    alone: Bool[Array, ""],
-) -> Callable[[Variational, Array, Key], Any]:
-    """The gradient of the loss; of the divergence alone while pre-training."""
-
-    def agree(q: Variational, key: Key) -> Scalar:
-        return mean_divergence(q, target, objective, key)
-
-    def fit(q: Variational, t: Array, key: Key) -> Scalar:
-        index, valid = batches.batch(t, BATCH)
-        likelihood = expected_log_likelihood(q, X[index], Y[index], valid)
-        return objective.weight / N * agree(q, key) - likelihood
-
-    def gradient(q: Variational, t: Array, key: Key) -> Any:
-        return jax.lax.cond(
-            alone,
-            lambda: jax.grad(agree)(q, key),
-            lambda: jax.grad(fit)(q, t, key),
-        )
-
-    return gradient

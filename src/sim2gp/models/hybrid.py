@@ -4,65 +4,54 @@
 
 ``g`` is 1 where the physics is part of the function and 0 where a network has replaced
 it; ``c`` is 0 where the network adds nothing. How ``W`` and ``tt`` are learned is what
-tells the models apart; prediction, draws, updates and information gain are the same.
+tells the recipes apart (`AbstractHybrid.learn`); prediction, draws, updates and
+information gain are the same.
 """
+
+from abc import abstractmethod
+from collections.abc import Mapping
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from equinox import AbstractClassVar
 from jaxtyping import Array, Bool, Float, Int
 
-from sim2gp.belief import AbstractBelief
+from sim2gp.belief import AbstractBelief, AbstractModel
 from sim2gp.data.transitions import Transitions
 from sim2gp.inference import linear_regression as last_layer
 from sim2gp.inference import linearized
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.information import Sensitivity
 from sim2gp.inference.linear_regression import LastLayer
-from sim2gp.models.features import Encoding, Network, stepped
-from sim2gp.models.nlm import (
-    Head,
-    Trained,
-    lifted,
-    with_noise,
-)
+from sim2gp.models import draws
+from sim2gp.models.features import Encoding, Network, check_training, stepped
+from sim2gp.models.nlm import Head, Trained, checked, lifted, with_noise
 from sim2gp.models.sim2gp import Sim2GP, Sim2GPBelief
-from sim2gp.systems.base import AbstractSystem
+from sim2gp.models.training import chosen
 from sim2gp.types import Action, Dynamics, Key, Scalar, State, double, in_float64
 
 
 class HybridDraw(eqx.Module):
-    """Physics, linearised at its MAP along one direction, plus ``W^T phi``.
+    """A function of the simulator plus ``W^T phi``.
 
-    Only the branch that is needed is computed, unless draws are themselves batched:
-    ``part`` 0 is no physics, 1 physics at ``tt``, 2 with its tangent along ``delta``.
+    ``keep`` is 0 where the network has replaced the physics, which is not computed
+    then.
     """
 
-    system: AbstractSystem
-    tt: Float[Array, " p"]
-    delta: Float[Array, " p"]
-    part: Float[Array, ""]
+    physics: Dynamics
+    keep: Float[Array, ""]
     network: Network
     W: Float[Array, "m d"]
     encoding: Encoding
-    dt: float = eqx.field(static=True)
 
     def __call__(self, s: State, a: Action) -> State:
         d = self.W.shape[1]
-
-        def f(tt: Array) -> Array:
-            return self.system.transition(tt, s, a, self.dt)
-
-        def tangent() -> Array:
-            mean, slope = jax.jvp(f, (self.tt,), (self.delta,))
-            return mean + slope
-
-        branches = [
+        base = jax.lax.cond(
+            self.keep > 0.0,
+            lambda: self.physics(s, a),
             lambda: stepped(s, a, jnp.zeros(d, s.dtype)),
-            lambda: f(self.tt),
-            tangent,
-        ]
-        base = jax.lax.switch(self.part.astype(jnp.int32), branches)
+        )
         phi = self.network(self.encoding(s, a))
         return base.at[:d].add(phi @ self.W.astype(phi.dtype))
 
@@ -102,15 +91,19 @@ class HybridBelief(AbstractBelief):
         first, second = jax.random.split(key)
         p, dtype = self.physics.scale.shape[1], self.physics.scale.dtype
         e0 = jax.random.normal(first, (p,), dtype)
-        return self._draw(self.physics.scale @ e0, self.head.weights(e0, second))
+        delta = self.physics.scale @ e0
+        physics = draws.linearized(
+            self.sim.system, self.physics.mean, delta, self.sim.dt
+        )
+        return self._function(physics, self.head.weights(e0, second))
 
     @in_float64
     def point(self) -> Dynamics:
-        nothing = jnp.zeros_like(self.physics.mean)
-        return self._draw(nothing, self.head.mean_weights())
+        physics = draws.physics_at(self.sim.system, self.physics.mean, self.sim.dt)
+        return self._function(physics, self.head.mean_weights())
 
     @in_float64
-    def learnable(self) -> "HybridBelief":
+    def untempered(self) -> "HybridBelief":
         """Where tempered, the constants' spread is that of independent rows again."""
         plain = jnp.where(
             self.kappa > 1.0, self.sim.posterior.scale, self.physics.scale
@@ -135,12 +128,7 @@ class HybridBelief(AbstractBelief):
         self, s: State, a: Action
     ) -> tuple[Float[Array, " d"], Float[Array, "d p"], Float[Array, "d features"]]:
         """Mean of the change, and its scale along ``e_0`` and each output's ``e_k``."""
-        d = self.noise.size
-
-        def f(tt: Array) -> Array:
-            return self.sim.system.transition(tt, s, a, self.sim.dt)[:d] - s[:d]
-
-        change = linearized.latent(f, self.physics)
+        change = linearized.latent(lambda tt: _change(self.sim, tt, s, a), self.physics)
         mean, shared, own = self.head.moments(s, a)
         return (
             self.keep * change.mean + mean,
@@ -148,60 +136,128 @@ class HybridBelief(AbstractBelief):
             own,
         )
 
-    def _draw(self, delta: Float[Array, " p"], W: Float[Array, "m d"]) -> HybridDraw:
-        spread = jnp.any(delta != 0.0)
-        tt = self.physics.mean
-        if not self.sim.linear:  # the function itself, at the drawn constants
-            tt, delta, spread = tt + delta, jnp.zeros_like(delta), jnp.zeros((), bool)
-        part = jnp.where(self.keep > 0.0, jnp.where(spread, 2.0, 1.0), 0.0)
-        return HybridDraw(
-            self.sim.system,
-            tt.astype(jnp.float32),
-            delta.astype(jnp.float32),
-            part.astype(jnp.float32),
-            self.head.trained.network,
-            W,
-            self.head.encoding,
-            self.sim.dt,
+    def _function(self, physics: Dynamics, W: Float[Array, "m d"]) -> HybridDraw:
+        keep, head = self.keep.astype(jnp.float32), self.head
+        return HybridDraw(physics, keep, head.trained.network, W, head.encoding)
+
+
+class AbstractHybrid(AbstractModel):
+    """A simulator and a network; a recipe says how both are learned.
+
+    Options as in `NLM`.
+    """
+
+    #: Whether an update after the first fit leaves the constants as they are.
+    layer_alone: AbstractClassVar[bool]
+
+    sim: Sim2GP
+    encoding: Encoding
+    hidden: tuple[int, ...] = eqx.field(static=True)
+    steps: int = eqx.field(static=True)
+    refit_steps: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        sim: Sim2GP,
+        hidden: tuple[int, ...],
+        steps: int,
+        refit_steps: int,
+        reach: Mapping[str, float] | None,
+    ) -> None:
+        self.sim = sim
+        self.encoding = Encoding.of(sim.system, reach or {})
+        self.hidden = tuple(hidden)
+        name = type(self).__name__
+        check_training(name, self.hidden, steps=steps, refit_steps=refit_steps)
+        self.steps = steps
+        self.refit_steps = refit_steps
+
+    @abstractmethod
+    def learn(
+        self,
+        belief: HybridBelief,
+        sim: Sim2GPBelief,
+        data: Transitions,
+        steps: int,
+        key: Key,
+    ) -> HybridBelief:
+        """Constants and layer given all data, in so many steps; ``sim`` has seen them.
+
+        Called in float64.
+        """
+
+    @in_float64
+    def init(self, key: Key) -> HybridBelief:
+        """The simulator's prior; the network adds nothing yet."""
+        physics = self.sim.init(key)
+        trained = Trained.random(key, self.encoding, self.hidden)
+        d, p = self.encoding.outputs, self.sim.prior.mean.size
+        layer = LastLayer.prior(d, trained.network.features, p, trained.alpha)
+        head = Head(trained, layer, jnp.zeros(d), self.encoding)
+        one, none = jnp.ones(()), jnp.zeros((), int)
+        prior = self.sim.prior
+        return HybridBelief(physics, prior, one, one, head, physics.noise, none)
+
+    @in_float64
+    def fit(
+        self, belief: AbstractBelief, data: Transitions, *, key: Key
+    ) -> HybridBelief:
+        """SIM2GP, then the network. Raises what SIM2GP's fit raises, `NotFinite`."""
+        assert isinstance(belief, HybridBelief)
+        if data.count == 0:
+            return belief
+        first, second = jax.random.split(key)
+        sim = self.sim.fit(belief.sim, data, key=first)
+        steps = self.refit_steps if int(belief.count) else self.steps
+        data = jax.tree.map(jnp.asarray, data)
+        return checked(self.learn(belief, sim, data, steps, second), data)
+
+    def update(
+        self, belief: AbstractBelief, s: State, a: Action, s2: State
+    ) -> HybridBelief:
+        """One more transition: the exact Gaussian update of ``(tt, W)``, features kept.
+
+        What ``tt`` and ``W`` then have in common is kept (`LastLayer.shared`), also
+        where the fit had left them independent. The simulator's own belief learns by
+        itself. Call it in float64.
+        """
+        assert isinstance(belief, HybridBelief)
+        before, head = belief.physics, belief.head
+
+        def f(tt: Array) -> Array:
+            return _change(belief.sim, tt, s, a)
+
+        value, J = linearized.value_and_jacobian(f, before.mean)
+        mean, _, _ = head.moments(s, a)
+        residual = (s2 - s)[: belief.noise.size] - belief.keep * value - mean
+        phi = head.output_scale[:, None] * head.phi(s, a)[None]
+        # Before the first fit there is no residual: the constants learn.
+        fixed = self.layer_alone & jnp.any(head.output_scale > 0.0)
+        scale = jnp.where(fixed, 0.0, before.scale)
+        physics, layer = last_layer.condition(
+            Gaussian(before.mean, scale),
+            head.layer,
+            belief.keep * J,
+            phi,
+            residual,
+            belief.noise,
+        )
+        sim, physics = (
+            self.sim.update(belief.sim, s, a, s2),
+            chosen(fixed, before, physics),
+        )
+        new = sim, physics, layer, belief.count + 1
+        return eqx.tree_at(
+            lambda b: (b.sim, b.physics, b.head.layer, b.count), belief, new
         )
 
 
-def before_data(
-    sim: Sim2GP, encoding: Encoding, hidden: tuple[int, ...], key: Key
-) -> HybridBelief:
-    """The simulator's prior, beside a network that adds nothing yet."""
-    physics = sim.init(key)
-    trained = Trained.random(key, encoding, hidden)
-    d, p = encoding.outputs, sim.prior.mean.size
-    layer = LastLayer.prior(d, trained.network.features, p, trained.alpha)
-    head = Head(trained, layer, jnp.zeros(d), encoding)
-    one = jnp.ones(())
-    nothing = jnp.zeros((), int)
-    return HybridBelief(physics, sim.prior, one, one, head, physics.noise, nothing)
-
-
-def conditioned(
-    model: Sim2GP, belief: HybridBelief, s: State, a: Action, s2: State
-) -> HybridBelief:
-    """One more transition: the exact Gaussian update of ``(tt, W)``, features kept.
-
-    What ``tt`` and ``W`` then have in common is kept (`LastLayer.shared`), also where
-    the fit had left them independent. The simulator's own belief learns by itself.
-    """
-    d, head = belief.noise.size, belief.head
-
-    def f(tt: Array) -> Array:
-        return belief.sim.system.transition(tt, s, a, belief.sim.dt)[:d] - s[:d]
-
-    value, J = linearized.value_and_jacobian(f, belief.physics.mean)
-    mean, _, _ = head.moments(s, a)
-    residual = (s2 - s)[:d] - belief.keep * value - mean
-    phi = head.output_scale[:, None] * head.phi(s, a)[None]
-    physics, layer = last_layer.condition(
-        belief.physics, head.layer, belief.keep * J, phi, residual, belief.noise
-    )
-    new = (model.update(belief.sim, s, a, s2), physics, layer, belief.count + 1)
-    return eqx.tree_at(lambda b: (b.sim, b.physics, b.head.layer, b.count), belief, new)
+def _change(
+    belief: Sim2GPBelief, tt: Float[Array, " p"], s: State, a: Action
+) -> Float[Array, " d"]:
+    """The simulator's change of the physical states in one step."""
+    d = belief.noise.size
+    return belief.system.transition(tt, s, a, belief.dt)[:d] - s[:d]
 
 
 def physics_rows(
@@ -212,13 +268,11 @@ def physics_rows(
     mask: Bool[Array, " N"],
 ) -> tuple[Float[Array, "N d"], Float[Array, "N d p"]]:
     """The simulator's changes and their Jacobians at ``tt``; masked rows are zero."""
-    d = belief.noise.size
 
     def one(s: Array, a: Array, valid: Array) -> tuple[Array, Array]:
-        def f(tt: Array) -> Array:
-            return belief.system.transition(tt, s, a, belief.dt)[:d] - s[:d]
-
-        value, J = linearized.value_and_jacobian(f, tt)
+        value, J = linearized.value_and_jacobian(
+            lambda tt: _change(belief, tt, s, a), tt
+        )
         return jnp.where(valid, value, 0.0), jnp.where(valid, J, 0.0)
 
     return jax.vmap(one)(S, A, mask)

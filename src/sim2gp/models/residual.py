@@ -10,6 +10,7 @@ better than the simulator alone keeps the simulator's answer, to the last digit 
 """
 
 from collections.abc import Mapping
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -17,23 +18,21 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from sim2gp import checks
-from sim2gp.belief import AbstractBelief, AbstractModel
 from sim2gp.data.transitions import Transitions
 from sim2gp.inference import linear_regression as last_layer
 from sim2gp.inference.gaussian import LOG_2PI
 from sim2gp.inference.linear_regression import LastLayer
 from sim2gp.models import features, hybrid, nlm
-from sim2gp.models.features import Encoding
-from sim2gp.models.hybrid import HybridBelief
+from sim2gp.models.hybrid import AbstractHybrid, HybridBelief
 from sim2gp.models.sim2gp import Sim2GP, Sim2GPBelief
 from sim2gp.models.training import chosen
-from sim2gp.types import Action, Key, State, in_float64
+from sim2gp.types import Key
 
 SCALE = 3.0  # a residual's prior sd, in fitted noises of the simulator
 MODES = ("seq_sum", "joint")
 
 
-class Residual(AbstractModel):
+class Residual(AbstractHybrid):
     """Simulator plus learned residual.
 
     mode: ``"seq_sum"`` adds two independent posteriors (slightly conservative: both
@@ -42,11 +41,8 @@ class Residual(AbstractModel):
     Other options as in `NLM`. Raises `InputError` E145 for another mode.
     """
 
-    sim: Sim2GP
-    encoding: Encoding
-    hidden: tuple[int, ...] = eqx.field(static=True)
-    steps: int = eqx.field(static=True)
-    refit_steps: int = eqx.field(static=True)
+    layer_alone: ClassVar[bool] = False
+
     mode: str = eqx.field(static=True)
 
     def __init__(
@@ -60,45 +56,19 @@ class Residual(AbstractModel):
         reach: Mapping[str, float] | None = None,
     ) -> None:
         checks.one_of("Residual", MODES, mode=mode)
-        self.sim = sim
-        self.encoding = Encoding.of(sim.system, reach or {})
-        self.hidden = tuple(hidden)
-        features.check_training(
-            "Residual", self.hidden, steps=steps, refit_steps=refit_steps
-        )
-        self.steps = steps
-        self.refit_steps = refit_steps
+        super().__init__(sim, hidden, steps, refit_steps, reach)
         self.mode = mode
 
-    @in_float64
-    def init(self, key: Key) -> HybridBelief:
-        """The simulator's prior, and no residual."""
-        return hybrid.before_data(self.sim, self.encoding, self.hidden, key)
-
-    @in_float64
-    def fit(
-        self, belief: AbstractBelief, data: Transitions, *, key: Key
+    def learn(
+        self,
+        belief: HybridBelief,
+        sim: Sim2GPBelief,
+        data: Transitions,
+        steps: int,
+        key: Key,
     ) -> HybridBelief:
-        """SIM2GP, then the network on what it leaves, then both posteriors.
-
-        Raises what the simulator's fit raises, and `NotFinite`.
-        """
-        assert isinstance(belief, HybridBelief)
-        if data.count == 0:
-            return belief
-        first, second = jax.random.split(key)
-        sim = self.sim.fit(belief.sim, data, key=first)
-        steps = self.refit_steps if int(belief.count) else self.steps
-        data = jax.tree.map(jnp.asarray, data)
-        fitted = _fit(belief, sim, data, second, jnp.asarray(steps), self.mode)
-        return nlm.checked(fitted, data)
-
-    def update(
-        self, belief: AbstractBelief, s: State, a: Action, s2: State
-    ) -> HybridBelief:
-        """Condition constants and layer on one transition; call in float64."""
-        assert isinstance(belief, HybridBelief)
-        return hybrid.conditioned(self.sim, belief, s, a, s2)
+        """The network on what the simulator leaves, then both posteriors."""
+        return _fit(belief, sim, data, key, jnp.asarray(steps), self.mode)
 
 
 @eqx.filter_jit

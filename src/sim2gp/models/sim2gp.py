@@ -50,7 +50,6 @@ class Sim2GPBelief(AbstractBelief):
     log_evidence: Scalar
     count: Int[Array, ""]
     dt: float = eqx.field(static=True)
-    linear: bool = eqx.field(static=True)
 
     @in_float64
     def latent(self, s: State, a: Action) -> Gaussian:
@@ -62,13 +61,13 @@ class Sim2GPBelief(AbstractBelief):
 
     @in_float64
     def sample(self, key: Key) -> Dynamics:
-        return draws.draw(self.system, self.posterior, self.dt, key, linear=self.linear)
+        mean = self.posterior.mean
+        delta = self.posterior.sample(key) - mean
+        return draws.linearized(self.system, mean, delta, self.dt)
 
     @in_float64
     def point(self) -> Dynamics:
-        at_map = Gaussian(self.posterior.mean, jnp.zeros_like(self.posterior.scale))
-        key = jax.random.key(0)  # the scale is zero: no randomness is used
-        return draws.draw(self.system, at_map, self.dt, key, linear=self.linear)
+        return draws.physics_at(self.system, self.posterior.mean, self.dt)
 
     def sensitivity(self, s: State, a: Action) -> Sensitivity:
         d = self.noise.size
@@ -89,18 +88,16 @@ class Sim2GP(AbstractModel):
     """The simulator as a prior over dynamics.
 
     ``dt`` is the control period (s). ``prior`` replaces the table's own, in virtual
-    space: with a posterior here, data sets are learned one after another. ``draws`` is
-    ``"linearized"`` (the paper's Gaussian process) or ``"nonlinear"``. A ``frozen``
+    space: with a posterior here, data sets are learned one after another. A ``frozen``
     simulator takes ``prior`` as the last word on its constants, because other data or
     the same ones in another form have made it: a fit then learns the noise alone.
     Raises `InputError` E148 for a period that is not positive, E140 for a prior of
-    another number of constants, E145 for other ``draws``.
+    another number of constants.
     """
 
     system: AbstractSystem
     prior: Gaussian
     dt: float = eqx.field(static=True)
-    linear: bool = eqx.field(static=True)
     frozen: bool = eqx.field(static=True)
 
     @in_float64
@@ -110,17 +107,14 @@ class Sim2GP(AbstractModel):
         *,
         dt: float = 0.02,
         prior: Gaussian | None = None,
-        draws: str = "linearized",
         frozen: bool = False,
     ) -> None:
-        checks.one_of("Sim2GP", ("linearized", "nonlinear"), draws=draws)
         checks.positive("Sim2GP", dt=dt)
         self.system = system
         self.prior = system.parameters.prior() if prior is None else prior
         p = len(system.parameters)
         checks.same_shape("Sim2GP", (p,), prior=self.prior.mean)
         self.dt = dt
-        self.linear = draws == "linearized"
         self.frozen = frozen
 
     def with_prior(self, prior: Gaussian) -> "Sim2GP":
@@ -141,7 +135,6 @@ class Sim2GP(AbstractModel):
             jnp.zeros(()),
             jnp.zeros((), int),
             self.dt,
-            self.linear,
         )
 
     @in_float64
@@ -220,7 +213,6 @@ def _belief(model: Sim2GP, found: Estimate, data: Transitions) -> Sim2GPBelief:
         found.log_evidence,
         jnp.sum(data.mask),
         model.dt,
-        model.linear,
     )
 
 

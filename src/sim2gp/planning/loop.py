@@ -69,7 +69,7 @@ class History(eqx.Module):
 
 def drawn(belief: AbstractBelief, key: Key) -> Dynamics:
     """Posterior sampling's world: a draw that is as wide as more data would settle."""
-    return belief.learnable().sample(key)
+    return belief.untempered().sample(key)
 
 
 def expected(belief: AbstractBelief, key: Key) -> Dynamics:
@@ -254,7 +254,7 @@ def psal(
     bound, cost = task.trusted, jnp.asarray(limit_cost, jnp.float32)
 
     def objective(belief: AbstractBelief) -> AbstractObjective:
-        gain = InformationGain(single(belief.learnable()), together)
+        gain = InformationGain(single(belief.untempered()), together)
         return Restrained(gain, bound, cost)
 
     return posterior_sampling(
@@ -286,7 +286,7 @@ def optimism(
     each = jnp.asarray(weight, jnp.float32)
 
     def objective(belief: AbstractBelief) -> AbstractObjective:
-        believed = single(belief.learnable())
+        believed = single(belief.untempered())
         return MarkovObjective(Optimistic(task.reward, believed, each))
 
     return posterior_sampling(

@@ -18,10 +18,10 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import optax
 from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp import checks
-from sim2gp.models.training import Moments, adam, adam_step
 from sim2gp.planning.mpc import from_unit
 from sim2gp.planning.networks import (
     MLP,
@@ -102,7 +102,7 @@ class Learner(eqx.Module):
     critics: Critics
     targets: Critics
     log_temperature: Scalar
-    moments: tuple[Moments, Moments, Moments]
+    optimisers: tuple[optax.OptState, ...]  # of the three, in the order of updates
     updates: Int[Array, ""]
     taught: Bool[Array, ""]
     replay: Replay
@@ -124,19 +124,19 @@ class SAC(AbstractPlanner):
     """Off-policy learning in the sampled world; then one network evaluation per step.
 
     hidden: widths of the layers of actor and critics.
-    worlds: episodes side by side, ``steps`` of each are made per preparation.
-    updates: gradient steps after each step of all worlds, on ``batch`` rows.
+    num_envs: episodes side by side, ``steps`` of each are made per preparation.
+    updates: gradient steps after each step of all episodes, on ``batch`` rows.
     capacity: of the replay, in preparations.
     replayed: share of the episodes that begin where the real machine has been.
     scattered: share of those that begin anywhere: a world, unlike a machine, can.
-    discount, rate, slow: of rewards per step, of Adam, of the critics' slow copies.
+    discount, rate, tau: of rewards per step, of Adam, of the critics' slow copies.
     scale: of the rewards, against the entropy of the policy.
 
     Raises `InputError` E148 for a setting that cannot be.
     """
 
     hidden: tuple[int, ...] = eqx.field(static=True, default=(64, 64))
-    worlds: int = eqx.field(static=True, default=64)
+    num_envs: int = eqx.field(static=True, default=64)
     steps: int = eqx.field(static=True, default=400)
     updates: int = eqx.field(static=True, default=32)
     batch: int = eqx.field(static=True, default=256)
@@ -145,16 +145,22 @@ class SAC(AbstractPlanner):
     scattered: float | Scalar = 0.6
     discount: float | Scalar = 0.99
     rate: float | Scalar = 1e-3
-    slow: float | Scalar = 0.02
+    tau: float | Scalar = 0.02
     scale: float | Scalar = 1.0
 
     def __check_init__(self) -> None:
-        sizes = {"worlds": self.worlds, "steps": self.steps, "updates": self.updates}
-        checks.count("SAC", **sizes, batch=self.batch, capacity=self.capacity)
+        sizes = {"num_envs": self.num_envs, "steps": self.steps}
+        sizes |= {"updates": self.updates, "batch": self.batch}
+        checks.count("SAC", **sizes, capacity=self.capacity)
         checks.count("SAC", hidden=self.hidden)
         shares = {"replayed": self.replayed, "scattered": self.scattered}
-        checks.share("SAC", **shares, discount=self.discount, slow=self.slow)
+        checks.share("SAC", **shares, discount=self.discount, tau=self.tau)
         checks.not_negative("SAC", rate=self.rate, scale=self.scale)
+
+    def optimiser(self) -> optax.GradientTransformation:
+        """Adam; never so many bad gradients that one is let through."""
+        adam = optax.adam(self.rate)
+        return optax.apply_if_finite(adam, max_consecutive_errors=2**31 - 1)
 
     def init(self, world: World, *, key: Key) -> Learner:
         first, second, third = jax.random.split(key, 3)
@@ -163,8 +169,9 @@ class SAC(AbstractPlanner):
         actor = MLP.random(first, (observe.size, *self.hidden, 2 * m))
         critics = random_critics(second, observe.size, m, self.hidden)
         log_temperature = jnp.zeros(())
-        moments = adam(critics), adam(actor), adam(log_temperature)
-        rows = self.capacity * self.worlds * self.steps
+        adam = self.optimiser()
+        optimisers = tuple(map(adam.init, (critics, actor, log_temperature)))
+        rows = self.capacity * self.num_envs * self.steps
         replay = Replay.empty(rows, n, m)
         none, taught = jnp.zeros((), int), jnp.asarray(False)
         return Learner(
@@ -174,7 +181,7 @@ class SAC(AbstractPlanner):
             critics,
             critics,
             log_temperature,
-            moments,
+            optimisers,
             none,
             taught,
             replay,
@@ -230,9 +237,9 @@ def _trained(
         return (learner, rollouts), None
 
     begin, ages, going = jax.random.split(key, 3)
-    S = jax.vmap(fresh)(jax.random.split(begin, sac.worlds))
+    S = jax.vmap(fresh)(jax.random.split(begin, sac.num_envs))
     # Episodes begin and end at different times, or the replay would breathe.
-    t = jax.random.randint(ages, (sac.worlds,), 0, world.horizon)
+    t = jax.random.randint(ages, (sac.num_envs,), 0, world.horizon)
     keys = jax.random.split(going, sac.steps)
     (learner, _), _ = jax.lax.scan(turn, (learner, Rollouts(S, t)), keys)
     # A world that could never be followed has taught nothing.
@@ -268,7 +275,7 @@ def _stepped(
         then = jnp.where(over, fresh(beginning), s2)
         return then, jnp.where(over, 0, t + 1), (s, u, s2, r, usable)
 
-    keys = jax.random.split(key, sac.worlds)
+    keys = jax.random.split(key, sac.num_envs)
     S, t, rows = jax.vmap(one)(rollouts.state, rollouts.steps, keys)
     return Rollouts(S, t), rows
 
@@ -276,7 +283,7 @@ def _stepped(
 def _updated(sac: SAC, learner: Learner, world: World, key: Key) -> Learner:
     """One gradient step of critics, actor and temperature, in this order."""
     which, first, second = jax.random.split(key, 3)
-    replay, t = learner.replay, learner.updates
+    replay = learner.replay
     held = jnp.minimum(replay.count, len(replay.valid))
     rows = jax.random.randint(which, (sac.batch,), 0, held)
     observe = jax.vmap(world.observe)
@@ -294,41 +301,43 @@ def _updated(sac: SAC, learner: Learner, world: World, key: Key) -> Learner:
     after = jnp.min(_values(learner.targets, O2, U2), axis=1) - alpha * log_pi2
     y = sac.scale * r + sac.discount * after
 
-    def misfit(critics: Critics) -> Scalar:
+    def critic_loss(critics: Critics) -> Scalar:
         each = (_values(critics, O, U) - y[:, None]) ** 2
         return jnp.sum(share[:, None] * each)
 
-    def regret(actor: MLP) -> tuple[Scalar, Scalar]:
+    def actor_loss(actor: MLP) -> tuple[Scalar, Scalar]:
         U, log_pi = drawn(actor, O, second)
         worth = jnp.min(_values(critics, O, U), axis=1)
         return jnp.sum(share * (alpha * log_pi - worth)), jnp.sum(share * log_pi)
 
-    def step(parameters: Any, state: Moments, grads: Any) -> Any:
-        rates = jax.tree.map(lambda _: sac.rate, parameters)
-        return adam_step(parameters, state, grads, rates, t=t)
+    adam = sac.optimiser()
 
-    of_critics, of_actor, of_temperature = learner.moments
+    def step(parameters: Any, state: optax.OptState, grads: Any) -> Any:
+        with jax.numpy_dtype_promotion("standard"):  # optax relies on it
+            updates, state = adam.update(grads, state)
+        return optax.apply_updates(parameters, updates), state
+
+    of_critics, of_actor, of_temperature = learner.optimisers
     critics, of_critics = step(
-        learner.critics, of_critics, jax.grad(misfit)(learner.critics)
+        learner.critics, of_critics, jax.grad(critic_loss)(learner.critics)
     )
-    slope, log_pi = jax.grad(regret, has_aux=True)(learner.actor)
+    slope, log_pi = jax.grad(actor_loss, has_aux=True)(learner.actor)
     actor, of_actor = step(learner.actor, of_actor, slope)
     wanted = -float(U.shape[1])
     log_temperature, of_temperature = step(
         learner.log_temperature, of_temperature, -(log_pi + wanted)
     )
     targets = jax.tree.map(
-        lambda old, new: old + sac.slow * (new - old), learner.targets, critics
+        lambda old, new: old + sac.tau * (new - old), learner.targets, critics
     )
-    moments = of_critics, of_actor, of_temperature
     return replace(
         learner,
         actor=actor,
         critics=critics,
         targets=targets,
         log_temperature=log_temperature,
-        moments=moments,
-        updates=t + 1,
+        optimisers=(of_critics, of_actor, of_temperature),
+        updates=learner.updates + 1,
     )
 
 
