@@ -255,8 +255,8 @@ MUTANTS = (
     Mutant(
         "draws with twice the spread",
         LIN,
-        "delta = (tt - posterior.mean)",
-        "delta = 2.0 * (tt - posterior.mean)",
+        "mean + slope\n",
+        "mean + 2.0 * slope\n",
         DRAWS,
     ),
 )

@@ -32,7 +32,7 @@ from sim2gp.design.goals import AbstractGoal
 from sim2gp.design.limits import Limits, excess
 from sim2gp.design.signals import AbstractSignal, Multisine
 from sim2gp.errors import InputError, NotFinite
-from sim2gp.models.training import ADAMW, descend
+from sim2gp.models.training import adamw, descend
 from sim2gp.types import Key, in_float64, single
 
 GRID, SUBSTEP = 0.01, 0.0025  # s, the shortest period and substep that a search sees
@@ -234,7 +234,7 @@ def _climber(
         return *about, cost, C, state, at, total
 
     nothing = jnp.zeros((signal.coefficients, inputs), jnp.float32)
-    _climb.compile_for(*block(nothing, ADAMW.init(nothing), trials[:GUARDS], 0))
+    _climb.compile_for(*block(nothing, adamw().init(nothing), trials[:GUARDS], 0))
 
     def improved(key: Key) -> Array:
         C = BEGIN * signal.random(key, inputs).astype(jnp.float32)
@@ -244,7 +244,7 @@ def _climber(
                 break
             C = 0.8 * C
             far = beyond(C)
-        state = ADAMW.init(C)
+        state = adamw().init(C)
         for i in range(BLOCKS):
             # Of a machine that is lost no gradient can be had.
             near = jnp.where(jnp.isfinite(far), far, -jnp.inf)
@@ -258,7 +258,7 @@ def _climber(
             else:
                 # Nothing is remembered, but how many steps there have been.
                 count = jnp.asarray(BLOCK * (i + 1), jnp.int32)
-                state = optax.tree.set(ADAMW.init(C), count=count)
+                state = optax.tree.set(adamw().init(C), count=count)
         return C
 
     return improved

@@ -25,7 +25,7 @@ from sim2gp.models.function_space_loss import (
 )
 from sim2gp.models.hybrid import HybridBelief
 from sim2gp.models.sim2gp import Sim2GPBelief
-from sim2gp.models.training import ADAMW, chosen, descend
+from sim2gp.models.training import adamw, chosen, descend
 from sim2gp.types import Key, Scalar
 
 BLOCK = 100
@@ -130,7 +130,7 @@ def train(
         batches = features.Minibatches.shuffled(jax.random.fold_in(key, i), rows)
         begin = jnp.where(i < first, 0, jnp.where(i < second, first, second))
         end = jnp.where(i < first, first, jnp.where(i < second, second, last))
-        moments = chosen(i == begin, ADAMW.init(q), moments)
+        moments = chosen(i == begin, adamw().init(q), moments)
         gradient = _gradient(X32, Y, batches, target, objective, N, i < first)
 
         def masked(q: Variational, t: Array, key: Key) -> Variational:
@@ -156,7 +156,7 @@ def train(
         log_noise = jnp.where(i + 1 >= second, settled, q.log_noise)
         return eqx.tree_at(lambda q: q.log_noise, q, log_noise), moments, noise
 
-    start = (q, ADAMW.init(q), q.noise)
+    start = (q, adamw().init(q), q.noise)
     q, _, noise = jax.lax.fori_loop(0, last, block, start)
     return q, noise
 

@@ -27,7 +27,7 @@ from sim2gp.inference.linalg import cholesky, solve_triangular
 from sim2gp.inference.linear_regression import LastLayer
 from sim2gp.models import features
 from sim2gp.models.features import Encoding, Network, stepped
-from sim2gp.models.training import ADAMW, chosen, descend
+from sim2gp.models.training import adamw, chosen, descend
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import Action, Dynamics, Key, Scalar, State, double, in_float64
 
@@ -297,7 +297,7 @@ def type_two(
         return trained, state, chosen(better, new, best)
 
     rates = trained.rates()
-    start = (trained, ADAMW.init(trained), look(trained))
+    start = (trained, adamw().init(trained), look(trained))
     return jax.lax.fori_loop(0, steps // BLOCK, block, start)[2]
 
 

@@ -15,13 +15,16 @@ from jaxtyping import Array, Int
 
 from sim2gp.types import Key, Scalar
 
-#: A step before its rate; never so many bad gradients that one is let through.
-ADAMW = optax.apply_if_finite(
-    optax.chain(optax.scale_by_adam(), optax.add_decayed_weights(1e-4)),
-    max_consecutive_errors=2**31 - 1,
-)
 #: ``(parameters, t, key) -> gradient`` of what is minimised.
 Gradient = Callable[[Any, Array, Key], Any]
+
+
+def adamw(epsilon: float | Array = 1e-8) -> optax.GradientTransformation:
+    """A step before its rate; never so many bad gradients that one is let through."""
+    step = optax.chain(
+        optax.scale_by_adam(eps=epsilon), optax.add_decayed_weights(1e-4)
+    )
+    return optax.apply_if_finite(step, max_consecutive_errors=2**31 - 1)
 
 
 def descend(
@@ -35,14 +38,17 @@ def descend(
     total: Int[Array, ""],
     key: Key,
 ) -> tuple[Any, optax.OptState]:
-    """``steps`` of `ADAMW` from step ``start`` of ``total``."""
+    """``steps`` of `adamw` from step ``start`` of ``total``."""
 
     def step(carry: tuple[Any, optax.OptState], i: Array) -> tuple[tuple, None]:
         parameters, state = carry
         t = start + i
         grads = gradient(parameters, t, jax.random.fold_in(key, t))
+        # Adam's second form (arXiv 1412.6980, section 2): 1e-8 beside the moment that
+        # is still biased. The smallest gradients wait for the others.
+        unbiased = jnp.sqrt(1.0 - 0.999 ** (t + 1).astype(jnp.float32))
         with jax.numpy_dtype_promotion("standard"):  # optax relies on it
-            updates, state = ADAMW.update(grads, state, parameters)
+            updates, state = adamw(1e-8 / unbiased).update(grads, state, parameters)
         # optax's cosine wants to know ``total`` while it is compiled.
         share = jnp.minimum(t / jnp.maximum(total, 1), 1.0).astype(jnp.float32)
         fall = 0.55 + 0.45 * jnp.cos(jnp.pi * share)
