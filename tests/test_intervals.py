@@ -384,7 +384,7 @@ def test_pulls_are_those_of_the_dense_marginal(
     np.testing.assert_allclose(total, A.T @ A, rtol=1e-9)
     away = np.asarray(belief.posterior.mean - belief.prior.mean)
     np.testing.assert_allclose(pulls.scores.sum(axis=0), -away, atol=1e-6)
-    np.testing.assert_allclose(belief.scores.sum(axis=0), -away, atol=1e-6)
+    np.testing.assert_allclose(np.asarray(belief.scores).sum(0), -away, atol=1e-6)
 
 
 def test_the_exact_posterior_of_a_linear_machine_is_laplaces(
