@@ -40,5 +40,5 @@ def linearized(
 
 def physics_at(system: AbstractSystem, tt: Float[Array, " p"], dt: float) -> Bound:
     """The plain simulator at the virtual parameters ``tt``."""
-    record = system.record(system.parameters.values(tt))
+    record = system.record(system.values(tt))
     return system.bind(single(record), dt)
