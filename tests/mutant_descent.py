@@ -176,7 +176,7 @@ DESCENTS = (
     Mutant(
         "windows without data have a say in the noise",
         ESTIMATE,
-        "jnp.mean(noise.weights, where=seen)",
+        "jnp.mean(noise.weights, where=with_data)",
         "jnp.mean(noise.weights)",
         ("test_em.py", "student"),
     ),

@@ -198,7 +198,7 @@ def test_a_project_file_says_what_was_weighed(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("1.24", "-1.0", "E142 a weighed sum that the bounds rule out"),
+        ("1.24", "-1.0", "E142 a measured sum that the bounds rule out"),
         ("0.005", "0.0", "E144"),
         ('"m2"', '"mm2"', "did you mean m2"),
         ('"m2"', '"m1"', "E145 a constant twice"),

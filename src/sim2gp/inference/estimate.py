@@ -287,8 +287,8 @@ def expected_noise(
     freedom: float | Scalar = jnp.inf,
 ) -> Noise:
     """EM's update of noise and weights, from squares expected under the posterior."""
-    seen = jnp.sum(counts, axis=1) > 0
-    mean = jnp.mean(noise.weights, where=seen)
+    with_data = jnp.sum(counts, axis=1) > 0
+    mean = jnp.mean(noise.weights, where=with_data)
     expected = noise.weights @ (squares + spread) / jnp.where(mean > 0, mean, 1.0)
     sd = jnp.sqrt((2.0 * floor**2 + expected) / (2.0 + jnp.sum(counts, axis=0)))
     misfit = jnp.sum(squares / sd[None] ** 2, axis=1)

@@ -37,7 +37,7 @@ class LinearMeasurement:
         if not low < self.value < high:
             raise InputError(
                 "E142",
-                "a weighed sum that the bounds rule out",
+                "a measured sum that the bounds rule out",
                 where=" + ".join(self.of),
                 got=f"{self.value:g}",
                 expected=f"more than {low:g} and less than {high:g}",
