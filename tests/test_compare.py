@@ -58,7 +58,7 @@ def recorded(path: Path, *, seed: int, share: float, seconds: float = 2.5) -> No
         cables = {name: share * value for name, value in SPRINGS.items()}
         values = arm.parameters.nominal() | cables
         params = arm.record({k: jnp.asarray(v, float) for k, v in values.items()})
-        ode = jax.jit(lambda s, a: arm.ode(params, s, a))
+        ode = jax.jit(lambda s, a: machines.ode(arm, params, s, a))
 
         def rate(t: float, s: np.ndarray) -> np.ndarray:
             k = int(np.searchsorted(time, t, side="right")) - 1
