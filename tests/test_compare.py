@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import scipy.integrate
 
+import machines
 from sim2gp.cli import main
 from sim2gp.errors import InputError
 from sim2gp.experiments import compare
