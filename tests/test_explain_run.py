@@ -29,11 +29,11 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two candidates instead of eighteen: the whole library takes minutes."""
 
     def short(system: Any, *, windows: bool = False) -> tuple[sy.Candidate, ...]:
-        kinds = ("theta.spring", "theta.back_emf")
+        kinds = ("theta.spring", "theta.viscous")
         every = sy.candidates(system, windows=windows)
         return tuple(c for c in every if c.name in kinds)
 
-    monkeypatch.setattr("sim2gp.identification.missing_physics.search.library", short)
+    monkeypatch.setattr("sim2gp.identification.missing_physics.search.registered", short)
 
 
 @pytest.fixture(scope="module")
