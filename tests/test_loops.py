@@ -27,10 +27,9 @@ from sim2gp.belief import AbstractBelief
 from sim2gp.data.transitions import Transitions
 from sim2gp.errors import NotFinite, Sim2GPError
 from sim2gp.planning import MPC, AbstractPlanner, MarkovObjective, World, tasks
-from sim2gp.planning import episode as flight
 from sim2gp.planning import loop as loops
 from sim2gp.planning import oracle as references
-from sim2gp.planning.episode import Trajectory, key_for, world_of
+from sim2gp.planning.episode import Purpose, Trajectory, key_for, world_of
 from sim2gp.planning.tasks import Task
 from sim2gp.systems import Furuta
 from sim2gp.types import Key, State
@@ -193,9 +192,9 @@ def test_keys_differ_by_episode_and_purpose() -> None:
     keys = {
         tuple(jax.random.key_data(key_for(KEY, e, purpose)).tolist())
         for e in range(20)
-        for purpose in flight.Purpose
+        for purpose in Purpose
     }
-    assert len(keys) == 20 * len(flight.Purpose)
+    assert len(keys) == 20 * len(Purpose)
 
 
 # ------------------------------------------------------------------- oracles
