@@ -33,7 +33,9 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
         every = sy.candidates(system, windows=windows)
         return tuple(c for c in every if c.name in kinds)
 
-    monkeypatch.setattr("sim2gp.identification.missing_physics.search.registered", short)
+    monkeypatch.setattr(
+        "sim2gp.identification.missing_physics.search.registered", short
+    )
 
 
 @pytest.fixture(scope="module")

@@ -18,6 +18,7 @@ BY_DAY = (
 #: Relative to the largest number of an array: of what is computed in one sweep, of
 #: what a descent finds, of what float32 training finds.
 EXACT, DESCENT, TRAINED = 1e-9, 1e-7, 1e-3
+WIDTH = 0.01  # of a corrected interval's, which effects of a library widen
 
 
 def tolerance(case: str, name: str) -> float:
@@ -27,6 +28,8 @@ def tolerance(case: str, name: str) -> float:
         return TRAINED
     if name in ("draw", "point", "draws"):
         return 1e-6  # float32
+    if name.startswith("corrected"):
+        return WIDTH
     swept = ("factors", "residual", "jacobian")
     return EXACT if group in ("transition", "density") or name in swept else DESCENT
 
@@ -39,6 +42,8 @@ def moved(case: str, found: Arrays) -> list[str]:
     for name, was in before.items():
         now, size = found[name], max(float(np.max(np.abs(was), initial=0.0)), 1e-300)
         assert now.shape == was.shape, name
+        if name == "corrected_mean":  # in its own sd
+            size = float(np.sqrt(np.min(np.diag(before["corrected_covariance"]))))
         gap = float(np.max(np.abs(now - was), initial=0.0)) / size
         if not gap <= tolerance(case, name):
             out.append(f"{name}: {gap:.1e} of its largest number")
