@@ -210,7 +210,7 @@ def test_the_oracle_swings_up_the_published_machine(
 ) -> None:
     oracle = references.fly_oracle(preset(), MPC(), key=KEY)
     assert len(oracle.returns) == 5
-    assert oracle.swings_up
+    assert oracle.reached
     assert oracle.oracle_return == np.median(oracle.returns)
     assert oracle.oracle_return >= least * 250
 

@@ -111,12 +111,12 @@ def test_scores() -> None:
 def test_swung_up_means_the_whole_last_second() -> None:
     task = tasks.furuta_swingup()
     states = jnp.zeros((251, 4)).at[201:, 1].set(3 * math.pi)  # any turn of the pole
-    assert task.swung_up(states)
-    assert task.swung_up(states.at[:201, 1].set(1.0))
+    assert task.reached(states)
+    assert task.reached(states.at[:201, 1].set(1.0))
     for k in (201, 220, 250):
-        assert not task.swung_up(states.at[k, 1].set(math.acos(-0.89)))
-        assert task.swung_up(states.at[k, 1].set(math.acos(-0.91)))
-    assert not task.swung_up(jnp.zeros((251, 4)))
+        assert not task.reached(states.at[k, 1].set(math.acos(-0.89)))
+        assert task.reached(states.at[k, 1].set(math.acos(-0.91)))
+    assert not task.reached(jnp.zeros((251, 4)))
 
 
 @pytest.mark.parametrize("system", [Furuta(), CartPole()])

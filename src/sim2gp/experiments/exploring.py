@@ -209,8 +209,8 @@ def learner_cell(cell: Cell, oracle: Mapping[str, Any]) -> dict[str, Any]:
         states = jnp.asarray(done.trajectory.state)
         told = {
             "nats": float(gained),
-            "upright": float(jnp.mean(task.upright(states))),
-            "swung_up": float(task.swung_up(states)),
+            "upright": float(jnp.mean(task.at_goal(states))),
+            "swung_up": float(task.reached(states)),
         }
         rows.append(tested(done.belief, test, noise) | told)
         before = done.belief

@@ -129,7 +129,7 @@ def world_of(
         planning_horizon=task.planning_horizon,
         planning_iterations=task.planning_iterations,
         noise_colour=task.noise_colour,
-        seen=Observation(jnp.concatenate([task.trusted, past]), task.pole),
+        seen=Observation(jnp.concatenate([task.trusted, past]), task.angle),
     )
 
 

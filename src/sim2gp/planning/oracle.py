@@ -23,7 +23,7 @@ class OracleRun(eqx.Module):
     """Episodes of a planner that knows the truth; fewer than asked if one fell."""
 
     returns: Float[np.ndarray, " E"]
-    swings_up: bool = eqx.field(static=True)
+    reached: bool = eqx.field(static=True)
 
     @property
     def oracle_return(self) -> float:
@@ -36,18 +36,18 @@ def fly_oracle(
 ) -> OracleRun:
     """The upper reference: ``planner`` in a world made of the true dynamics.
 
-    It plans without noise and flies the noisy task. It swings up when the pole stands
-    over the last second of every episode; the first one that does not ends the run.
+    It plans without noise and acts on the noisy task. It has reached the task's goal
+    where every episode ends there; the first one that does not ends the run.
     """
     checks.count("fly_oracle", episodes=episodes)
-    returns, up = [], True
+    returns, reached = [], True
     world = oracle_world(task)
     for trajectory in flights(task, world, planner, key=key, episodes=episodes):
         returns.append(float(trajectory.total))
-        up = bool(task.swung_up(jnp.asarray(trajectory.state)))
-        if not up:
+        reached = bool(task.reached(jnp.asarray(trajectory.state)))
+        if not reached:
             break
-    return OracleRun(np.asarray(returns), up)
+    return OracleRun(np.asarray(returns), reached)
 
 
 def flights(
@@ -103,7 +103,7 @@ def accept_truth(
         except NotFinite:
             diverged += 1
             continue
-        if oracle.swings_up:
+        if oracle.reached:
             return AcceptedTruth(task, oracle, attempt)
     raise Sim2GPError(
         "E204",

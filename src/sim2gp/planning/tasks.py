@@ -59,7 +59,8 @@ class Task(eqx.Module):
     state_bound: `TRUSTED` times the box of states that a model is trusted in.
     horizon: steps of ``dt`` seconds in an episode.
     history: past actions that the state of ``dynamics`` carries (delayed inputs).
-    pole: which state is the angle that must end upright.
+    angle: the state whose turns do not count: a policy sees its sine and cosine.
+    goal: whether one state is where the task is to end, or None where nobody asks.
     planning_horizon, planning_iterations, noise_colour: what suits this machine.
     truth: the hidden constants by name, for reports and tests only.
 
@@ -80,7 +81,8 @@ class Task(eqx.Module):
     horizon: int = eqx.field(static=True, default=250)
     dt: float = eqx.field(static=True, default=0.02)
     history: int = eqx.field(static=True, default=0)
-    pole: int = eqx.field(static=True, default=1)
+    angle: int | None = eqx.field(static=True, default=None)
+    goal: Callable[[State], Bool[Array, ""]] | None = None
     planning_horizon: int = eqx.field(static=True, default=30)
     planning_iterations: int = eqx.field(static=True, default=4)
     noise_colour: float = eqx.field(static=True, default=1.0)
@@ -96,7 +98,7 @@ class Task(eqx.Module):
         lengths = {"horizon": self.horizon, "planning_horizon": self.planning_horizon}
         checks.count("Task", **lengths, planning_iterations=self.planning_iterations)
         checks.whole("Task", history=self.history)
-        checks.index("Task", self.size, pole=self.pole)
+        checks.index("Task", self.size, angle=self.angle)
         self._check_functions()
 
     def _check_functions(self) -> None:
@@ -139,14 +141,25 @@ class Task(eqx.Module):
         """Half-widths of the box of states that a model is trusted in."""
         return self.state_bound / TRUSTED
 
-    def upright(self, states: Float[Array, "*T n"]) -> Bool[Array, "*T"]:
-        """Whether the pole stands, per state."""
-        return jnp.cos(states[..., self.pole]) < UPRIGHT_COSINE
+    def at_goal(self, states: Float[Array, "T n"]) -> Bool[Array, " T"]:
+        """Whether each state is where the task is to end; all are without a goal."""
+        if self.goal is None:
+            return jnp.ones(len(states), bool)
+        return jax.vmap(self.goal)(states)
 
-    def swung_up(self, states: Float[Array, "T n"]) -> Bool[Array, ""]:
-        """Whether the pole stands over the whole last second of an episode."""
+    def reached(self, states: Float[Array, "T n"]) -> Bool[Array, ""]:
+        """Whether the goal holds over the whole last second of an episode."""
         last = round(1.0 / self.dt)
-        return jnp.all(self.upright(states[-last:]))
+        return jnp.all(self.at_goal(states[-last:]))
+
+
+class PoleUpright(eqx.Module):
+    """The goal of a swing-up: the pole, one of the states, stands (hanging = 0)."""
+
+    pole: int = eqx.field(static=True)
+
+    def __call__(self, s: State) -> Bool[Array, ""]:
+        return jnp.cos(s[self.pole]) < UPRIGHT_COSINE
 
 
 class FurutaReward(eqx.Module):
@@ -214,6 +227,8 @@ def furuta_swingup(truth: Any = None, effects: Sequence[AbstractPart] = ()) -> T
         start=_single(0.0, 0.0, 0.0, 0.0),
         start_sd=_single(0.02, 0.02, 0.02, 0.02),
         state_bound=TRUSTED * _single(2.0, math.inf, 15.0, 25.0),
+        angle=1,
+        goal=PoleUpright(1),
         planning_horizon=45,
         noise_colour=2.0,
     )
@@ -234,6 +249,8 @@ def cartpole_swingup(truth: Any = None, effects: Sequence[AbstractPart] = ()) ->
         start=_single(0.0, 0.0, 0.0, 0.0),
         start_sd=_single(0.0, 0.02, 0.0, 0.02),
         state_bound=TRUSTED * _single(0.35, math.inf, 1.5, 15.0),
+        angle=1,
+        goal=PoleUpright(1),
         planning_horizon=50,
         planning_iterations=3,
         noise_colour=2.0,
