@@ -29,7 +29,7 @@ from sbx import SAC as Theirs
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sim2gp.data.transitions import Transitions
-from sim2gp.experiments.swingup import Cell, fly_cell, meeting, reference
+from sim2gp.experiments.swingup import Cell, meeting, reference, run_cell
 from sim2gp.planning import SAC, World
 from sim2gp.planning.episode import Purpose, key_for, oracle_world
 from sim2gp.planning.mpc import from_unit
@@ -104,7 +104,7 @@ def flown(task: Task, act: Callable[[jax.Array], jax.Array], key: jax.Array) -> 
 def met(machine: str, seed: int, out: Path) -> tuple[Task, float]:
     """A seed's hidden machine, and what sampling MPC in the true world returns."""
     cell = Cell(machine, "nominal", "SIM2GP", seed, 1)
-    oracle = fly_cell(reference(cell), out)
+    oracle = run_cell(reference(cell), out)
     task, _, _ = meeting(cell, "SIM2GP", int(oracle["redrawn"]))
     return task, float(oracle["oracle_return"])
 

@@ -60,7 +60,7 @@ def test_no_flipped_bit_of_a_stored_cell_is_accepted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A bit of every byte, one after the other, and many an end cut off."""
-    swingup.fly_cell(CELL, tmp_path / "fig2")
+    swingup.run_cell(CELL, tmp_path / "fig2")
     path = tmp_path / "fig2.cells" / f"{CELL.name}.json"
     good = path.read_bytes()
 
@@ -68,13 +68,13 @@ def test_no_flipped_bit_of_a_stored_cell_is_accepted(
         raise Computed
 
     monkeypatch.setattr(swingup, "learner_cell", again)
-    assert swingup.fly_cell(CELL, tmp_path / "fig2")["returns"] == [60.0, 70.0]
+    assert swingup.run_cell(CELL, tmp_path / "fig2")["returns"] == [60.0, 70.0]
     bad = [good[:end] for end in range(0, len(good), 32)]
     accepted = 0
     for content in [*bad, *flips(good, 9)]:
         path.write_bytes(content)
         try:
-            swingup.fly_cell(CELL, tmp_path / "fig2")
+            swingup.run_cell(CELL, tmp_path / "fig2")
             accepted += 1
         except (InputError, Computed):
             continue
@@ -82,9 +82,9 @@ def test_no_flipped_bit_of_a_stored_cell_is_accepted(
     # Nor is a damaged one used because older ones are; computed again it may be.
     path.write_bytes(bad[-1])
     with pytest.raises(InputError, match=r"E186 .* 1 damaged"):
-        swingup.fly_cell(CELL, tmp_path / "fig2", "keep")
+        swingup.run_cell(CELL, tmp_path / "fig2", "keep")
     with pytest.raises(Computed):
-        swingup.fly_cell(CELL, tmp_path / "fig2", "refresh")
+        swingup.run_cell(CELL, tmp_path / "fig2", "refresh")
 
 
 def unmarked(path: Path) -> None:

@@ -217,11 +217,11 @@ def test_claims_count_what_was_answered() -> None:
 def test_the_study_plants_what_it_says(machine: str, name: str) -> None:
     """The same hidden constants and noise: without the effect the motion differs."""
     key, planted = jax.random.key(4), study.PLANTED[machine][name]
-    (S0, A0), (S1, _) = study.flights(machine, None, key)
+    (S0, A0), (S1, _) = study.episodes_in(machine, None, key)
     assert S0.shape == (251, 4)
     assert A0.shape == (250, 1)
     assert not np.allclose(S0, S1)
-    (S, _), _ = study.flights(machine, planted, key)
+    (S, _), _ = study.episodes_in(machine, planted, key)
     assert np.all(np.isfinite(S))
     np.testing.assert_array_equal(S[0], S0[0])
     assert np.max(np.abs(S[:50] - S0[:50])) > 1e-3

@@ -87,7 +87,7 @@ def test_windows_of_a_second_share_an_error(run: Path) -> None:
 @pytest.mark.usefixtures("few")
 @pytest.mark.nightly  # the way of `test_a_spring_is_found_in_logs_and_added`
 def test_a_demo_is_explained_by_its_own_flights(tmp_path: Path) -> None:
-    episodes = study.flights("furuta", SPRING, jax.random.key(6))
+    episodes = study.episodes_in("furuta", SPRING, jax.random.key(6))
     with new_run(tmp_path / "demo", "demo") as writer:
         writer.write_summary(
             {

@@ -128,15 +128,15 @@ def test_a_finished_cell_is_not_flown_again(tmp_path: Path, monkeypatch):
     assert cells.load(cell.name, cell.arguments) is None
     saved = cells.save(cell.name, cell.arguments, {"returns": (1.0, np.float64(2.0))})
     assert saved == {"returns": [1.0, 2.0]}
-    assert swingup.fly_cell(cell, tmp_path / "fig2") == saved
+    assert swingup.run_cell(cell, tmp_path / "fig2") == saved
     assert not [f for f in cells.folder.iterdir() if f.name.startswith(".")]
     # Fewer episodes are there as well; more are not, nor those of another planner.
     fewer = dataclasses.replace(cell, episodes=1)
-    assert swingup.fly_cell(fewer, tmp_path / "fig2") == saved
+    assert swingup.run_cell(fewer, tmp_path / "fig2") == saved
     monkeypatch.setattr(swingup, "learner_cell", lambda cell, redrawn: {"returns": []})
     monkeypatch.setattr(swingup, "oracle_cell", lambda cell: ORACLE)
     more = dataclasses.replace(cell, episodes=4)
-    flown = swingup.fly_cell(more, tmp_path / "fig2")
+    flown = swingup.run_cell(more, tmp_path / "fig2")
     assert flown == {"returns": []}
     for other in (MPC(horizon=7), MPC(lengths=(0.5, 1.0))):
         monkeypatch.setitem(swingup.PLANNERS, "mpc", other)
@@ -165,11 +165,11 @@ def test_a_quick_look_has_a_planner_and_cells_of_its_own(monkeypatch):
     used = []
     trained = []
 
-    def fly(task, model, planner, **rest):
+    def run_episode(task, model, planner, **rest):
         used.append(planner)
         trained.append((model.steps, model.refit_steps))
 
-    monkeypatch.setattr(swingup, "psrl", fly)
+    monkeypatch.setattr(swingup, "psrl", run_episode)
     swingup.learner_cell(quick, 0)
     swingup.learner_cell(full, 0)
     assert trained[0] == tuple(quick.arguments["training"].values()) < trained[1]

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool
 
 from sim2gp.errors import InputError, NotFinite
 from sim2gp.planning import AbstractPlanner, World
-from sim2gp.planning.episode import Purpose, fly, key_for, oracle_world
+from sim2gp.planning.episode import Purpose, key_for, oracle_world, run_episode
 from sim2gp.planning.mpc import from_unit
 from sim2gp.planning.tasks import MACHINES, Task, draw_truth, furuta_swingup
 from sim2gp.robot.gymnasium import NAMES, _kind, after, environment, register
@@ -88,7 +88,7 @@ def test_an_episode_is_the_flights_to_the_last_bit(
     planner = Played(jnp.asarray(shares))
     state = planner.init(world, key=key)
     flying = key_for(key, 2, Purpose.EPISODE)
-    expected, _ = jax.jit(fly)(task, planner, state, world, key=flying)
+    expected, _ = jax.jit(run_episode)(task, planner, state, world, key=flying)
     np.testing.assert_array_equal(found, expected.state)
     rewards = np.asarray([reward for _, reward, *_ in steps], np.float32)
     np.testing.assert_array_equal(rewards, expected.reward)

@@ -101,7 +101,7 @@ def test_what_is_added_to_a_run_changes_nothing() -> None:
     def evaluate(report: loops.Episode) -> None:
         seen.append(report.index)
         task = mass_task()
-        references.fly_oracle(task, SMALL, key=KEY, episodes=1)
+        references.run_oracle(task, SMALL, key=KEY, episodes=1)
         assert report.belief.parameters()[0].shape == (1,)
 
     assert same(plain, run(on_episode=evaluate))
@@ -208,7 +208,7 @@ def test_keys_differ_by_episode_and_purpose() -> None:
 def test_the_oracle_swings_up_the_published_machine(
     preset: Callable[[], Task], least: float
 ) -> None:
-    oracle = references.fly_oracle(preset(), MPC(), key=KEY)
+    oracle = references.run_oracle(preset(), MPC(), key=KEY)
     assert len(oracle.returns) == 5
     assert oracle.reached
     assert oracle.oracle_return == np.median(oracle.returns)
@@ -228,7 +228,7 @@ def test_truths_are_redrawn_until_the_oracle_swings_up(
             raise NotFinite("E203", "state 72")
         return references.OracleRun(np.asarray([1.0, 3.0, 2.0]), len(asked) == 3)
 
-    monkeypatch.setattr(references, "fly_oracle", judge)
+    monkeypatch.setattr(references, "run_oracle", judge)
     arguments = (tasks.furuta_swingup, Furuta(), MPC())
     accepted = references.accept_truth(*arguments, key=KEY)
     assert accepted.redrawn == 2

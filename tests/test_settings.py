@@ -195,7 +195,7 @@ IMPOSSIBLE = {
     "limit's cost": (lambda: run(sg.psal, limit_cost=-1.0), "E148"),
     "optimism": (lambda: run(sg.optimism, weight=NAN), "E148"),
     "no oracle": (
-        lambda: oracle.fly_oracle(mass_task(), sg.MPC(), key=KEY, episodes=0),
+        lambda: oracle.run_oracle(mass_task(), sg.MPC(), key=KEY, episodes=0),
         "E148",
     ),
     # Models, windows, designs

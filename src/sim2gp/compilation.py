@@ -22,7 +22,7 @@ R = TypeVar("R")
 _COMPILER = ThreadPoolExecutor(1, thread_name_prefix="compiler")
 
 
-class ahead(Generic[P, R]):
+class compile_async(Generic[P, R]):
     """A jitted function of arrays and static values that can be compiled in advance.
 
     Called with what was announced by `compile_for`, it waits for that compilation and

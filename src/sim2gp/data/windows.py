@@ -8,11 +8,11 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sim2gp.systems.simulate import Stretch
+from sim2gp.systems.simulate import HeldInputs
 from sim2gp.types import AnyArray
 
 
-class Windows(Stretch):
+class Windows(HeldInputs):
     """Padded windows, a row for each end of an integration step.
 
     Row 0 is the start, padding rows have zero length, and a row without a sample (where

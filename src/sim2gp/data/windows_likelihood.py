@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sim2gp.compilation import ahead
+from sim2gp.compilation import compile_async
 from sim2gp.data.windows import Windows
 from sim2gp.inference.arrowhead import Blocks, Noise, eliminate
 from sim2gp.inference.estimate import Estimate
@@ -127,7 +127,7 @@ def compile_linearise(system: AbstractSystem, windows: Windows) -> None:
     _linearise.compile_for(likelihood, e, prior.mean, prior.scale)
 
 
-@ahead
+@compile_async
 def _linearise(
     likelihood: WindowsLikelihood,
     e: Float[Array, "W n"],

@@ -22,7 +22,7 @@ from sim2gp.inference.least_squares import over
 from sim2gp.inference.linalg import triangular
 from sim2gp.inference.linearized import value_and_jacobian
 from sim2gp.systems.base import WINDOW_SUBSTEP, AbstractSystem
-from sim2gp.systems.simulate import DELAY_BLUR, Stretch, simulate
+from sim2gp.systems.simulate import DELAY_BLUR, HeldInputs, simulate
 
 #: Commands over each period, in the units of the inputs.
 Commands = Float[Array, "T m"]
@@ -171,7 +171,7 @@ def after(belief: Gaussian, A: Float[Array, "rows p"]) -> Float[Array, "p p"]:
     return over(belief.scale, triangular(jnp.concatenate([A, eye])))
 
 
-def _piece(experiment: Experiment, U: Commands, first: Any, periods: int) -> Stretch:
+def _piece(experiment: Experiment, U: Commands, first: Any, periods: int) -> HeldInputs:
     """Some periods, and the inputs that reach them; at rest before the experiment."""
     period, count = experiment.period, experiment.substeps
     reach = experiment.system.longest_delay + DELAY_BLUR
@@ -184,4 +184,4 @@ def _piece(experiment: Experiment, U: Commands, first: Any, periods: int) -> Str
     area = jax.lax.dynamic_slice_in_dim(area, first, rows)
     knots = period * (jnp.arange(rows, dtype=U.dtype) - before)
     span = jnp.full(periods * count + 1, period / count, U.dtype).at[0].set(0.0)
-    return Stretch(span, knots, area - area[:1])
+    return HeldInputs(span, knots, area - area[:1])

@@ -20,7 +20,7 @@ import optax
 from jaxtyping import Array, Float
 
 from sim2gp import checks
-from sim2gp.compilation import ahead
+from sim2gp.compilation import compile_async
 from sim2gp.design.experiment import (
     Experiment,
     after,
@@ -264,7 +264,7 @@ def _climber(
     return improved
 
 
-@ahead
+@compile_async
 def _climb(
     signal: AbstractSignal,
     experiment: Experiment,
@@ -328,7 +328,7 @@ def _worth_at(
     return goal.nats(experiment.belief.scale, scale), scale
 
 
-@ahead
+@compile_async
 def _worth(
     experiment: Experiment, goal: AbstractGoal, draws: Array, U: Array
 ) -> tuple[Array, Array, Array]:
@@ -351,7 +351,7 @@ def _states(experiment: Experiment, U: Array, machines: Array) -> Array:
 _sensitivity = eqx.filter_jit(sensitivity_at)
 
 
-@ahead
+@compile_async
 def _checked(
     experiment: Experiment, limits: Limits, U: Array, draws: Array
 ) -> tuple[Array, Array]:

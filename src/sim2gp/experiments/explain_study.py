@@ -150,7 +150,7 @@ def planted_task(machine: str, planted: AbstractPart | None, key: Key) -> Task:
 
 
 @eqx.filter_jit
-def _fly(
+def _run_episodes(
     task: Task, centre: float, fastest: float, pump: Array, key: Key
 ) -> tuple[Array, Array]:
     reset, process, drive = jax.random.split(key, 3)
@@ -171,7 +171,7 @@ def _fly(
     return jnp.concatenate([s0[None, : task.size], S]), A
 
 
-def flights(
+def episodes_in(
     machine: str, planted: AbstractPart | None, key: Key
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """States (T + 1, n) and inputs (T, m) of two episodes on one hidden machine."""
@@ -180,7 +180,7 @@ def flights(
     return [
         jax.tree.map(
             np.asarray,
-            _fly(
+            _run_episodes(
                 task,
                 CENTRE[machine],
                 FASTEST[machine],
@@ -195,7 +195,7 @@ def flights(
 def data_of(machine: str, planted: AbstractPart | None, key: Key) -> OneStepData:
     """What `explain` sees of them."""
     make, _ = MACHINES[machine]
-    return OneStepData(make(), flights(machine, planted, key))
+    return OneStepData(make(), episodes_in(machine, planted, key))
 
 
 def scaled(planted: AbstractPart, strength: float) -> AbstractPart:

@@ -32,7 +32,7 @@ from sim2gp.planning import ICEM, MPC, SAC, AbstractPlanner, World
 from sim2gp.planning.domain_randomisation import randomised_world
 from sim2gp.planning.episode import Purpose, Trajectory, key_for, oracle_world
 from sim2gp.planning.loop import psrl
-from sim2gp.planning.oracle import accept_truth, flights
+from sim2gp.planning.oracle import accept_truth, episodes_in
 from sim2gp.planning.tasks import MACHINES, Task, draw_truth, hanging_return, score
 from sim2gp.runs import Progress
 from sim2gp.runs.cells import Cells, Old
@@ -229,21 +229,21 @@ def learner_cell(cell: Cell, redrawn: int) -> dict[str, Any]:
     returns: list[float] = []
     started, failure = time.perf_counter(), None
     try:
-        _fly(cell, redrawn, lambda flown: returns.append(float(flown.total)))
+        _run_episodes(cell, redrawn, lambda flown: returns.append(float(flown.total)))
     except (NotConverged, NotFinite) as error:
         failure = str(error)
     seconds = time.perf_counter() - started
     return {"returns": returns, "failure": failure, "seconds": seconds}
 
 
-def _fly(cell: Cell, redrawn: int, note: Callable[[Trajectory], None]) -> None:
+def _run_episodes(cell: Cell, redrawn: int, note: Callable[[Trajectory], None]) -> None:
     """The episodes of a learner, or of a policy that is trained elsewhere."""
     key = jax.random.key(cell.seed)
     if cell.method in TRAINED:
         task, _, _ = meeting(cell, "SIM2GP", redrawn)
         world = TRAINED[cell.method](task, MACHINES[cell.machine][0]())
         planner, episodes = cell.planner, cell.episodes
-        for flown in flights(task, world, planner, key=key, episodes=episodes):
+        for flown in episodes_in(task, world, planner, key=key, episodes=episodes):
             note(flown)
         return
     task, model, history = meeting(cell, cell.method, redrawn)
@@ -260,7 +260,7 @@ def _fly(cell: Cell, redrawn: int, note: Callable[[Trajectory], None]) -> None:
     )
 
 
-def fly_cell(cell: Cell, out: Path, old: Old = "refuse") -> dict[str, Any]:
+def run_cell(cell: Cell, out: Path, old: Old = "refuse") -> dict[str, Any]:
     """A cell's values, from the disk if it was run for as many episodes (E186)."""
     cells = Cells(out, __file__, old)
     stored = cells.load(cell.name, cell.arguments)
@@ -271,7 +271,7 @@ def fly_cell(cell: Cell, out: Path, old: Old = "refuse") -> dict[str, Any]:
     if cell.method == "oracle":
         values = oracle_cell(cell)
     else:
-        oracle = fly_cell(reference(cell), out, old)
+        oracle = run_cell(reference(cell), out, old)
         values = learner_cell(cell, int(oracle["redrawn"]))
     return cells.save(cell.name, cell.arguments, values)
 
@@ -307,7 +307,7 @@ def study(
     stored = Cells(out, __file__, old)
     named = [(cell.name, cell.arguments) for cell in dict.fromkeys(chain(*stages))]
     stored.check(named)
-    work = partial(fly_cell, out=out, old=old)
+    work = partial(run_cell, out=out, old=old)
     flown = in_stages(stages, work, alike, workers=workers, progress=progress)
     table = {
         group: scores(

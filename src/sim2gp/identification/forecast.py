@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from sim2gp.compilation import ahead
+from sim2gp.compilation import compile_async
 from sim2gp.data.grid import PERIOD, Grid
 from sim2gp.data.windows import Windows
 from sim2gp.inference.gaussian import LOG_2PI, Gaussian
@@ -107,7 +107,7 @@ def compile_forecast(system: AbstractSystem, grid: Grid) -> None:
     _forecast.compile_for(system, system.parameters.prior(), first)
 
 
-@ahead
+@compile_async
 def _forecast(
     system: AbstractSystem, posterior: Gaussian, windows: Windows
 ) -> tuple[Array, Array, Array, Array]:

@@ -161,7 +161,7 @@ def begin(
     return Moment(start, past, planner_state, memory), start[: task.size]
 
 
-def fly_steps(
+def run_steps(
     task: Task,
     planner: AbstractPlanner,
     moment: Moment,
@@ -197,18 +197,18 @@ def fly_steps(
     return jax.lax.scan(step, moment, steps)
 
 
-def fly(
+def run_episode(
     task: Task, planner: AbstractPlanner, planner_state: Any, world: World, *, key: Key
 ) -> tuple[Trajectory, Any]:
     """One episode as one scan: pure, for `jit` and `vmap`; nothing is checked."""
     moment, start = begin(task, planner_state, world, key=key)
     steps = jnp.arange(task.horizon)
-    moment, (states, *rest) = fly_steps(task, planner, moment, world, steps, key=key)
+    moment, (states, *rest) = run_steps(task, planner, moment, world, steps, key=key)
     states = jnp.concatenate([start[None], states])
     return Trajectory(states, *rest), moment.planner
 
 
-_fly_steps = eqx.filter_jit(fly_steps)
+_fly_steps = eqx.filter_jit(run_steps)
 
 
 @of_callbacks()

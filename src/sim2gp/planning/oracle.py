@@ -31,7 +31,7 @@ class OracleRun(eqx.Module):
         return float(np.median(self.returns))
 
 
-def fly_oracle(
+def run_oracle(
     task: Task, planner: AbstractPlanner, *, key: Key, episodes: int = 5
 ) -> OracleRun:
     """The upper reference: ``planner`` in a world made of the true dynamics.
@@ -39,10 +39,10 @@ def fly_oracle(
     It plans without noise and acts on the noisy task. It has reached the task's goal
     where every episode ends there; the first one that does not ends the run.
     """
-    checks.count("fly_oracle", episodes=episodes)
+    checks.count("run_oracle", episodes=episodes)
     returns, reached = [], True
     world = oracle_world(task)
-    for trajectory in flights(task, world, planner, key=key, episodes=episodes):
+    for trajectory in episodes_in(task, world, planner, key=key, episodes=episodes):
         returns.append(float(trajectory.total))
         reached = bool(task.reached(jnp.asarray(trajectory.state)))
         if not reached:
@@ -50,7 +50,7 @@ def fly_oracle(
     return OracleRun(np.asarray(returns), reached)
 
 
-def flights(
+def episodes_in(
     task: Task, world: World, planner: AbstractPlanner, *, key: Key, episodes: int
 ) -> Iterator[Trajectory]:
     """Episodes of a planner that learns nothing of the machine but what its world is.
@@ -99,7 +99,7 @@ def accept_truth(
         task = preset(record)
         key_a = jax.random.fold_in(key, attempt)
         try:
-            oracle = fly_oracle(task, planner, key=key_a)
+            oracle = run_oracle(task, planner, key=key_a)
         except NotFinite:
             diverged += 1
             continue

@@ -18,7 +18,7 @@ from sim2gp.types import AnyArray
 DELAY_BLUR = 4e-3  # s, of inputs that may be delayed
 
 
-class Stretch(eqx.Module):
+class HeldInputs(eqx.Module):
     """The steps of a simulation, and the inputs that reach it.
 
     ``span`` is the time since the previous row, s. ``knots`` and ``area`` are the times
@@ -32,7 +32,7 @@ class Stretch(eqx.Module):
 
 
 def inputs_of(
-    window: Stretch, delays: Float[Array, " m"], blur: float = 0.0
+    window: HeldInputs, delays: Float[Array, " m"], blur: float = 0.0
 ) -> Float[Array, "L m"]:
     """Mean delayed input over the step that ends at each row of one window.
 
@@ -77,7 +77,7 @@ def _second_integral(
 def simulate(
     system: AbstractSystem,
     params: Any,
-    window: Stretch,
+    window: HeldInputs,
     x0: Float[Array, " n"],
 ) -> Float[Array, "L n"]:
     """States at the rows of one window, from ``x0`` at its first."""

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim2gp.compilation import ahead
 from sim2gp.types import in_float64
 
 
@@ -17,7 +16,7 @@ class Traced:
     def __init__(self) -> None:
         self.threads: list[str] = []
 
-        @ahead
+        @compile_async
         def power(x: Any, n: int) -> Any:
             """x to the n."""
             self.threads.append(threading.current_thread().name)
@@ -68,7 +67,7 @@ def test_another_static_value_is_another_function() -> None:
 
 @in_float64
 def test_what_compilation_raises_reaches_the_caller() -> None:
-    @ahead
+    @compile_async
     def broken(x: Any) -> Any:
         raise ValueError("not today")
 

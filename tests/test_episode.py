@@ -24,7 +24,7 @@ from mass_task import (
 )
 from sim2gp.errors import NotFinite, Sim2GPWarning
 from sim2gp.planning import AbstractPlanner, MarkovObjective, World, tasks
-from sim2gp.planning.episode import Trajectory, episode, fly, oracle_world, world_of
+from sim2gp.planning.episode import Trajectory, episode, oracle_world, world_of
 from sim2gp.systems import Delay
 from sim2gp.types import Key, State
 
@@ -58,7 +58,9 @@ def test_vmapped_seeds_are_looped_seeds() -> None:
     world = oracle_world(task)
     state = start(task, SMALL, world)
     keys = jax.random.split(KEY, 4)
-    batch, _ = jax.vmap(lambda key: fly(task, SMALL, state, world, key=key))(keys)
+    batch, _ = jax.vmap(lambda key: run_episode(task, SMALL, state, world, key=key))(
+        keys
+    )
     for i, key in enumerate(keys):
         one = episode(task, SMALL, state, world, key=key)[0]
         np.testing.assert_allclose(batch.state[i], one.state, atol=1e-4)
