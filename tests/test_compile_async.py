@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sim2gp.compilation import compile_async
 from sim2gp.types import in_float64
 
 

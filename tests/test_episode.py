@@ -24,7 +24,13 @@ from mass_task import (
 )
 from sim2gp.errors import NotFinite, Sim2GPWarning
 from sim2gp.planning import AbstractPlanner, MarkovObjective, World, tasks
-from sim2gp.planning.episode import Trajectory, episode, oracle_world, world_of
+from sim2gp.planning.episode import (
+    Trajectory,
+    episode,
+    oracle_world,
+    run_episode,
+    world_of,
+)
 from sim2gp.systems import Delay
 from sim2gp.types import Key, State
 
