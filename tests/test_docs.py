@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 
+from house_rules import LAYERS
 from sim2gp import cli
 from sim2gp.cli.commands import COMMANDS
 from sim2gp.data.logs.arrays import missing
@@ -335,3 +336,22 @@ def test_the_theory_names_code_and_tests_that_are_there() -> None:
     numbers = list(dict.fromkeys(int(row[0].strip("()")) for row in numbered))
     assert sorted(numbers) == list(range(1, max(numbers) + 1))
     assert all(len(row) == 4 and "`test_" in row[3] for row in numbered)
+
+
+def test_the_architecture_is_that_of_the_tree() -> None:
+    """Files that are there, with their lines; every folder; the layers as enforced."""
+    text = (DOCS / "architecture.md").read_text(encoding="utf-8")
+    paths = set(re.findall(r"`([\w/]+\.py)`", text))
+    lost = {path for path in paths if not (PACKAGE / path).is_file()}
+    assert lost <= {"tests/house_rules.py"}
+    height = {}
+    for layer, *cells in (row for row in rows(text) if row[0].isdigit()):
+        for room in re.findall(r"`(\w+)(?:/|\.py)`", cells[0]):
+            height[room] = int(layer)
+    for layer, rooms in enumerate(LAYERS, start=1):
+        assert {room for room, at in height.items() if at == layer} == rooms
+    for line in re.findall(r"^- (`.*\(\d+ lines\))$", text.replace("\n  ", " "), re.M):
+        files = re.findall(r"`([\w/]+\.py)`", line)
+        found = sum(len((PACKAGE / f).read_text().splitlines()) for f in files)
+        told = int(re.findall(r"\((\d+) lines\)", line)[0])
+        assert abs(found - told) <= 0.1 * found, line
