@@ -94,8 +94,8 @@ def of_priors(place: str) -> dict[str, Change]:
         "low": ("low = 0.001, high = 0.02", "low = 0.002, high = 0.02"),
         "high": ("low = 0.001, high = 0.02", "low = 0.001, high = 0.03"),
         "map": (
-            'low = 0.001, high = 0.02, map = "box"',
-            'low = 0.001, high = 0.02, map = "log_box"',
+            'low = 0.001, high = 0.02, map = "bounded"',
+            'low = 0.001, high = 0.02, map = "log_bounded"',
         ),
     }
     section, name = place.split("] ")

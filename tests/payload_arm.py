@@ -13,10 +13,10 @@ from sim2gp.systems import ODE, Channel
 ARM, GRAVITY = 0.3, 9.81  # m, m/s^2
 TRUTH = {"inertia": 0.02, "weight": 1.2, "damping": 0.05, "payload": 0.15}
 TABLE = (
-    Parameter("inertia", "kg m^2", "about the joint", "log_box", 0.005, 0.08),
-    Parameter("weight", "N m", "moment of the arm's weight", "log_box", 0.3, 5.0),
-    Parameter("damping", "N m s/rad", "viscous friction", "log_box", 0.005, 0.5),
-    Parameter("payload", "kg", "mass at the tip", "box", 0.0, 0.5),
+    Parameter("inertia", "kg m^2", "about the joint", "log_bounded", 0.005, 0.08),
+    Parameter("weight", "N m", "moment of the arm's weight", "log_bounded", 0.3, 5.0),
+    Parameter("damping", "N m s/rad", "viscous friction", "log_bounded", 0.005, 0.5),
+    Parameter("payload", "kg", "mass at the tip", "bounded", 0.0, 0.5),
 )
 STATES = Channel("q", "rad"), Channel("q.velocity", "rad/s")
 ACTIONS = (Channel("torque", "N m", low=-2.0, high=2.0),)

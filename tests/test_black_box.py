@@ -27,8 +27,8 @@ from sim2gp.types import in_float64
 
 DT = 0.05
 TABLE = (
-    Parameter("gravity", "1/s^2", "gravity over length", "log_box", 3.0, 30.0),
-    Parameter("damping", "1/s", "viscous friction", "log_box", 0.05, 5.0),
+    Parameter("gravity", "1/s^2", "gravity over length", "log_bounded", 3.0, 30.0),
+    Parameter("damping", "1/s", "viscous friction", "log_bounded", 0.05, 5.0),
 )
 STATES = Channel("q", "rad", angle=True), Channel("q.velocity", "rad/s")
 ACTIONS = (Channel("torque", "1/s^2", low=-5.0, high=5.0),)

@@ -160,7 +160,7 @@ def test_no_delay_is_longer_than_inputs_are_kept() -> None:
     for wrong in (0.021, -0.001):
         with pytest.raises(InputError, match=r"E141 torque\.delay of one"):
             with_variants(machine, [Variant("a", (("torque.delay", wrong),))])
-    long = {"torque.delay @ a": Parameter("", "", "", "box", 0.0, 0.03)}
+    long = {"torque.delay @ a": Parameter("", "", "", "bounded", 0.0, 0.03)}
     with pytest.raises(InputError, match=r"from 0 to 0\.03 s"):
         with_variants(machine, [Variant("a", own=("torque.delay",))], long)
 
@@ -347,7 +347,7 @@ def test_one_step_is_fitted_jointly_as_well(getkey: Any) -> None:
 
 def test_rows_on_the_host_have_constants_of_their_own() -> None:
     """A known value beyond the prior's bounds is simulated as it is."""
-    inside = Parameter("k", "1", "gain", "box", 0.5, 2.0)
+    inside = Parameter("k", "1", "gain", "bounded", 0.5, 2.0)
     asked: list[float] = []
 
     def step(params: Any, s: Any, a: Any, h: Any) -> Any:

@@ -23,8 +23,8 @@ def test_moments_agree_with_monte_carlo():
     low, high = 0.5, 2.0
     table = Parameters(
         (
-            Parameter("box", "", "", "box", low, high),
-            Parameter("log_box", "", "", "log_box", low, high),
+            Parameter("bounded", "", "", "bounded", low, high),
+            Parameter("log_bounded", "", "", "log_bounded", low, high),
             Parameter("softplus", "", "", "softplus", low),
             Parameter("log", "", "", "log", 0.0),
         )
@@ -105,12 +105,14 @@ def test_thresholds_of_a_lone_parameter(l, verdict):
     assert words_of(*belief) == [verdict, "identified"]
 
 
-@pytest.mark.parametrize("kind", ["box", "log_box", "log", "identity", "softplus"])
+@pytest.mark.parametrize(
+    "kind", ["bounded", "log_bounded", "log", "identity", "softplus"]
+)
 @pytest.mark.parametrize("tt", [-4.01, -3.99, 3.99, 4.01])
 def test_only_boxes_have_ends(kind, tt):
     table = named("a", kind, sd=2.0, low=0.5, high=2.0)
     got = words_of(*believe(table, [[100.0]], [tt]))
-    bound = kind in ("box", "log_box") and abs(tt) > 4.0
+    bound = kind in ("bounded", "log_bounded") and abs(tt) > 4.0
     assert got == ["at_bound" if bound else "identified"]
     note = study(*believe(table, [[100.0]], [tt]))["parameters"]["a"]["note"]
     end = "upper bound of 2 kg" if tt > 0 else "lower bound of 0.5 kg"
@@ -255,7 +257,7 @@ def test_a_conflict_spread_over_parameters_is_found():
 
 
 def test_arrays_are_draws_in_physical_units():
-    table = named("a b", "box", low=0.5, high=2.0)
+    table = named("a b", "bounded", low=0.5, high=2.0)
     A = np.array([[3.0, 1.0], [0.0, 2.0]])
     parameters, prior, posterior, _ = believe(table, A)
     got = diagnose.arrays(

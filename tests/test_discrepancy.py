@@ -223,7 +223,7 @@ def test_a_sound_simulator_is_believed(arms: ModuleType) -> None:
 @in_float64
 def test_a_belief_keeps_its_constants_among_effects() -> None:
     """Actuators, whose constants stand elsewhere in the table, and a dense prior."""
-    delay = Parameter("torque1.delay", "s", "delay", "box", 0.0, 0.02)
+    delay = Parameter("torque1.delay", "s", "delay", "bounded", 0.0, 0.02)
     parts = {"torque1.delay": delay}
     system = with_parts(UniformRodArm(), [Delay("torque1")], parts)
     p = len(system.parameters.names)

@@ -198,8 +198,8 @@ def test_base_parameter_is_the_sum_of_the_posterior():
 def test_base_parameter_is_the_product_of_the_posterior():
     table = Parameters(
         (
-            Parameter("k", "V s", "", "log_box", 0.1, 10.0),
-            Parameter("R", "ohm", "", "log_box", 0.1, 10.0),
+            Parameter("k", "V s", "", "log_bounded", 0.1, 10.0),
+            Parameter("R", "ohm", "", "log_bounded", 0.1, 10.0),
         )
     )
     fisher_at = rows_of(lambda v: 1e3 * (v["k"] ** 2 / v["R"])[None], table)
@@ -241,7 +241,7 @@ def test_base_parameter_is_the_product_of_the_posterior():
 
 def test_curved_trade_off_holds_locally():
     """a + b^2 is neither a sum nor a product; said of the MAP only."""
-    table = named("a b", "log_box", low=0.1, high=10.0)
+    table = named("a b", "log_bounded", low=0.1, high=10.0)
     fisher_at = rows_of(lambda v: 1e3 * (v["a"] + v["b"] ** 2)[None], table)
     tt = np.array([0.31, -0.42])
     (base,) = study(*believe(table, fisher_at(tt), tt), fisher_at=fisher_at)[
@@ -254,7 +254,7 @@ def test_curved_trade_off_holds_locally():
 
 def test_partly_curved_trade_offs_keep_what_holds():
     """c / d is a ratio everywhere; with a beside c only near the MAP."""
-    table = named("a b c d", "log_box", low=0.1, high=10.0)
+    table = named("a b c d", "log_bounded", low=0.1, high=10.0)
 
     def rows(v):
         s = v["c"] + v["a"] ** 2 * v["d"]
@@ -271,7 +271,7 @@ def test_partly_curved_trade_offs_keep_what_holds():
 
 
 def test_points_that_diverge_are_left_out():
-    table = named("a b", "log_box", low=0.1, high=10.0)
+    table = named("a b", "log_bounded", low=0.1, high=10.0)
     fisher_at = rows_of(lambda v: 1e3 * (v["a"] + 2.0 * v["b"])[None], table)
     tt = np.array([0.31, -0.42])
     belief = believe(table, fisher_at(tt), tt)

@@ -338,7 +338,7 @@ def test_a_linear_machines_centre_is_where_the_gaussian_says(
 @pytest.mark.nightly
 def test_a_constant_at_its_bound_stays_where_the_data_are() -> None:
     """Its map is flat there: with less data the Gaussian alone leaves for the prior."""
-    at = Parameter("k1", "1", "slope", "box", low=0.0, high=4.0)
+    at = Parameter("k1", "1", "slope", "bounded", low=0.0, high=4.0)
     system = linear(1, 1)
     system = Machine(Parameters((*system.parameters.free, at)), 1)
     rng = np.random.default_rng(22)

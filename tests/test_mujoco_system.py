@@ -231,7 +231,7 @@ def test_the_posterior_is_that_of_our_own_equations(tmp_path):
     """Two dampings, one-step data: mean and covariance."""
     values = own(ARM)
     free = {
-        name: Parameter(name, "N m s/rad", name, "log_box", 1e-3, 0.1)
+        name: Parameter(name, "N m s/rad", name, "log_bounded", 1e-3, 0.1)
         for name in ("b1", "b2")
     }
     held = {k: v for k, v in values.items() if k not in free}
@@ -272,7 +272,7 @@ def test_what_is_zero_in_the_model_is_left_alone_or_needs_a_prior(tmp_path):
         InputError, match=r"E142 no prior for joint/z/damping.*low and high"
     ):
         crawler(tmp_path, constants=["joint/*/damping"])
-    prior = Parameter("", "N s/m", "damping", "box", 0.0, 1.0)
+    prior = Parameter("", "N s/m", "damping", "bounded", 0.0, 1.0)
     system = crawler(
         tmp_path, constants=["joint/z/damping"], priors={"joint/z/damping": prior}
     )
@@ -311,7 +311,7 @@ RESTING = """
 def test_what_rests_is_dead_and_not_identified(tmp_path):
     """Dry friction that is zero in the file, a mass, a length that nothing turns."""
     dead = ["joint/y/frictionloss", "body/other/mass", "body/pole/length"]
-    dry = Parameter("", "N", "dry friction", "box", 0.0, 1.0)
+    dry = Parameter("", "N", "dry friction", "bounded", 0.0, 1.0)
     path = written(tmp_path, RESTING)
     system = sy.MuJoCo(path, ["joint/x/damping", *dead], {dead[0]: dry})
     prior = system.parameters.prior()

@@ -25,14 +25,16 @@ from sim2gp.inference.parameters import (
     signed,
 )
 
-BOX = Parameter("k", "N", "box", "box", 0.5, 2.0)
-LOG_BOX = Parameter("k", "N", "log box", "log_box", 1e-6, 3e-3)
+BOX = Parameter("k", "N", "bounded", "bounded", 0.5, 2.0)
+LOG_BOX = Parameter("k", "N", "log box", "log_bounded", 1e-6, 3e-3)
 SOFTPLUS = Parameter("k", "N", "softplus", "softplus", -1.5)
 LOG = Parameter("k", "N", "log", "log", 0.0)
 IDENTITY = Parameter("k", "N", "identity", "identity")
 EVERY = [BOX, LOG_BOX, SOFTPLUS, LOG, IDENTITY]
 # Boxes where low + (high - low) > high, in double and in single precision.
-ROUNDED = [Parameter("k", "N", "box", "box", *b) for b in ((0.3, 0.9), (0.7, 1.9))]
+ROUNDED = [
+    Parameter("k", "N", "bounded", "bounded", *b) for b in ((0.3, 0.9), (0.7, 1.9))
+]
 
 
 pytestmark = pytest.mark.usefixtures("float64")
@@ -66,7 +68,7 @@ def test_physical_values_stay_inside(p, dtype):
         size = np.abs(theta[1:]) + abs(p.low)  # of what was added
         assert np.all(np.diff(theta.astype(float)) >= -2 * np.finfo(dtype).eps * size)
     # Both ends of a box are approached: its range is neither larger nor smaller.
-    if p.map in ("box", "log_box"):
+    if p.map in ("bounded", "log_bounded"):
         np.testing.assert_allclose(theta[[0, -1]], [p.low, p.high], rtol=1e-6)
 
 
@@ -85,7 +87,7 @@ def test_slopes(p):
 
 
 def span(p):
-    return p.high - p.low if p.map in ("box", "log_box") else 1.0
+    return p.high - p.low if p.map in ("bounded", "log_bounded") else 1.0
 
 
 @pytest.mark.parametrize("p", EVERY, ids=ids)
@@ -123,8 +125,8 @@ def test_a_value_on_a_bound_maps_just_inside(p):
 def moments(p):
     """Physical mean and sd by adaptive quadrature in the virtual value."""
     inner = {
-        "box": lambda t: p.low + (p.high - p.low) / (1 + math.exp(-t)),
-        "log_box": lambda t: p.low * (p.high / p.low) ** (1 / (1 + math.exp(-t))),
+        "bounded": lambda t: p.low + (p.high - p.low) / (1 + math.exp(-t)),
+        "log_bounded": lambda t: p.low * (p.high / p.low) ** (1 / (1 + math.exp(-t))),
         "log": math.exp,
         "identity": lambda t: t,
     }[p.map]
@@ -166,11 +168,11 @@ def test_priors_from_physical_moments(p, mean, sd, bounds):
     ("code", "make"),
     [
         ("E141", lambda: Parameter("k", "", "", "cube")),
-        ("E141", lambda: Parameter("k", "", "", "box", 2.0, 1.0)),
-        ("E141", lambda: Parameter("k", "", "", "box", 1.0, 1.0)),
-        ("E141", lambda: Parameter("k", "", "", "box", math.nan, 1.0)),
-        ("E141", lambda: Parameter("k", "", "", "box", 0.0, math.inf)),
-        ("E141", lambda: Parameter("k", "", "", "log_box", 0.0, 1.0)),
+        ("E141", lambda: Parameter("k", "", "", "bounded", 2.0, 1.0)),
+        ("E141", lambda: Parameter("k", "", "", "bounded", 1.0, 1.0)),
+        ("E141", lambda: Parameter("k", "", "", "bounded", math.nan, 1.0)),
+        ("E141", lambda: Parameter("k", "", "", "bounded", 0.0, math.inf)),
+        ("E141", lambda: Parameter("k", "", "", "log_bounded", 0.0, 1.0)),
         ("E144", lambda: Parameter("k", "", "", "log", 0.0, sd=0.0)),
         ("E144", lambda: Parameter("k", "", "", "log", 0.0, mean=math.nan)),
         ("E144", lambda: prior_from_moments(BOX, 1.0, 0.0)),
@@ -201,7 +203,7 @@ TABLE = parameters_of(Record)
 def test_a_table_is_read_from_the_record():
     assert TABLE.names == ("stiffness", "damping", "mass", "offset")
     assert TABLE.units == ("N/m", "N s/m", "kg", "m")
-    assert [p.map for p in TABLE.free] == ["box", "log_box", "log", "identity"]
+    assert [p.map for p in TABLE.free] == ["bounded", "log_bounded", "log", "identity"]
     assert {p.map for p in TABLE.free} <= set(MAPS)
     assert len(TABLE) == 4
     assert moments(TABLE["mass"]) == (pytest.approx(0.4), pytest.approx(0.1))
@@ -256,7 +258,7 @@ def test_a_table_without_free_constants():
 @pytest.mark.nightly
 def test_curvature_is_what_the_maps_add_to_a_hessian():
     """A function linear in theta has no other: autodiff's Hessian, any prior scale."""
-    kinds = ("box", "log_box", "softplus", "log", "identity")
+    kinds = ("bounded", "log_bounded", "softplus", "log", "identity")
     free = tuple(
         Parameter(f"{kind}{k}", "kg", "", kind, low=0.5, high=4.0, mean=0.2 * k)
         for k, kind in enumerate(kinds)

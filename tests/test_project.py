@@ -148,9 +148,9 @@ def test_box_value_and_number(tmp_path: Path) -> None:
     text += "cf1 = {low = 1e-4, high = 1.0}\n"
     table = load(tmp_path, text).build_system().parameters
     box = table["m2"]
-    assert (box.map, box.low, box.high) == ("box", 0.2, 0.7)
+    assert (box.map, box.low, box.high) == ("bounded", 0.2, 0.7)
     assert (box.mean, box.sd) == (0.0, BOX_SD)
-    assert table["cf1"].map == "log_box"  # as the system's own prior
+    assert table["cf1"].map == "log_bounded"  # as the system's own prior
     assert dict(table.fixed)["b1"] == 0.01
     assert dict(table.fixed)["Ir"] == 0.0
 

@@ -38,8 +38,8 @@ def pushed(params, s, a):
 SYSTEM = sg.systems.ODE(
     pushed,
     [
-        sg.Parameter("gain", "1/kg", "of the input", "log_box", 0.5, 8.0),
-        sg.Parameter("drag", "1/s", "of the rail", "log_box", 0.05, 2.0),
+        sg.Parameter("gain", "1/kg", "of the input", "log_bounded", 0.5, 8.0),
+        sg.Parameter("drag", "1/s", "of the rail", "log_bounded", 0.05, 2.0),
     ],
     [sg.Channel("x", "m"), sg.Channel("x.velocity", "m/s")],
     [sg.Channel("force", "N", low=-1.0, high=1.0)],

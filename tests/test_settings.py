@@ -29,8 +29,8 @@ from sim2gp.robot.export import export_model
 
 NAN, INF = float("nan"), float("inf")
 KEY = jax.random.key(0)
-MASS = Parameter("mass", "kg", "of the pole", "log_box", 0.1, 1.0)
-CONSTANTS = [Parameter("damping", "1/s", "", "log_box", 0.1, 1.0)]
+MASS = Parameter("mass", "kg", "of the pole", "log_bounded", 0.1, 1.0)
+CONSTANTS = [Parameter("damping", "1/s", "", "log_bounded", 0.1, 1.0)]
 WINDOWS = windows_of(np.ones((3, 2, 2)), np.ones((3, 2)), np.zeros(3))
 PRIOR = Gaussian(jnp.zeros(2), jnp.eye(2))
 STATES, INPUTS = [sg.Channel("q", "rad")], [sg.Channel("u", "1")]

@@ -252,7 +252,7 @@ def test_information_gain_identities(case, belief):
 
 def test_evidence_against_quadrature():
     """One boxed parameter: nonlinear, so Laplace; within 2 % of the integral."""
-    model = Sim2GP(linear(1, 1, "box", low=-1.0, high=3.0), dt=1.0)
+    model = Sim2GP(linear(1, 1, "bounded", low=-1.0, high=3.0), dt=1.0)
     rng = np.random.default_rng(7)
     J = rng.standard_normal((60, 1, 1))
     y = 0.4 * J[:, :, 0] + 0.3 * rng.standard_normal((60, 1))
@@ -272,7 +272,7 @@ def test_evidence_against_quadrature():
 
 def test_the_precision_is_gauss_newtons():
     """With residuals of order one the full Hessian differs: it is a diagnostic."""
-    model = Sim2GP(linear(2, 1, "box", low=-1.0, high=3.0), dt=1.0)
+    model = Sim2GP(linear(2, 1, "bounded", low=-1.0, high=3.0), dt=1.0)
     rng = np.random.default_rng(8)
     J = rng.standard_normal((25, 1, 2))
     y = 1.5 * J[:, :, 0] ** 2 + 2.4 * J[:, :, 1]  # a model that does not fit

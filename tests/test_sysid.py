@@ -98,7 +98,7 @@ CART = """
 
 
 def box(name: str, low: float, high: float, nominal: float) -> Parameter:
-    return Parameter(name, "", "", "box", low, high, nominal=nominal)
+    return Parameter(name, "", "", "bounded", low, high, nominal=nominal)
 
 
 @pytest.fixture
@@ -139,7 +139,7 @@ def test_quotes_are_taken_off(tmp_path: Path) -> None:
 
 TABLE = Parameters(
     (
-        Parameter("gain", "N", "", "log_box", 1e-7, 2.5, nominal=1e-5),
+        Parameter("gain", "N", "", "log_bounded", 1e-7, 2.5, nominal=1e-5),
         Parameter("mass", "kg", "", "log", 0.0, mean=0.0, sd=0.5),
         Parameter("offset", "m", "", "identity", mean=0.0, sd=1.0),
     ),
@@ -182,7 +182,7 @@ def test_a_model_takes_them_with_its_units(tmp_path: Path) -> None:
         system.parameters.free, delivered.parameters.free, strict=True
     ):
         assert (mine.unit, mine.meaning) == (own.unit, own.meaning)
-        assert (mine.map, mine.low, mine.high) == ("box", own.low, own.high)
+        assert (mine.map, mine.low, mine.high) == ("bounded", own.low, own.high)
         assert mine.nominal == own.nominal
 
 

@@ -76,7 +76,7 @@ WITHOUT_EFFECT: dict[str, tuple[str, str]] = {
     "a map that bounds overrule": (
         "[parameters.cart_mass]\nmean = 0.4\nsd = 0.1\nlow = 0.1\nhigh = 1.0\n"
         'map = "log"\n',
-        "E160 .*map = log.*line 2.*box or log_box",
+        "E160 .*map = log.*line 2.*bounded or log_bounded",
     ),
     "a map without moments": (
         '[parameters.cart_mass]\nmap = "identity"\n',

@@ -30,8 +30,8 @@ from sim2gp.types import in_float64
 KEY = jax.random.key(0)
 SUM = LinearMeasurement(("k0", "k1"), (1.0, 1.0), 3.0, 0.01)
 BOXES = (
-    Parameter("a", "kg", "one", "box", 0.0, 2.0),
-    Parameter("b", "kg", "other", "log_box", 0.1, 1.0, mean=0.5),
+    Parameter("a", "kg", "one", "bounded", 0.0, 2.0),
+    Parameter("b", "kg", "other", "log_bounded", 0.1, 1.0, mean=0.5),
     Parameter("c", "kg", "third", "log", 0.0, sd=0.5),
 )
 

@@ -20,7 +20,7 @@ from sim2gp.planning import AbstractObjective, MarkovObjective
 from sim2gp.planning.tasks import furuta_swingup
 from sim2gp.systems.effects.base import AbstractForce
 
-TABLE = [Parameter("gravity", "1/s^2", "gravity over length", "log_box", 3.0, 30.0)]
+TABLE = [Parameter("gravity", "1/s^2", "gravity over length", "log_bounded", 3.0, 30.0)]
 STATES = [sy.Channel("q", "rad", angle=True), sy.Channel("q.velocity", "rad/s")]
 ACTIONS = [sy.Channel("torque", "1/s^2", low=-5.0, high=5.0)]
 #: What a machine of two states may be answered with by mistake, and what is said of it.

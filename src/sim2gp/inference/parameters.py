@@ -45,7 +45,7 @@ class Parameter:
     name: str
     unit: str
     meaning: str
-    map: str = "box"
+    map: str = "bounded"
     low: float = -math.inf
     high: float = math.inf
     mean: float = 0.0
@@ -60,7 +60,7 @@ class Parameter:
                 got=self.map,
                 expected=f"one of {', '.join(bijections.MAPS)}",
             )
-        boxed = self.map in ("box", "log_box")
+        boxed = self.map in ("bounded", "log_bounded")
         where = self.name or "a parameter"
         checks.bounds(where, self.low, self.high, unbounded=not boxed)
         if self.map == "softplus" and not math.isfinite(self.low):
@@ -69,7 +69,7 @@ class Parameter:
             raise InputError(
                 "E141", f"lower bound of {where}", got=got, expected=expected
             )
-        if self.map == "log_box" and self.low <= 0.0:
+        if self.map == "log_bounded" and self.low <= 0.0:
             raise InputError(
                 "E141",
                 f"lower bound of {self.name}",
@@ -99,14 +99,16 @@ def bounded(
     low: float, high: float, unit: str, meaning: str, *, nominal: float | None = None
 ) -> Any:
     """Field of a record: a constant in the box ``[low, high]``, nearly uniform."""
-    return _field(Parameter("", unit, meaning, "box", low, high, nominal=nominal))
+    return _field(Parameter("", unit, meaning, "bounded", low, high, nominal=nominal))
 
 
 def log_bounded(
     low: float, high: float, unit: str, meaning: str, *, nominal: float | None = None
 ) -> Any:
     """Field of a record: a constant whose logarithm is nearly uniform in a box."""
-    return _field(Parameter("", unit, meaning, "log_box", low, high, nominal=nominal))
+    return _field(
+        Parameter("", unit, meaning, "log_bounded", low, high, nominal=nominal)
+    )
 
 
 def positive(
@@ -148,9 +150,12 @@ def prior_from_moments(
     if low is not None or high is not None:
         low = parameter.low if low is None else low
         high = parameter.high if high is None else high
-        logarithmic = parameter.map in ("log", "log_box") and low > 0.0
+        logarithmic = parameter.map in ("log", "log_bounded") and low > 0.0
         boxed = dataclasses.replace(
-            parameter, map="log_box" if logarithmic else "box", low=low, high=high
+            parameter,
+            map="log_bounded" if logarithmic else "bounded",
+            low=low,
+            high=high,
         )
         return _match_in_box(boxed, mean, sd)
     if parameter.low >= 0.0:

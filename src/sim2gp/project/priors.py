@@ -15,7 +15,7 @@ from sim2gp.inference.parameters import BOX_SD, Parameter, prior_from_moments
 from sim2gp.project.schema import PriorSpec
 
 _MATTER = {"kg": "mass", "kg m^2": "inertia"}
-_BOXED = "box or log_box with bounds"
+_BOXED = "bounded or log_bounded, with low and high"
 
 
 def located(error: InputError, where: str) -> InputError:
@@ -123,7 +123,7 @@ def _box(spec: PriorSpec, base: Parameter, where: str) -> Parameter:
     if spec.low is None and spec.high is None:
         if spec.map is None:
             raise _conflict(where, "nothing stated", {}, "a prior or a value")
-        if spec.map != base.map and spec.map not in ("box", "log_box"):
+        if spec.map != base.map and spec.map not in ("bounded", "log_bounded"):
             expected = "mean and sd, whose logarithm or value is Gaussian"
             raise _conflict(where, f"map = {spec.map}", {"map": spec.map}, expected)
         return replace(base, map=spec.map)
@@ -137,9 +137,9 @@ def _box(spec: PriorSpec, base: Parameter, where: str) -> Parameter:
             expected="two finite bounds",
             fix="state both low and high",
         )
-    logarithmic = base.map in ("log", "log_box") and low > 0
-    kind = spec.map or ("log_box" if logarithmic else "box")
-    if kind not in ("box", "log_box"):
+    logarithmic = base.map in ("log", "log_bounded") and low > 0
+    kind = spec.map or ("log_bounded" if logarithmic else "bounded")
+    if kind not in ("bounded", "log_bounded"):
         given = {"low": low, "high": high, "map": kind}
         raise _conflict(where, f"map = {kind}", given, _BOXED)
     return replace(base, map=kind, low=low, high=high, mean=0.0, sd=BOX_SD)
@@ -147,7 +147,7 @@ def _box(spec: PriorSpec, base: Parameter, where: str) -> Parameter:
 
 def _moments(spec: PriorSpec, mean: float, sd: float, base: Parameter) -> Parameter:
     low, high = spec.low, spec.high
-    if spec.map in ("box", "log_box"):
+    if spec.map in ("bounded", "log_bounded"):
         low = base.low if low is None else low
         high = base.high if high is None else high
         # The map decides in which box the moments are matched.

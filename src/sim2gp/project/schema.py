@@ -10,7 +10,7 @@ one that nothing reads is an error (`sim2gp.project.validate`).
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat
 
 from sim2gp.project.source import Path_
 
@@ -27,6 +27,14 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
+#: How a parameter is unbounded; older files say ``box`` and ``log_box``.
+Map = Annotated[
+    Literal["bounded", "log_bounded", "log", "identity"],
+    BeforeValidator(lambda x: _OLDER.get(x, x) if isinstance(x, str) else x),
+]
+_OLDER = {"box": "bounded", "log_box": "log_bounded"}
+
+
 class PriorSpec(Section):
     """What is believed of one constant: a value, moments, a box, or both of these.
 
@@ -39,7 +47,7 @@ class PriorSpec(Section):
     relative_sd: Positive | None = None
     low: FiniteFloat | None = None
     high: FiniteFloat | None = None
-    map: Literal["box", "log_box", "log", "identity"] | None = None
+    map: Map | None = None
 
 
 class ParameterSpec(PriorSpec):

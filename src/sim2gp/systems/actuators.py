@@ -56,7 +56,7 @@ class Gain(AbstractActuator):
 
     def parameter(self, plant: AbstractPlant) -> Parameter:
         meaning = f"gain of {self.where}"
-        return Parameter(self.name, "1", meaning, "log_box", 0.5, 2.0)
+        return Parameter(self.name, "1", meaning, "log_bounded", 0.5, 2.0)
 
 
 class Offset(AbstractActuator):
@@ -75,7 +75,7 @@ class Offset(AbstractActuator):
         span = channel.high - channel.low
         edge = 0.1 * span if math.isfinite(span) else 1.0
         meaning = f"offset of {self.where}"
-        return Parameter(self.name, channel.unit, meaning, "box", -edge, edge)
+        return Parameter(self.name, channel.unit, meaning, "bounded", -edge, edge)
 
 
 class Delay(AbstractActuator):
@@ -98,7 +98,9 @@ class Delay(AbstractActuator):
 
     def parameter(self, plant: AbstractPlant) -> Parameter:
         longest = self.magnitude or LONGEST_DELAY
-        return Parameter(self.name, "s", f"delay of {self.where}", "box", 0.0, longest)
+        return Parameter(
+            self.name, "s", f"delay of {self.where}", "bounded", 0.0, longest
+        )
 
 
 class Lag(AbstractActuator):
@@ -115,7 +117,7 @@ class Lag(AbstractActuator):
 
     def parameter(self, plant: AbstractPlant) -> Parameter:
         box = SHORTEST_LAG, self.magnitude
-        return Parameter(self.name, "s", self.meaning, "log_box", *box)
+        return Parameter(self.name, "s", self.meaning, "log_bounded", *box)
 
 
 def neutral_actuators(channels: Sequence[Channel]) -> tuple[AbstractActuator, ...]:

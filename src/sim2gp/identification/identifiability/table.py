@@ -117,7 +117,7 @@ def verdicts(spec: Spectrum) -> list[tuple[str, tuple[str, ...]]]:
         partners = _partners(spec, P, j)
         if spec.dead[j]:
             out.append(("dead", ()))
-        elif p.map in ("box", "log_box") and abs(spec.at[j]) > BOUND:
+        elif p.map in ("bounded", "log_bounded") and abs(spec.at[j]) > BOUND:
             out.append(("at_bound", ()))
         elif P[j, j] > SHARE and partners:
             out.append(("traded_off", partners))

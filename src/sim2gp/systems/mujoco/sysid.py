@@ -123,7 +123,7 @@ def _prior(name: str, entry: Entry, i: int) -> Parameter | float:
         if not math.isfinite(value):
             raise InputError("E101", f"value of {name}", got=value)
         return value
-    parameter = Parameter(name, "", "", "box", low, high, nominal=nominal)
+    parameter = Parameter(name, "", "", "bounded", low, high, nominal=nominal)
     if not low <= nominal <= high:
         expected = f"within [{low:g}, {high:g}]"
         what = f"nominal value of {name}"

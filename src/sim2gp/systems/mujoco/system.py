@@ -246,7 +246,9 @@ def default_prior(constant: Constant, model: Any) -> Parameter | None:
     if value <= 0.0 or constant.quantity in SIGNED:
         return None
     about = constant.path, constant.unit, constant.meaning
-    return Parameter(*about, "log_box", value / FACTOR, value * FACTOR, nominal=value)
+    return Parameter(
+        *about, "log_bounded", value / FACTOR, value * FACTOR, nominal=value
+    )
 
 
 def _prior(
