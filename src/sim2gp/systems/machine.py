@@ -45,6 +45,7 @@ from sim2gp.systems.effects.base import (
     AbstractJointEffect,
     check_effect,
 )
+from sim2gp.systems.effects.kicks import kicked
 from sim2gp.systems.function_checks import names_of
 from sim2gp.systems.mechanism import AbstractMechanism, Effects
 from sim2gp.systems.parts import AbstractPart
@@ -168,10 +169,11 @@ class Machine(AbstractSystem):
 
     @property
     def max_substep(self) -> float:
+        # A plant without equations is stepped as its author steps it.
+        inside = isinstance(self.plant, AbstractMechanism)
+        own = [e.max_substep if inside else LONGEST_MEAN for e in self.effects]
         mean = [LONGEST_MEAN] if self.actuators else []
-        return min(
-            [self.plant.max_substep, *(e.max_substep for e in self.effects), *mean]
-        )
+        return min([self.plant.max_substep, *own, *mean])
 
     @property
     def window_substep(self) -> float:
@@ -255,8 +257,9 @@ class Machine(AbstractSystem):
         acting = self.acting(params)
         if not acting:
             return self.plant.flow(params.plant, s, a, h)
-        assert isinstance(self.plant, AbstractMechanism)  # as their units need
-        return self.plant.flow_with(params.plant, acting, s, a, h)
+        if isinstance(self.plant, AbstractMechanism):
+            return self.plant.flow_with(params.plant, acting, s, a, h)
+        return kicked(self.plant, params.plant, acting, s, a, h)
 
     def _has(self, kind: type[AbstractActuator]) -> bool:
         return any(isinstance(part, kind) for part in self.actuators)

@@ -62,6 +62,28 @@ class AbstractForce(AbstractJointEffect):
         return none, none, none
 
 
+class AbstractJointForce(AbstractForce):
+    """A force along one joint, by its own position and velocity: on any plant.
+
+    A plant without a mass matrix takes it as an acceleration
+    (`sim2gp.systems.effects.kicks`).
+    """
+
+    @abc.abstractmethod
+    def along(self, x: Scalar, q: Scalar, v: Scalar) -> Scalar:
+        """The force, for the magnitude ``x``."""
+
+    @abc.abstractmethod
+    def accelerated(self, x: Scalar, q: Scalar, v: Scalar, t: Scalar) -> Scalar:
+        """Velocity after ``t`` seconds of ``dv/dt = along(x, q, v)``, ``q`` held."""
+
+    def force(
+        self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
+    ) -> Pair:
+        i = system.joint(self.where)
+        return on_joint(i, self.along(x, q[i], v[i]))
+
+
 class AbstractInputEffect(AbstractEffect):
     """An effect on the input ``where`` of any plant; it has the input's unit."""
 
@@ -82,12 +104,14 @@ def on_joint(i: int, f: Scalar) -> Pair:
 def check_effect(plant: AbstractPlant, effect: AbstractEffect) -> None:
     """That an effect's functions have the right shapes (E140, E123, E173).
 
-    Raises `InputError` E145 for an effect on joints of a plant that has no equations.
+    Raises `InputError` E145 for an effect that needs the equations of a plant without.
     """
     if isinstance(effect, AbstractInputEffect):
         found: list[tuple[str, Any, int]] = [("through", _through, 1)]
     elif isinstance(plant, AbstractMechanism):
         found = [("inertia", _inertia, 3), ("force", _force, 2)]
+    elif isinstance(effect, AbstractJointForce):
+        found = [("along", _along, 2)]
     else:
         raise InputError(
             "E145",
@@ -111,6 +135,15 @@ def _through(
 ) -> Float[Array, " 1"]:
     """`AbstractInputEffect.through` as an array of one, at a magnitude of one."""
     return jnp.asarray(effect.through(jnp.ones((), s.dtype), a[0]))[None]
+
+
+def _along(
+    plant: AbstractPlant, effect: AbstractJointForce, params: Any, s: State, a: Action
+) -> Float[Array, " 2"]:
+    """`AbstractJointForce.along` and `accelerated`, likewise."""
+    one = jnp.ones((), s.dtype)
+    along = effect.along(one, s[0], s[0])
+    return jnp.stack([along, effect.accelerated(one, s[0], s[0], one)])
 
 
 def _inertia(

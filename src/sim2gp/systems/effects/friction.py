@@ -7,11 +7,17 @@ import jax.numpy as jnp
 
 from sim2gp import checks
 from sim2gp.systems.base import AbstractPlant
-from sim2gp.systems.effects.base import SUBSTEP, AbstractForce, on_joint
+from sim2gp.systems.effects.base import (
+    SUBSTEP,
+    AbstractForce,
+    AbstractJointForce,
+    on_joint,
+)
 from sim2gp.systems.effects.friction_laws import (
     COULOMB_SUBSTEP,
     coulomb,
     quadratic_drag,
+    slowed_by_coulomb,
 )
 from sim2gp.systems.effects.units import force_unit, gravity_of, only_on, unit_per
 from sim2gp.systems.mechanism import AbstractMechanism, Pair
@@ -19,7 +25,7 @@ from sim2gp.systems.plants.cartpole import CartPole
 from sim2gp.types import Scalar
 
 
-class Coulomb(AbstractForce):
+class Coulomb(AbstractJointForce):
     """Dry friction of a joint, ``-magnitude tanh(v / width)``."""
 
     where: str = eqx.field(static=True)
@@ -35,11 +41,11 @@ class Coulomb(AbstractForce):
     def unit(self, plant: AbstractPlant) -> str:
         return force_unit(plant, self.where)
 
-    def force(
-        self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
-    ) -> Pair:
-        i = system.joint(self.where)
-        return on_joint(i, -coulomb(v[i], x, self.width))
+    def along(self, x: Scalar, q: Scalar, v: Scalar) -> Scalar:
+        return -coulomb(v, x, self.width)
+
+    def accelerated(self, x: Scalar, q: Scalar, v: Scalar, t: Scalar) -> Scalar:
+        return slowed_by_coulomb(v, x, self.width, t)
 
 
 class RailFriction(AbstractForce):
@@ -66,7 +72,7 @@ class RailFriction(AbstractForce):
         return on_joint(0, -coulomb(v[0], x * weight, self.width))
 
 
-class Stribeck(AbstractForce):
+class Stribeck(AbstractJointForce):
     """Friction that is twice as large at rest as in motion.
 
     ``-magnitude (1 + exp(-(v / speed)^2)) / 2 tanh(v / width)``: ``magnitude`` is the
@@ -87,15 +93,19 @@ class Stribeck(AbstractForce):
     def unit(self, plant: AbstractPlant) -> str:
         return force_unit(plant, self.where)
 
-    def force(
-        self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
-    ) -> Pair:
-        i = system.joint(self.where)
-        level = 0.5 * x * (1.0 + jnp.exp(-((v[i] / self.speed) ** 2)))
-        return on_joint(i, -coulomb(v[i], level, self.width))
+    def along(self, x: Scalar, q: Scalar, v: Scalar) -> Scalar:
+        return -coulomb(v, self._level(x, v), self.width)
+
+    def accelerated(self, x: Scalar, q: Scalar, v: Scalar, t: Scalar) -> Scalar:
+        # The level of the middle of the time: of second order.
+        middle = slowed_by_coulomb(v, self._level(x, v), self.width, 0.5 * t)
+        return slowed_by_coulomb(v, self._level(x, middle), self.width, t)
+
+    def _level(self, x: Scalar, v: Scalar) -> Scalar:
+        return 0.5 * x * (1.0 + jnp.exp(-((v / self.speed) ** 2)))
 
 
-class Viscous(AbstractForce):
+class Viscous(AbstractJointForce):
     """Damping of a joint, ``-magnitude v``, such as the back-EMF of its motor."""
 
     where: str = eqx.field(static=True)
@@ -108,14 +118,14 @@ class Viscous(AbstractForce):
     def unit(self, plant: AbstractPlant) -> str:
         return unit_per(plant, self.where, " s")
 
-    def force(
-        self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
-    ) -> Pair:
-        i = system.joint(self.where)
-        return on_joint(i, -x * v[i])
+    def along(self, x: Scalar, q: Scalar, v: Scalar) -> Scalar:
+        return -x * v
+
+    def accelerated(self, x: Scalar, q: Scalar, v: Scalar, t: Scalar) -> Scalar:
+        return v * jnp.exp(-x * t)
 
 
-class Drag(AbstractForce):
+class Drag(AbstractJointForce):
     """Quadratic drag of a joint, ``-magnitude v |v|``."""
 
     where: str = eqx.field(static=True)
@@ -127,8 +137,8 @@ class Drag(AbstractForce):
     def unit(self, plant: AbstractPlant) -> str:
         return unit_per(plant, self.where, " s^2", square=True)
 
-    def force(
-        self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
-    ) -> Pair:
-        i = system.joint(self.where)
-        return on_joint(i, -quadratic_drag(v[i], x))
+    def along(self, x: Scalar, q: Scalar, v: Scalar) -> Scalar:
+        return -quadratic_drag(v, x)
+
+    def accelerated(self, x: Scalar, q: Scalar, v: Scalar, t: Scalar) -> Scalar:
+        return v / (1.0 + x * jnp.abs(v) * t)

@@ -10,6 +10,8 @@ which makes the equations stiff: 4e-3 N m over 0.05 rad/s on the Furuta's arm is
 of 800/s, where RK4 needs substeps of 2.5 ms.
 """
 
+import math
+
 import jax.numpy as jnp
 
 from sim2gp.types import Scalar
@@ -43,3 +45,23 @@ def dead_zone(u: Scalar, width: Scalar, smoothing: float) -> Scalar:
 def quadratic_drag(v: Scalar, coefficient: Scalar) -> Scalar:
     """Drag ``coefficient v |v|``, to be subtracted from a force."""
     return coefficient * v * jnp.abs(v)
+
+
+def slowed_by_coulomb(v: Scalar, level: Scalar, width: float, t: Scalar) -> Scalar:
+    """Velocity after ``t`` seconds of ``dv/dt = -level tanh(v / width)``.
+
+    ``sinh(v / width)`` decays exponentially; of a fast joint its logarithm is taken.
+    """
+    u, k = v / width, level * t / width
+    fast = jnp.abs(u) > 1.0
+    slow = jnp.where(fast, 0.0, u)
+    near = jnp.arcsinh(jnp.sinh(slow) * jnp.exp(-k))
+    a = jnp.where(fast, jnp.abs(u), 1.0)
+    z = a + jnp.log1p(-jnp.exp(-2.0 * a)) - math.log(2.0) - k  # log sinh of the result
+    up = jnp.maximum(z, 0.0)
+    far = jnp.where(
+        z > 0.0,
+        up + jnp.log1p(jnp.sqrt(1.0 + jnp.exp(-2.0 * up))),
+        jnp.arcsinh(jnp.exp(jnp.minimum(z, 0.0))),
+    )
+    return width * jnp.where(fast, jnp.sign(u) * far, near)

@@ -12,14 +12,17 @@ position and speed, a dead zone by the input's range.
 """
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 
 from sim2gp.errors import InputError
 from sim2gp.systems.actuators import AbstractActuator, Delay, Gain, Lag, Offset
-from sim2gp.systems.base import AbstractPlant, AbstractSystem
+from sim2gp.systems.base import LONGEST_MEAN, AbstractPlant, AbstractSystem
 from sim2gp.systems.effects.base import (
     AbstractEffect,
     AbstractInputEffect,
@@ -45,6 +48,7 @@ from sim2gp.systems.plants.cartpole import CartPole
 from sim2gp.systems.plants.furuta import Furuta
 from sim2gp.systems.plants.two_link import TwoLink, UniformRodArm
 from sim2gp.systems.sensors import EncoderOffset
+from sim2gp.types import in_float64
 
 _JOINT: tuple[Any, ...] = Coulomb, Stribeck, Viscous, Drag, Spring, EncoderOffset
 #: Every part by what it acts on; `possible` says which machines can have it.
@@ -146,26 +150,26 @@ def candidates(
 ) -> tuple[Candidate, ...]:
     """Every candidate for a machine, without those that its table has already.
 
-    Over ``windows`` a lag is left to its equivalent, a delay. Raises `InputError` E145
-    for a machine that no effects are registered for.
+    Over ``windows`` a lag is left to its equivalent, a delay.
     """
     plant = plant_of(system)
     found = _physics(plant)
-    if found is None:
-        known = "Furuta, CartPole, TwoLink, UniformRodArm"
-        got = type(plant).__name__
-        raise InputError("E145", "no library of effects", got=got, expected=known)
     for channel in plant.actions:
-        found += _of_input(channel.name, channel.high, lag=not windows)
+        high = channel.high if math.isfinite(channel.high) else 1.0
+        found += _of_input(channel.name, high, lag=not windows)
     return _new(found, system)
 
 
 def smooth_effects(system: AbstractSystem) -> tuple[AbstractPart, ...]:
     """What a machine may lack and whose slope at nothing says what it does.
 
-    Each with its prior sd; none for a machine without registered effects.
+    Each with its prior sd; none for a plant without a mass matrix, whose intervals
+    rest on the scatter of its windows alone.
     """
-    found = _new(_physics(plant_of(system)) or (), system)
+    plant = plant_of(system)
+    if not isinstance(plant, AbstractMechanism):
+        return ()
+    found = _new(_physics(plant), system)
     return tuple(candidate.effect for candidate in found if candidate.smooth)
 
 
@@ -182,12 +186,14 @@ def _new(found: Sequence[Candidate], system: AbstractSystem) -> tuple[Candidate,
     )
 
 
-def _physics(plant: AbstractSystem) -> list[Candidate] | None:
+def _physics(plant: AbstractPlant) -> list[Candidate]:
     if isinstance(plant, Furuta):
         return _furuta()
     if isinstance(plant, CartPole):
         return _cartpole()
-    return _arm(plant) if isinstance(plant, TwoLink | UniformRodArm) else None
+    if isinstance(plant, TwoLink | UniformRodArm):
+        return _arm(plant)
+    return _of_any(plant)
 
 
 def _of_input(name: str, high: float, *, lag: bool) -> list[Candidate]:
@@ -262,3 +268,47 @@ def _arm(plant: TwoLink | UniformRodArm) -> list[Candidate]:
             Candidate(EncoderOffset(joint.name, OFFSET), sign=0),
         ]
     return found
+
+
+def _of_any(plant: AbstractPlant) -> list[Candidate]:
+    """Of each joint whose velocity is a state, as large as what moves it."""
+    found: list[Candidate] = []
+    names = [channel.name for channel in plant.physical_states]
+    speeds = {f"{name}.velocity" for name in names} & set(names)
+    for joint in plant.physical_states:
+        if joint.unit not in ("rad", "m") or f"{joint.name}.velocity" not in speeds:
+            continue
+        slide = joint.unit == "m"
+        width, slip = (0.01, 0.1) if slide else (0.05, 1.0)
+        speed, reach = (1.0, 0.3) if slide else (10.0, 1.0)
+        most = _acceleration(plant, f"{joint.name}.velocity")
+        found += [
+            Candidate(Coulomb(joint.name, SHARE * most, width)),
+            *_of_joint(joint.name, most, speed, reach, width=width, slip=slip),
+            Candidate(EncoderOffset(joint.name, OFFSET), sign=0),
+        ]
+    return found
+
+
+@in_float64
+def _acceleration(plant: AbstractPlant, velocity: str) -> float:
+    """The largest that inputs and weight give at rest, nominal constants; 1 if none."""
+    params, n = plant.nominal(), len(plant.physical_states)
+    i = [channel.name for channel in plant.physical_states].index(velocity)
+    positions = np.asarray([c.unit in ("rad", "m") for c in plant.physical_states])
+    high, low = (
+        [x if math.isfinite(x) else sign for x in ends]
+        for sign, ends in (
+            (1.0, [c.high for c in plant.actions]),
+            (-1.0, [c.low for c in plant.actions]),
+        )
+    )
+    inputs = [np.zeros(len(high)), *np.diag(high), *np.diag(low)]
+    flow = jax.jit(lambda s, a: plant.flow(params, s, a, LONGEST_MEAN))
+    moved = [
+        np.asarray(flow(jnp.asarray(s), jnp.asarray(a)))[i] / LONGEST_MEAN
+        for s in (np.zeros(n), 0.5 * positions)
+        for a in inputs
+    ]
+    most = float(np.max(np.abs(moved)))
+    return most if 0.0 < most < math.inf else 1.0

@@ -1,17 +1,16 @@
 """Springs: what pulls a joint back."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 
 from sim2gp.systems.base import AbstractPlant
-from sim2gp.systems.effects.base import SUBSTEP, AbstractForce, on_joint
+from sim2gp.systems.effects.base import SUBSTEP, AbstractJointForce
 from sim2gp.systems.effects.units import unit_per
-from sim2gp.systems.mechanism import AbstractMechanism, Pair
 from sim2gp.types import Scalar
 
 
-class Spring(AbstractForce):
+class Spring(AbstractJointForce):
     """A cable that pulls a joint back to zero, ``-magnitude q``."""
 
     where: str = eqx.field(static=True)
@@ -23,8 +22,8 @@ class Spring(AbstractForce):
     def unit(self, plant: AbstractPlant) -> str:
         return unit_per(plant, self.where, "")
 
-    def force(
-        self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
-    ) -> Pair:
-        i = system.joint(self.where)
-        return on_joint(i, -x * q[i])
+    def along(self, x: Scalar, q: Scalar, v: Scalar) -> Scalar:
+        return -x * q
+
+    def accelerated(self, x: Scalar, q: Scalar, v: Scalar, t: Scalar) -> Scalar:
+        return v - x * q * t

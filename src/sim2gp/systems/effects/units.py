@@ -32,15 +32,27 @@ def joint_of(plant: AbstractPlant, name: str) -> Channel:
     return joints[index_of(name, joints)]
 
 
+def velocity_of(plant: AbstractPlant, name: str) -> int:
+    """Index of a joint's velocity among the states (E103)."""
+    joint_of(plant, name)
+    return index_of(f"{name}.velocity", plant.physical_states)
+
+
 def force_unit(plant: AbstractPlant, name: str) -> str:
-    """N on a slide, N m on a hinge."""
-    return "N" if joint_of(plant, name).unit == "m" else "N m"
+    """N on a slide, N m on a hinge; of a plant without a mass matrix acceleration."""
+    position = joint_of(plant, name).unit
+    if isinstance(plant, AbstractMechanism):
+        return "N" if position == "m" else "N m"
+    velocity_of(plant, name)
+    return f"{position}/s^2"
 
 
 def unit_per(
     plant: AbstractPlant, name: str, seconds: str, square: bool = False
 ) -> str:
-    """Unit of a force per position, or per squared velocity."""
+    """Unit of a force per position, per velocity, or per squared velocity."""
+    force, position = force_unit(plant, name), joint_of(plant, name).unit
+    if not isinstance(plant, AbstractMechanism):
+        return {"": "1/s^2", " s": "1/s"}.get(seconds, f"1/{position}")
     power = "^2" if square else ""
-    position = joint_of(plant, name).unit
-    return f"{force_unit(plant, name)}{seconds}/{position}{power}"
+    return f"{force}{seconds}/{position}{power}"

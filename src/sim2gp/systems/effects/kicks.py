@@ -1,0 +1,49 @@
+"""Forces on the joints of a plant that has no mass matrix: a function, or an engine.
+
+Such a plant takes a force as the acceleration that it makes. In one substep the plant
+flows between two half kicks of its joints' velocities, the second in reverse order
+(Strang 1968), so that the error of a step is of third order in its length. A kick is
+the effect's own closed form (`AbstractJointForce.accelerated`): friction may be as
+steep as it likes.
+"""
+
+from collections.abc import Iterable
+from typing import Any
+
+import jax.numpy as jnp
+
+from sim2gp.systems.base import AbstractPlant, index_of
+from sim2gp.systems.effects.base import AbstractJointEffect, AbstractJointForce
+from sim2gp.systems.effects.units import velocity_of
+from sim2gp.systems.mechanism import Effects
+from sim2gp.types import Action, Scalar, State
+
+
+def kicked(
+    plant: AbstractPlant,
+    params: Any,
+    effects: Effects,
+    s: State,
+    a: Action,
+    h: float | Scalar,
+) -> State:
+    """State ``h`` seconds later of a plant whose joints are accelerated by effects."""
+    half = jnp.asarray(0.5 * h, s.dtype)
+    s = _kick(plant, effects, s, half)
+    s = plant.flow(params, s, a, h)
+    return _kick(plant, reversed(effects), s, half)
+
+
+def _kick(
+    plant: AbstractPlant,
+    effects: Iterable[tuple[AbstractJointEffect, Scalar]],
+    s: State,
+    t: Scalar,
+) -> State:
+    for effect, x in effects:
+        assert isinstance(effect, AbstractJointForce)  # as `check_effect` asks
+        i = index_of(effect.where, plant.physical_states)
+        j = velocity_of(plant, effect.where)
+        v = effect.accelerated(x.astype(s.dtype), s[i], s[j], t)
+        s = s.at[j].set(v)
+    return s
