@@ -127,7 +127,7 @@ def test_damping_is_mujocos_own(tmp_path: Path) -> None:
             t = other.flow(other.nominal(), t, jnp.asarray(a), 0.01)
             np.testing.assert_allclose(s, t, atol=2e-4)
             fastest = max(fastest, abs(float(t[1])))
-    assert fastest > 1.0
+    assert fastest > 0.3
 
 
 def _inertia(plant: Any) -> float:

@@ -12,6 +12,7 @@ import pytest
 import machines
 import mjcf
 from sim2gp import systems as sy
+from sim2gp.systems.machine import as_machine
 
 mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is not installed")
 
@@ -40,13 +41,14 @@ def physical(values):
 
 def compare(system, xml, *, applied=lambda p, v: 0.0, change=dict, solve=None):
     """Largest relative difference between the system and its MJCF twin."""
-    ode = jax.jit(system.ode)
+    machine = as_machine(system)
+    ode = jax.jit(lambda p, s, a: machines.ode(machine, p, s, a))
     tables = machines.batch(system, CONSTANTS, 5)[0]
     worst = 0.0
     for k, tt in enumerate(tables):
         values = {n: float(x) for n, x in system.parameters.values(tt).items()}
         values = change(values)
-        p = system.record({n: jnp.asarray(x) for n, x in values.items()})
+        p = machine.record({n: jnp.asarray(x) for n, x in values.items()})
         model = mujoco.MjModel.from_xml_string(xml(values))
         data = mujoco.MjData(model)
         _, S, A = machines.batch(system, STATES // CONSTANTS, 100 + k)

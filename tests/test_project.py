@@ -106,7 +106,10 @@ def test_a_system_of_ones_own_in_a_project(tmp_path: Path) -> None:
     assert (known["damping"], known["torque.dead_zone"]) == (0.05, 0.1)
     assert project.system.longest_delay == 0.01
     path.write_text('system = "my arm"\n[effects.q.spring]\nsd = 0.1\n')
-    with pytest.raises(InputError, match=r"E145 no spring on this machine.*encoder"):
+    spring = load_project(path, system=payload_arm.arm()).system.parameters["q.spring"]
+    assert (spring.unit, spring.sd) == ("1/s^2", 0.1)
+    path.write_text('system = "my arm"\n[effects.q.payload]\nsd = 0.1\n')
+    with pytest.raises(InputError, match=r"E145 no payload on this machine.*encoder"):
         load_project(path, system=payload_arm.arm())
     path.write_text('system = "my arm"\n[options]\ngravity = 9.81\n')
     with pytest.raises(InputError, match="E160 unknown option"):

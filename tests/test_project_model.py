@@ -120,8 +120,8 @@ def test_without_parameters_all_usual_ones_are_open(tmp_path: Path) -> None:
         ('[parameters."joint/*/stiffness"]\nrelative_sd = 0.1', "E160.*relative_sd"),
         ("[options]\ngravity = 9.8", "E160 unknown option.*line 4.*root"),
         (
-            "[effects.shoulder.spring]\nmean = 0.0\nsd = 1.0",
-            "E145 no spring on this machine.*encoder",
+            "[effects.shoulder.payload]\nmean = 0.0\nsd = 1.0",
+            "E145 no payload on this machine.*encoder",
         ),
         ("[effects.wrist.encoder]\nsd = 0.1", "E103 unknown channel.*line 3"),
         ("[limits]\nwrist = [0.0, 1.0]", "E160 unknown channel.*line 4"),
