@@ -277,7 +277,8 @@ def test_an_effect_is_recovered(name: str, kind: str, tmp_path: Path) -> None:
     searched = free_parts(fixed, [type(part)(part.where, 3.0 * part.magnitude)])
     windows, _ = cut([log], searched, window=0.3)
     found = fit_windows(searched, windows, key=jax.random.key(0))
-    mean, sd = float(found.posterior.mean[0]), float(found.posterior.sd()[0])
+    mean = float(np.asarray(found.posterior.mean)[0])
+    sd = float(np.linalg.norm(np.asarray(found.posterior.scale)[0]))
     table = searched.parameters
     low, high = (table.free[0].constrain(mean + k * 1.96 * sd) for k in (-1, 1))
     assert low <= part.magnitude <= high
