@@ -352,27 +352,30 @@ def test_random_times_of_real_commands(command: str, tmp_path: Path) -> None:
         child.communicate()
         assert child.returncode == 0
     whole = time.monotonic() - begun
-    took = []
-    rng = random.Random(0)
-    for k in range(20):
-        folder = tmp_path / str(k)
+    took, attempts, rng = [], 0, random.Random(0)
+    while len(took) < 20 and attempts < 60:
+        folder = tmp_path / str(attempts)
         folder.mkdir()
-        sign = ("SIGTERM", "SIGINT")[k % 2]
+        sign = ("SIGTERM", "SIGINT")[attempts % 2]
+        attempts, begun = attempts + 1, time.monotonic()
         with started(folder, arguments) as child:
             try:
                 child.wait(rng.uniform(0.0, 0.95) * whole)
             except subprocess.TimeoutExpired:
                 seconds, below, said = stopped(child, sign)
-                took.append(seconds)
-                # Before the command has begun, Python ends by the signal itself.
-                codes = {CODES[sign]}
-                if "interrupted" not in said:
-                    codes.add(-getattr(signal, sign))
-                assert child.returncode in codes, said
-                assert none_is_left(below)
-                assert everything_in(folder) == ["temporary", "work"]
+            if child.returncode == 0:  # it was done, on a machine that is less busy now
+                whole = min(whole, time.monotonic() - begun)
+                continue
+            took.append(seconds)
+            # Before the command has begun, Python ends by the signal itself.
+            codes = {CODES[sign]}
+            if "interrupted" not in said:
+                codes.add(-getattr(signal, sign))
+            assert child.returncode in codes, said
+            assert none_is_left(below)
+            assert everything_in(folder) == ["temporary", "work"]
     words_of_all = " ".join(f"{seconds:.2f}" for seconds in sorted(took))
-    print(f"{command}: {len(took)} of 20 stopped within a whole of {whole:.0f} s")
+    print(f"{command}: 20 of {attempts} stopped within a whole of {whole:.0f} s")
     print(f"seconds to the end: {words_of_all}")
-    assert len(took) >= 15
+    assert len(took) == 20
     assert max(took) < SECONDS

@@ -1,0 +1,73 @@
+"""Episodes of every learner of figures 2 to 5, frozen: returns, and errors of a test.
+
+Ten seeds of quick cells: fewer plans and less training than in the figures. Record them
+again with ``python tests/frozen/episodes.py`` (20 minutes on a core).
+"""
+
+import json
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from frozen.cases import VALUES
+from sim2gp.experiments import exploring, swingup
+
+RECORD = VALUES / "episodes.json"
+SEEDS = range(10)
+#: Machine, condition, learner, planner, episodes: figures 2, 4 (SAC) and 5 (Auto).
+ACTING = [
+    *(("furuta", "mismatch", name, "mpc", 2) for name in swingup.METHODS),
+    ("cartpole", "nominal", "SIM2GP", "mpc", 2),
+    ("furuta", "nominal", "SIM2GP", "sac", 2),
+]
+#: Figure 3: explorers, judged by the error of their predictions.
+EXPLORING = [("cartpole", "nominal", name, 1) for name in ("SIM2GP", "RES-FS")]
+
+
+def label(*words: Any) -> str:
+    """The name of one learner's row."""
+    return " ".join(map(str, words))
+
+
+def rows() -> Iterator[tuple[str, list[list[float]]]]:
+    """Each learner's numbers, a list for each seed: returns, or errors."""
+    with tempfile.TemporaryDirectory() as name:
+        out = Path(name)
+        for machine, condition, method, planning, episodes in ACTING:
+            found = [
+                swingup.fly_cell(
+                    swingup.Cell(
+                        machine, condition, method, seed, episodes, None, True, planning
+                    ),
+                    out,
+                )["returns"]
+                for seed in SEEDS
+            ]
+            yield label(machine, condition, method, planning), found
+        for machine, condition, method, episodes in EXPLORING:
+            found = [
+                exploring.explore_cell(
+                    exploring.Cell(machine, condition, method, seed, episodes, True),
+                    out / "exploring",
+                )["rmse"]
+                for seed in SEEDS
+            ]
+            yield label(machine, condition, method, "exploring"), found
+
+
+def main() -> None:
+    """Record all rows."""
+    record = {}
+    for name, found in rows():
+        print(name, found, flush=True)
+        record[name] = found
+        RECORD.write_text(json.dumps(record, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,34 @@
+"""What is frozen of the runs of the examples on real recordings.
+
+python tests/frozen/recordings.py NAME RUN       record a run of `sim2gp identify`
+"""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+EXAMPLES = ("double_pendulum", "qube")
+
+
+def figures(run: Any) -> dict[str, np.ndarray]:
+    """Posterior, evidence, corrected intervals and errors of held-out forecasts."""
+    out = {"log_evidence": np.asarray(run.summary["log_evidence"])}
+    for width in ("belief", "intervals"):
+        out[f"{width}_mean"] = run.arrays[f"{width}/mean"]
+        out[f"{width}_sd"] = np.linalg.norm(run.arrays[f"{width}/scale"], axis=1)
+    held_out = run.summary["held_out"]
+    errors = [held_out["open_loop_rmse"], held_out["one_step_rmse"]]
+    out["held_out"] = np.asarray(
+        [value for error in errors for value in error.values()]
+    )
+    return out
+
+
+if __name__ == "__main__":
+    import sim2gp as sg
+
+    name, run = sys.argv[1:]
+    values = Path(__file__).parent / "values" / f"recording_{name}.npz"
+    np.savez_compressed(values, **figures(sg.load_run(Path(run))))
