@@ -1,13 +1,13 @@
 """Episodes of every learner of figures 2 to 5, frozen: returns, and errors of a test.
 
-Ten seeds of quick cells: fewer plans and less training than in the figures. Record them
-again with ``python tests/frozen/episodes.py`` (20 minutes on a core).
+Ten seeds of quick cells: fewer plans and less training than in the figures. Record what
+is not recorded yet with ``python tests/frozen/episodes.py`` (an hour on a core).
 """
 
 import json
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -34,13 +34,15 @@ def label(*words: Any) -> str:
     return " ".join(map(str, words))
 
 
-def rows() -> Iterator[tuple[str, list[list[float]]]]:
-    """Each learner's numbers, a list for each seed: returns, or errors."""
+def rows(wanted: Callable[[str], bool]) -> Iterator[tuple[str, list[list[float]]]]:
+    """Numbers of each learner that is wanted, a list per seed: returns, or errors."""
     with tempfile.TemporaryDirectory() as name:
         out = Path(name)
         for machine, condition, method, planning, episodes in ACTING:
+            if not wanted(label(machine, condition, method, planning)):
+                continue
             found = [
-                swingup.fly_cell(
+                swingup.run_cell(
                     swingup.Cell(
                         machine, condition, method, seed, episodes, None, True, planning
                     ),
@@ -50,6 +52,8 @@ def rows() -> Iterator[tuple[str, list[list[float]]]]:
             ]
             yield label(machine, condition, method, planning), found
         for machine, condition, method, episodes in EXPLORING:
+            if not wanted(label(machine, condition, method, "exploring")):
+                continue
             found = [
                 exploring.explore_cell(
                     exploring.Cell(machine, condition, method, seed, episodes, True),
@@ -61,9 +65,9 @@ def rows() -> Iterator[tuple[str, list[list[float]]]]:
 
 
 def main() -> None:
-    """Record all rows."""
-    record = {}
-    for name, found in rows():
+    """Record the rows that are not recorded yet."""
+    record = json.loads(RECORD.read_text()) if RECORD.exists() else {}
+    for name, found in rows(lambda name: name not in record):
         print(name, found, flush=True)
         record[name] = found
         RECORD.write_text(json.dumps(record, indent=1) + "\n")
