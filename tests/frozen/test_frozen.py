@@ -3,7 +3,11 @@
 import numpy as np
 import pytest
 
-from frozen.cases import Arrays, every, stored
+from frozen.cases import VALUES, Arrays, every, stored
+
+pytestmark = pytest.mark.skipif(
+    not VALUES.is_dir(), reason="the frozen values are in the repository alone"
+)
 
 CASES = every()
 #: Minutes of compilation: what is left tells any fault of the mathematics by day.
