@@ -11,9 +11,9 @@ import pytest
 import scipy.integrate
 
 import payload_arm
-from sim2gp.data import cut
 from sim2gp.data.logs import Log
-from sim2gp.identification import fit_windows
+from sim2gp.data.split_log import cut
+from sim2gp.identification.fit import fit_windows
 from sim2gp.project import load_project
 from sim2gp.systems import (
     ODE,

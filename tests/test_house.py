@@ -242,6 +242,12 @@ def test_import_is_light() -> None:
     assert probe["seconds"] < 5.0
 
 
+@pytest.mark.parametrize("name", ["data.logs", "project.project", "runs"])
+def test_what_answers_first_loads_no_simulator(name: str) -> None:
+    """A log that is refused, a project that is: neither waits a second for JAX."""
+    run_python(f"import sys, sim2gp.{name}\nassert 'jax' not in sys.modules")
+
+
 def test_every_module_imports_without_extras() -> None:
     """An extra that is not installed breaks its own feature, never an import."""
     names = [module_name(path) for path in MODULES if path.stem != "__main__"]

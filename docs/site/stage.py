@@ -96,20 +96,18 @@ def modules() -> dict[str, list[str]]:
 
 def public_names() -> dict[str, str]:
     """What ``sim2gp`` offers by name: where each thing is defined, as a dotted path."""
-    contents: dict[str, str] = {}
+    found: dict[str, dict[str, str]] = {}
     for node in tree("sim2gp").body:
-        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "_CONTENTS":
-            contents = ast.literal_eval(node.value)
-    return {
-        name: place(name, f"sim2gp.{room}" if room else "sim2gp")
-        for name, room in contents.items()
+        if isinstance(node, ast.Assign) and isinstance(node.value, ast.Dict):
+            found[ast.unparse(node.targets[0])] = ast.literal_eval(node.value)
+    modules = {name: f"sim2gp.{home}" for name, home in found["_MODULES"].items()}
+    return modules | {
+        name: place(name, f"sim2gp.{home}") for name, home in found["_CONTENTS"].items()
     }
 
 
 def place(name: str, module: str) -> str:
     """The dotted path of a thing that a module defines, or imports from elsewhere."""
-    if file_of(f"{module}.{name}").is_file():
-        return f"{module}.{name}"
     for node in tree(module).body:
         if isinstance(node, DEFINITIONS) and node.name == name:
             return f"{module}.{name}"

@@ -9,13 +9,16 @@ from typing import Any
 
 __version__ = "0.1.0"
 
-# The table of contents. Nothing is imported before it is used, so that asking for help
-# or for the version costs nothing.
+# The table of contents: modules, and the modules of other names. Nothing is imported
+# before it is used, so that asking for help or for the version costs nothing.
+_MODULES = {
+    "systems": "systems",
+    "tasks": "planning.tasks",
+    "diagnose": "identification.diagnose",
+    "sinks": "runs.sinks",
+}
 _CONTENTS = {
-    "systems": "",
-    "tasks": "planning",
     "load_project": "project",
-    "sinks": "runs",
     "Box": "types",
     "Gaussian": "inference.gaussian",
     "Parameter": "inference.parameters",
@@ -24,9 +27,9 @@ _CONTENTS = {
     "log_bounded": "inference.parameters",
     "positive": "inference.parameters",
     "signed": "inference.parameters",
-    "Transitions": "data",
-    "Windows": "data",
-    "cut": "data",
+    "Transitions": "data.transitions",
+    "Windows": "data.windows",
+    "cut": "data.split_log",
     "AbstractSystem": "systems",
     "Channel": "systems",
     "AbstractModel": "belief",
@@ -39,8 +42,7 @@ _CONTENTS = {
     "Auto": "models",
     "PointEstimate": "models",
     "PriorMean": "models",
-    "fit_windows": "identification",
-    "diagnose": "identification",
+    "fit_windows": "identification.fit",
     "World": "planning",
     "rollout": "planning",
     "AbstractPlanner": "planning",
@@ -48,27 +50,26 @@ _CONTENTS = {
     "ICEM": "planning",
     "MPPI": "planning",
     "SAC": "planning",
-    "Task": "planning",
-    "episode": "planning",
-    "posterior_sampling": "planning",
-    "psrl": "planning",
-    "psal": "planning",
-    "optimism": "planning",
+    "Task": "planning.tasks",
+    "episode": "planning.episode",
+    "posterior_sampling": "planning.loop",
+    "psrl": "planning.loop",
+    "psal": "planning.loop",
+    "optimism": "planning.loop",
     "load_run": "runs",
     "show": "report",
     "InputError": "errors",
     "Sim2GPError": "errors",
 }
-__all__ = ["__version__", *_CONTENTS]
+__all__ = ["__version__", *_MODULES, *_CONTENTS]
 
 
 def __getattr__(name: str) -> Any:
+    if name in _MODULES:
+        return import_module(f"sim2gp.{_MODULES[name]}")
     if name not in _CONTENTS:
         raise AttributeError(f"module 'sim2gp' has no attribute {name!r}")
-    home = _CONTENTS[name]
-    if not home:
-        return import_module(f"sim2gp.{name}")
-    return getattr(import_module(f"sim2gp.{home}"), name)
+    return getattr(import_module(f"sim2gp.{_CONTENTS[name]}"), name)
 
 
 def __dir__() -> list[str]:

@@ -1,5 +1,6 @@
-"""Data to learn from: transitions, and windows of logs."""
+"""Data to learn from. Importing it loads no simulator: a log is read without one.
 
-from sim2gp.data.split_log import cut as cut
-from sim2gp.data.transitions import Transitions as Transitions
-from sim2gp.data.windows import Windows as Windows
+`transitions` and `windows` are what is learned from; `one_step` and
+`windows_likelihood` say how well a machine explains them; `split_log`, `grid` and
+`one_step_log` make them of logs, which `logs` reads.
+"""

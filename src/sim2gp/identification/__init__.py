@@ -1,6 +1,6 @@
-"""Which parameters do logs determine, how well, and what do they leave open."""
+"""Which parameters do logs determine, how well, and what do they leave open?
 
-from sim2gp.identification import diagnose
-from sim2gp.identification.fit import fit_windows
-
-__all__ = ["diagnose", "fit_windows"]
+`fit` is the posterior, `intervals` what its errors make of it, `diagnose` the words,
+`forecast` what it predicts; `misfit`, `missing_physics`, `identifiability` and
+`exact_posterior` each ask one question more.
+"""

@@ -1,15 +1,11 @@
 """How a draw becomes actions. Planners know callables, never models."""
 
-from sim2gp.planning import tasks
-from sim2gp.planning.episode import episode
 from sim2gp.planning.icem import ICEM
-from sim2gp.planning.loop import optimism, posterior_sampling, psal, psrl
 from sim2gp.planning.mpc import MPC
 from sim2gp.planning.mppi import MPPI
 from sim2gp.planning.networks import Policy
 from sim2gp.planning.sac import SAC
 from sim2gp.planning.signals import Chirp, Multisine, RandomInput
-from sim2gp.planning.tasks import Task
 from sim2gp.planning.update import AbstractUpdate, Plan
 from sim2gp.planning.world import (
     AbstractObjective,
@@ -37,13 +33,6 @@ __all__ = [
     "Policy",
     "RandomInput",
     "Resumed",
-    "Task",
     "World",
-    "episode",
-    "optimism",
-    "posterior_sampling",
-    "psal",
-    "psrl",
     "rollout",
-    "tasks",
 ]
