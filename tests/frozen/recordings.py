@@ -4,12 +4,14 @@ python tests/frozen/recordings.py NAME RUN       record a run of `sim2gp identif
 """
 
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 EXAMPLES = ("double_pendulum", "qube")
+SHARE = 0.01  # of a posterior's sd, of an interval's width, of an error; nats
 
 
 def figures(run: Any) -> dict[str, np.ndarray]:
@@ -24,6 +26,16 @@ def figures(run: Any) -> dict[str, np.ndarray]:
         [value for error in errors for value in error.values()]
     )
     return out
+
+
+def check_same(was: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Assert that no figure of a run has moved by more than its share."""
+    assert abs(now["log_evidence"] - was["log_evidence"]) < SHARE
+    for width in ("belief", "intervals"):
+        sd = was[f"{width}_sd"]
+        assert np.max(np.abs(now[f"{width}_mean"] - was[f"{width}_mean"]) / sd) < SHARE
+        assert np.max(np.abs(now[f"{width}_sd"] / sd - 1.0)) < SHARE
+    np.testing.assert_allclose(now["held_out"], was["held_out"], rtol=SHARE)
 
 
 if __name__ == "__main__":

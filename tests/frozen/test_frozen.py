@@ -1,4 +1,4 @@
-"""Nothing that is frozen has moved (`cases.py`); `record.py` writes the values anew."""
+"""Nothing that is frozen has moved (`cases.py`; `record.py` records it again)."""
 
 import numpy as np
 import pytest

@@ -7,12 +7,12 @@
 import json
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 import sim2gp as sg
+from frozen.recordings import check_same, figures
 from sim2gp.cli import main
 from sim2gp.experiments.identified import restored
 
@@ -21,7 +21,6 @@ pytestmark = pytest.mark.skipif(
     not GOLDEN.is_dir(), reason="the golden runs are in the repository alone"
 )
 PROJECTS = ("furuta", "arm")
-SD, NATS = 0.01, 0.01  # of a posterior's sd or an interval's width; of log evidence
 
 
 @pytest.mark.parametrize("name", PROJECTS)
@@ -47,33 +46,18 @@ def test_a_run_still_has_its_posterior(name: str) -> None:
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", PROJECTS)
 def test_a_project_is_identified_as_before(name: str, tmp_path: Path) -> None:
-    """Posterior, evidence, corrected intervals and forecasts, by what a command writes.
-
-    The noise of the forecasts' bands is compared as a number of the summary.
-    """
+    """Posterior, evidence, corrected intervals, forecasts and verdicts."""
     for file in GOLDEN.glob(f"{name}*"):
         shutil.copy(file, tmp_path)
     out = tmp_path / "run"
     main(["identify", str(tmp_path / f"{name}.toml"), "--out", str(out)])
-    same_run(sg.load_run(GOLDEN / "runs" / name), sg.load_run(out))
-
-
-def same_run(before: Any, now: Any) -> None:
-    """What a run says of parameters, evidence, intervals and held-out forecasts."""
-    was, is_ = before.summary, now.summary
-    assert abs(is_["log_evidence"] - was["log_evidence"]) < NATS
-    for prefix in ("belief", "intervals"):
-        sd = np.linalg.norm(before.arrays[f"{prefix}/scale"], axis=1)
-        for key in ("mean", "scale"):
-            a, b = (x.arrays[f"{prefix}/{key}"] for x in (before, now))
-            if key == "scale":
-                a, b = (np.linalg.norm(x, axis=1) for x in (a, b))
-            assert np.max(np.abs(a - b) / sd) < SD, f"{prefix}/{key}"
-    assert {k: e["verdict"] for k, e in was["parameters"].items()} == {
-        k: e["verdict"] for k, e in is_["parameters"].items()
-    }
-    for name, error in was["held_out"]["open_loop_rmse"].items():
-        assert is_["held_out"]["open_loop_rmse"][name] == pytest.approx(error, rel=SD)
+    was, now = (sg.load_run(run) for run in (GOLDEN / "runs" / name, out))
+    check_same(figures(was), figures(now))
+    before, after = (
+        {key: entry["verdict"] for key, entry in run.summary["parameters"].items()}
+        for run in (was, now)
+    )
+    assert before == after
 
 
 def test_the_golden_summaries_are_json() -> None:

@@ -9,10 +9,9 @@ import pytest
 import sim2gp as sg
 from frozen import episodes
 from frozen.cases import VALUES
-from frozen.recordings import EXAMPLES, figures
+from frozen.recordings import EXAMPLES, check_same, figures
 from sim2gp.cli import main
 
-SHARE = 0.01  # of a posterior's sd, of an interval's width; nats
 ROOT = Path(__file__).resolve().parents[2]
 pytestmark = pytest.mark.nightly
 
@@ -26,12 +25,7 @@ def test_a_recording_is_identified_as_before(
     now = figures(sg.load_run(out))
     with np.load(VALUES / f"recording_{name}.npz") as file:
         was = dict(file)
-    assert abs(now["log_evidence"] - was["log_evidence"]) < SHARE
-    for width in ("belief", "intervals"):
-        sd = was[f"{width}_sd"]
-        assert np.max(np.abs(now[f"{width}_mean"] - was[f"{width}_mean"]) / sd) < SHARE
-        assert np.max(np.abs(now[f"{width}_sd"] / sd - 1.0)) < SHARE
-    np.testing.assert_allclose(now["held_out"], was["held_out"], rtol=SHARE)
+    check_same(was, now)
 
 
 def test_learners_act_as_before() -> None:

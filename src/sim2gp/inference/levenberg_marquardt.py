@@ -182,7 +182,7 @@ def _descend(
         small = finite & (here.gradient <= 0.1 * GRADIENT_TOLERANCE)
         hopeless = ~finite | ~(damping < MOST_DAMPING) | (count > MAX_STEPS)
         hopeless = (count > 0) & hopeless
-        # Two steps at least: a gradient that is small beside a large cost is not zero.
+        # Two steps at least: a gradient may be small next to a large cost.
         done = settled | jnp.where(exact, small & (count >= 2), small)
         return ~done & ~hopeless & ~idle
 

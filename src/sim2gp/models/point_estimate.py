@@ -1,6 +1,6 @@
 """Beliefs of one function alone: the MAP, and the prior mean that never learns.
 
-Always beside posterior sampling: the point estimate (certainty equivalence) and the
+References for posterior sampling: the point estimate (certainty equivalence), and the
 simulator as delivered.
 """
 

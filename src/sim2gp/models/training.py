@@ -44,8 +44,8 @@ def descend(
         parameters, state = carry
         t = start + i
         grads = gradient(parameters, t, jax.random.fold_in(key, t))
-        # Adam's second form (arXiv 1412.6980, section 2): 1e-8 beside the moment that
-        # is still biased. The smallest gradients wait for the others.
+        # Adam's second form (arXiv 1412.6980, section 2): 1e-8 is added to the moment
+        # that is still biased. The smallest gradients wait for the others.
         unbiased = jnp.sqrt(1.0 - 0.999 ** (t + 1).astype(jnp.float32))
         with jax.numpy_dtype_promotion("standard"):  # optax relies on it
             updates, state = adamw(1e-8 / unbiased).update(grads, state, parameters)

@@ -28,6 +28,7 @@ from sim2gp.project.readings import SURE, Found, Reading, Version, find_readings
 from sim2gp.project.replace import key as toml_key
 from sim2gp.project.replace import quoted, replace_project
 from sim2gp.systems.base import AbstractSystem
+from sim2gp.systems.effects.units import joints_of
 from sim2gp.types import Key
 
 DELAY = 0.04  # s, the longest that a draft lets an input be late
@@ -163,7 +164,7 @@ def _in_other_units(
 
 def _large(version: Version, system: AbstractSystem) -> bool:
     """Whether a joint without a unit travels so far that it may be in a smaller one."""
-    joints = [c.name for c in system.physical_states if c.unit in ("rad", "m")]
+    joints = [c.name for c in joints_of(system)]
     return any(
         np.ptp(log.channels[name]) > LARGE
         for log in version.logs

@@ -23,6 +23,7 @@ from sim2gp.systems.effects.registry import (
     options_of,
     possible,
 )
+from sim2gp.systems.effects.units import joints_of
 from sim2gp.systems.machine import plant_of
 
 
@@ -48,8 +49,7 @@ def with_effects(
 
 def _impossible(plant: AbstractPlant, what: str, where: str, line: str) -> InputError:
     """An effect that no machine, this one, or this channel has (E103, E145, E160)."""
-    joints = [c.name for c in plant.physical_states if c.unit in ("rad", "m")]
-    channels = [*joints, *(c.name for c in plant.actions)]
+    channels = [c.name for c in (*joints_of(plant), *plant.actions)]
     known = {
         channel: [kind for kind in NAMES if possible(plant, kind, channel)]
         for channel in channels

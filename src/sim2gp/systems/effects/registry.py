@@ -40,7 +40,7 @@ from sim2gp.systems.effects.friction import (
 from sim2gp.systems.effects.geometry import PoleGeometry, RodInertia
 from sim2gp.systems.effects.inputs import DeadZone
 from sim2gp.systems.effects.springs import Spring
-from sim2gp.systems.effects.units import joint_of
+from sim2gp.systems.effects.units import joint_of, joints_of, velocity_of
 from sim2gp.systems.machine import Machine, plant_of
 from sim2gp.systems.mechanism import AbstractMechanism
 from sim2gp.systems.parts import AbstractPart
@@ -273,42 +273,38 @@ def _arm(plant: TwoLink | UniformRodArm) -> list[Candidate]:
 def _of_any(plant: AbstractPlant) -> list[Candidate]:
     """Of each joint whose velocity is a state, as large as what moves it."""
     found: list[Candidate] = []
-    names = [channel.name for channel in plant.physical_states]
-    speeds = {f"{name}.velocity" for name in names} & set(names)
-    for joint in plant.physical_states:
-        if joint.unit not in ("rad", "m") or f"{joint.name}.velocity" not in speeds:
+    names, most = [c.name for c in plant.physical_states], _accelerations(plant)
+    for joint in joints_of(plant):
+        if f"{joint.name}.velocity" not in names:
             continue
         slide = joint.unit == "m"
         width, slip = (0.01, 0.1) if slide else (0.05, 1.0)
         speed, reach = (1.0, 0.3) if slide else (10.0, 1.0)
-        most = _acceleration(plant, f"{joint.name}.velocity")
+        force = most[velocity_of(plant, joint.name)]
         found += [
-            Candidate(Coulomb(joint.name, SHARE * most, width)),
-            *_of_joint(joint.name, most, speed, reach, width=width, slip=slip),
+            Candidate(Coulomb(joint.name, SHARE * force, width)),
+            *_of_joint(joint.name, force, speed, reach, width=width, slip=slip),
             Candidate(EncoderOffset(joint.name, OFFSET), sign=0),
         ]
     return found
 
 
 @in_float64
-def _acceleration(plant: AbstractPlant, velocity: str) -> float:
-    """The largest that inputs and weight give at rest, nominal constants; 1 if none."""
-    params, n = plant.nominal(), len(plant.physical_states)
-    i = [channel.name for channel in plant.physical_states].index(velocity)
-    positions = np.asarray([c.unit in ("rad", "m") for c in plant.physical_states])
-    high, low = (
-        [x if math.isfinite(x) else sign for x in ends]
-        for sign, ends in (
-            (1.0, [c.high for c in plant.actions]),
-            (-1.0, [c.low for c in plant.actions]),
-        )
-    )
+def _accelerations(plant: AbstractPlant) -> list[float]:
+    """The largest slope of each state that inputs and weight give at rest, per second.
+
+    With nominal constants; 1 for a state that does not move.
+    """
+    params, joints = plant.nominal(), joints_of(plant)
+    away = np.asarray([0.5 * (c in joints) for c in plant.physical_states])
+    high = [c.high if math.isfinite(c.high) else 1.0 for c in plant.actions]
+    low = [c.low if math.isfinite(c.low) else -1.0 for c in plant.actions]
     inputs = [np.zeros(len(high)), *np.diag(high), *np.diag(low)]
-    flow = jax.jit(lambda s, a: plant.flow(params, s, a, LONGEST_MEAN))
+    flow = jax.jit(lambda s, a: plant.flow(params, s, a, LONGEST_MEAN) - s)
     moved = [
-        np.asarray(flow(jnp.asarray(s), jnp.asarray(a)))[i] / LONGEST_MEAN
-        for s in (np.zeros(n), 0.5 * positions)
+        np.abs(flow(jnp.asarray(s), jnp.asarray(a))) / LONGEST_MEAN
+        for s in (0.0 * away, away)
         for a in inputs
     ]
-    most = float(np.max(np.abs(moved)))
-    return most if 0.0 < most < math.inf else 1.0
+    most = np.max(moved, axis=0)
+    return [float(x) if 0.0 < x < math.inf else 1.0 for x in most]

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 from sim2gp.errors import InputError
-from sim2gp.systems.base import AbstractPlant, Channel, index_of
+from sim2gp.systems.base import AbstractPlant, AbstractSystem, Channel, index_of
 from sim2gp.systems.mechanism import AbstractMechanism
 
 
@@ -26,9 +26,14 @@ def gravity_of(system: AbstractMechanism) -> float:
     return float(system.gravity)  # type: ignore[attr-defined]
 
 
+def joints_of(system: AbstractSystem) -> list[Channel]:
+    """The positions among the states: of hinges in rad, of slides in m."""
+    return [c for c in system.physical_states if c.unit in ("rad", "m")]
+
+
 def joint_of(plant: AbstractPlant, name: str) -> Channel:
     """A joint by the name of its position (E103)."""
-    joints = [c for c in plant.physical_states if c.unit in ("rad", "m")]
+    joints = joints_of(plant)
     return joints[index_of(name, joints)]
 
 
