@@ -19,6 +19,7 @@ from mutant_configurations import CONFIGURATIONS
 from mutant_descent import DESCENTS
 from mutant_design import DESIGN
 from mutant_draft import FIRST_DRAFT
+from mutant_effects import EFFECTS
 from mutant_exploring import EXPLORING
 from mutant_inputs import INPUTS
 from mutant_interop import INTEROP
@@ -41,6 +42,7 @@ MUTANTS = (
     *EXPLORING,
     *DESIGN,
     *FIRST_DRAFT,
+    *EFFECTS,
     *OFF_POLICY,
     *ON_THE_HOST,
     *LOGS,

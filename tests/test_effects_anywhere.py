@@ -53,14 +53,8 @@ def slowed(effect: Any, v: float, t: float, q: float = 0.6) -> float:
     return float(effect.accelerated(*numbers))
 
 
-@pytest.mark.parametrize("v", [1.5, 0.06, 0.01, -0.2, 0.0])
-@pytest.mark.parametrize("t", [1e-3, 0.02, 0.3])
-@pytest.mark.parametrize(
-    "effect",
-    [Viscous("q", 3.0), Drag("q", 2.0), Spring("q", 2.0), Coulomb("q", 2.0)],
-)
-def test_a_kick_is_the_solution(effect: Any, t: float, v: float) -> None:
-    """Of ``dv/dt = along(x, q, v)``, by an independent integrator."""
+def integrated(effect: Any, v: float, t: float) -> float:
+    """Velocity after ``dv/dt = along(x, q, v)``, by an independent integrator."""
 
     @in_float64
     def rate(_: float, v: np.ndarray) -> np.ndarray:
@@ -70,7 +64,24 @@ def test_a_kick_is_the_solution(effect: Any, t: float, v: float) -> None:
     exact = scipy.integrate.solve_ivp(
         rate, (0.0, t), [v], method="LSODA", rtol=1e-10, atol=1e-12
     )
-    assert slowed(effect, v, t) == pytest.approx(exact.y[0, -1], rel=1e-6, abs=1e-9)
+    return float(exact.y[0, -1])
+
+
+@pytest.mark.parametrize("v", [1.5, 0.06, 0.01, -0.2, 0.0])
+@pytest.mark.parametrize("t", [1e-3, 0.02, 0.3])
+@pytest.mark.parametrize(
+    "effect",
+    [Viscous("q", 3.0), Drag("q", 2.0), Spring("q", 2.0), Coulomb("q", 2.0)],
+)
+def test_a_kick_is_the_solution(effect: Any, t: float, v: float) -> None:
+    expected = integrated(effect, v, t)
+    assert slowed(effect, v, t) == pytest.approx(expected, rel=1e-6, abs=1e-9)
+
+
+def test_a_kick_of_stribeck_friction_is_of_second_order() -> None:
+    effect = Stribeck("q", 2.0, 0.5)
+    errors = [slowed(effect, 1.5, t) - integrated(effect, 1.5, t) for t in (0.1, 0.05)]
+    assert 7.0 < errors[0] / errors[1] < 9.0  # of one step: the third
 
 
 def test_steep_friction_stops_and_does_not_turn() -> None:

@@ -1,0 +1,82 @@
+"""Mutants of effects on plants without a mass matrix, and of what may be added."""
+
+from mutant_list import Hunt, Mutant
+
+FRICTION, LAWS = "systems/effects/friction.py", "systems/effects/friction_laws.py"
+KICKS, LIST = "systems/effects/kicks.py", "systems/effects/registry.py"
+KICK: Hunt = ("test_effects_anywhere.py", "kick or steep or order")
+LISTED: Hunt = ("test_effects_anywhere.py", "registered or names")
+
+EFFECTS = (
+    Mutant(
+        "whole kicks for half",
+        KICKS,
+        "jnp.asarray(0.5 * h, s.dtype)",
+        "jnp.asarray(h, s.dtype)",
+        KICK,
+    ),
+    Mutant(
+        "second kick in the first's order",
+        KICKS,
+        "reversed(effects)",
+        "effects",
+        KICK,
+    ),
+    Mutant("drag's sign", FRICTION, "x * jnp.abs(v) * t", "x * v * t", KICK),
+    Mutant(
+        "drag as a step of Euler's",
+        FRICTION,
+        "v / (1.0 + x * jnp.abs(v) * t)",
+        "v * (1.0 - x * jnp.abs(v) * t)",
+        KICK,
+    ),
+    Mutant(
+        "damping as a step of Euler's",
+        FRICTION,
+        "v * jnp.exp(-x * t)",
+        "v * (1.0 - x * t)",
+        KICK,
+    ),
+    Mutant(
+        "dry friction without its width",
+        LAWS,
+        "level * t / width\n",
+        "level * t\n",
+        KICK,
+    ),
+    Mutant(
+        "log sinh without its two",
+        LAWS,
+        " - math.log(2.0) - k",
+        " - k",
+        KICK,
+    ),
+    Mutant(
+        "Stribeck's level of the start",
+        FRICTION,
+        "slowed_by_coulomb(v, self._level(x, middle), self.width, t)",
+        "slowed_by_coulomb(v, self._level(x, v), self.width, t)",
+        KICK,
+    ),
+    Mutant(
+        "springs pull from the other side",
+        "systems/effects/springs.py",
+        "v - x * q * t",
+        "v + x * q * t",
+        KICK,
+    ),
+    Mutant(
+        "priors in the input alone",
+        LIST,
+        "for s in (0.0 * away, away)",
+        "for s in (0.0 * away,)",
+        LISTED,
+    ),
+    Mutant(
+        "priors per step",
+        LIST,
+        "jnp.asarray(a))) / LONGEST_MEAN",
+        "jnp.asarray(a)))",
+        LISTED,
+    ),
+)
