@@ -82,6 +82,16 @@ def test_the_last_turn_goes_on_to_a_zero_gradient():
     assert float(jnp.max(jnp.abs(again.z - fit.z))) <= 1e-8
 
 
+def test_a_gradient_that_is_small_next_to_a_large_cost_is_followed():
+    """The last turn takes two steps at least."""
+
+    def residual(z):
+        return jnp.stack([jnp.asarray(1e5), z[0] - 1.0])
+
+    fit = minimise(residual, jnp.zeros(1))
+    assert float(fit.z[0]) == pytest.approx(0.5)
+
+
 def no_update(at, noise):
     return noise
 
