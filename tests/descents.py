@@ -47,6 +47,13 @@ class Whitened(AbstractLikelihood):
     floor: Float[Array, " 1"]
     residual: Callable = eqx.field(static=True)
 
+    @property
+    def n_nuisances(self) -> int:
+        return 0
+
+    def first_noise(self) -> Noise:
+        return Noise(jnp.ones(1), jnp.ones(len(self.counts)))
+
     def blocks(
         self, tt: Float[Array, " p"], e: Float[Array, "1 0"], scale: Float[Array, "p p"]
     ) -> Blocks:

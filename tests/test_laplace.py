@@ -318,6 +318,10 @@ def some_noise():
 class Curves(AbstractLikelihood):
     counts: jax.Array
     floor: jax.Array
+    n_nuisances = 2
+
+    def first_noise(self):
+        return some_noise()
 
     def blocks(self, z, e, scale):
         def one(w):

@@ -190,8 +190,6 @@ def _fit(
         likelihood,
         ParameterPrior(model.prior, model.system.parameters),
         starts=starts,
-        nuisances=jnp.zeros((1, 0)),
-        noise=likelihood.large_noise(),
         rounds=NOISE_ROUNDS,
     )
 
