@@ -43,8 +43,8 @@ def worlds(task: Task) -> dict[str, World]:
     """A draw of each fitted model as a world, beside the simulator itself."""
     sim, data, key = Sim2GP(Furuta()), random_data(task), jax.random.key(1)
     found = {SIMULATOR: oracle_world(task)}
-    for name, make in MODELS.items():
-        model = make(sim, {})
+    for name, learner in MODELS.items():
+        model = learner.make(sim, {})
         belief = model.fit(model.init(key), data, key=key)
         objective = MarkovObjective(task.reward)
         found[name] = world_of(task, belief.sample(key), objective, history=0)

@@ -47,6 +47,13 @@ class Whitened(AbstractLikelihood):
     floor: Float[Array, " 1"]
     residual: Callable = eqx.field(static=True)
 
+    @property
+    def n_nuisances(self) -> int:
+        return 0
+
+    def first_noise(self) -> Noise:
+        return Noise(jnp.ones(1), jnp.ones(len(self.counts)))
+
     def blocks(
         self, tt: Float[Array, " p"], e: Float[Array, "1 0"], scale: Float[Array, "p p"]
     ) -> Blocks:
@@ -56,6 +63,39 @@ class Whitened(AbstractLikelihood):
 
 def whitened(residual: Callable) -> Whitened:
     return Whitened(jnp.ones((1, 1)), jnp.zeros(1), residual)
+
+
+def curves(z, e):
+    """Three windows, two channels, four samples: nonlinear in ``z`` and each ``e``."""
+    t = jnp.linspace(0.0, 1.0, 4)[None] + 0.3 * jnp.arange(3.0)[:, None]
+    first = jnp.sin(z[0] * t + e[:, :1]) * jnp.exp(0.3 * e[:, 1:])
+    second = z[1] * t**2 + e[:, 1:] ** 2 * t - z[0]
+    target = jnp.stack([jnp.cos(3.0 * t), t], axis=-1)
+    return jnp.stack([first, second], axis=-1) - target
+
+
+def some_noise():
+    return Noise(jnp.asarray([0.2, 0.05]), jnp.asarray([1.0, 0.6, 2.0]))
+
+
+class Curves(AbstractLikelihood):
+    """The same as a likelihood."""
+
+    counts: jax.Array
+    floor: jax.Array
+    n_nuisances = 2
+
+    def first_noise(self):
+        return some_noise()
+
+    def blocks(self, z, e, scale):
+        def one(w):
+            r = lambda z, own: curves(z, e.at[w].set(own))[w]  # noqa: E731
+            by_z, by_e = jax.jacfwd(r, argnums=(0, 1))(z, e[w])
+            J = jnp.concatenate([by_e, by_z], axis=-1)
+            return jax.vmap(factor, in_axes=1)(J, r(z, e[w]))
+
+        return jnp.stack([one(w) for w in range(3)])
 
 
 class Found(eqx.Module):

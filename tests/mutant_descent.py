@@ -208,4 +208,18 @@ DESCENTS = (
         "vain & (here.gradient <= 0.0)",
         ("test_laplace.py", "rounding_hides"),
     ),
+    Mutant(
+        "padded nuisances in the place of parameters",
+        "inference/stacked.py",
+        "np.concatenate([own, np.arange(n, k)])",
+        "np.arange(k - n + own.size)",
+        ("test_stacked.py", "linear"),
+    ),
+    Mutant(
+        "every likelihood in the first one's windows",
+        "inference/stacked.py",
+        "w, i = w + rows, i + columns",
+        "w, i = 0, i + columns",
+        ("test_stacked.py", "linear"),
+    ),
 )

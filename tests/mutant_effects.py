@@ -6,6 +6,7 @@ FRICTION, LAWS = "systems/effects/friction.py", "systems/effects/friction_laws.p
 KICKS, LIST = "systems/effects/kicks.py", "systems/effects/registry.py"
 KICK: Hunt = ("test_effects_anywhere.py", "kick or steep or order")
 LISTED: Hunt = ("test_effects_anywhere.py", "registered or names")
+LAW: Hunt = ("test_effects_anywhere.py", "new_law")
 
 EFFECTS = (
     Mutant(
@@ -61,8 +62,8 @@ EFFECTS = (
     Mutant(
         "springs pull from the other side",
         "systems/effects/springs.py",
-        "v - x * q * t",
-        "v + x * q * t",
+        "v + self.along(x, q, v) * t",
+        "v - self.along(x, q, v) * t",
         KICK,
     ),
     Mutant(
@@ -78,5 +79,19 @@ EFFECTS = (
         "jnp.asarray(a))) / LONGEST_MEAN",
         "jnp.asarray(a)))",
         LISTED,
+    ),
+    Mutant(
+        "a law's prior by position alone",
+        LIST,
+        "(joint.reach**of_position * joint.speed**of_velocity)",
+        "joint.reach**of_position",
+        LAW,
+    ),
+    Mutant(
+        "a law's unit without its seconds",
+        "systems/effects/units.py",
+        '("s", seconds - 2)',
+        '("s", -2)',
+        LAW,
     ),
 )

@@ -90,4 +90,11 @@ STUDIES = (
         "if False:",
         ("test_export.py", "malformed"),
     ),
+    Mutant(
+        "past actions of the bare plant",
+        "experiments/swingup.py",
+        "return task, model, model.history",
+        "return task, model, system.history",
+        ("test_mismatch.py", "wraps"),
+    ),
 )

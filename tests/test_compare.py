@@ -22,10 +22,12 @@ QUIET = Progress(quiet=True)
 #: The simulator and one learned model: each model more is half a minute of compiling,
 #: and so is a box of its own for each of the two arms.
 BOX = {"q1.velocity": 12.0, "q2.velocity": 20.0}
-SOME: compare.Makers = {
+SOME: compare.Learners = {
     "SIM2GP": compare.MODELS["SIM2GP"],
-    "RES-FS": lambda sim, reach: ResidualFunctionSpace(
-        sim, hidden=(32, 32), steps=900, reach=BOX
+    "RES-FS": compare.MODELS["RES-FS"]._replace(
+        make=lambda sim, reach: ResidualFunctionSpace(
+            sim, hidden=(32, 32), steps=900, reach=BOX
+        )
     ),
 }
 SPRINGS = {"q1.spring": 2.0, "q2.spring": 1.0}  # N m/rad

@@ -2,8 +2,9 @@
 
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -36,7 +37,9 @@ from sim2gp.systems import (
     plant_of,
 )
 from sim2gp.systems.assemble import carrying_inputs
-from sim2gp.types import in_float64
+from sim2gp.systems.effects import registry
+from sim2gp.systems.effects.springs import AbstractSpring
+from sim2gp.types import Scalar, in_float64
 
 ARM = payload_arm.arm()
 ABOUT = payload_arm.TABLE, payload_arm.STATES, payload_arm.ACTIONS
@@ -200,6 +203,57 @@ def test_what_any_plant_may_lack_is_registered(tmp_path: Path) -> None:
     most = (2.0 + weight * math.sin(0.5)) / inertia
     scale = {c.name: c.effect.magnitude for c in candidates(ARM)}["q.coulomb"]
     assert scale == pytest.approx(0.2 * most, rel=0.05)  # over 10 ms it gives way
+
+
+class CubicSpring(AbstractSpring):
+    """A spring that stiffens, ``-magnitude q^3``: a law that the list does not have."""
+
+    where: str = eqx.field(static=True)
+    magnitude: float = eqx.field(static=True)
+    what: ClassVar[str] = "cubic_spring"
+    powers: ClassVar[tuple[int, int]] = 3, 0
+    meaning: ClassVar[str] = "stiffening of a cable"
+    max_substep: ClassVar[float] = 0.005
+
+    def along(self, x: Scalar, q: Scalar, v: Scalar) -> Scalar:
+        return -x * q**3
+
+
+class Churning(CubicSpring):
+    """``-magnitude q v^3``, as a law of both: its unit and its prior alone."""
+
+    what: ClassVar[str] = "churning"
+    powers: ClassVar[tuple[int, int]] = 1, 3
+
+
+def test_a_new_law_is_a_candidate_with_its_unit_and_prior(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """One entry of `_FORCES` is enough, on machines with a mass matrix and without."""
+    more = *registry._FORCES, CubicSpring, Churning
+    monkeypatch.setattr(registry, "_FORCES", more)
+    ode = ODE(payload_arm.ode, *ABOUT)
+    expected = {
+        ("furuta", "theta"): ("N m/rad^3", "N m s^3/rad^4", 0.025, 10.0, 1.0),
+        ("furuta", "alpha"): ("N m/rad^3", "N m s^3/rad^4", 0.015, 15.0, 1.0),
+        ("cartpole", "x"): ("N/m^3", "N s^3/m^4", 12.6, 1.0, 0.3),
+        ("ode", "q"): ("1/(rad^2 s^2)", "s/rad^3", None, 10.0, 1.0),
+    }
+    plants = {"furuta": Furuta(), "cartpole": CartPole(), "ode": ode}
+    for (name, q), (cubic, churning, force, speed, reach) in expected.items():
+        plant = plants[name]
+        found = {c.name: c for c in candidates(plant)}
+        spring, other = found[f"{q}.cubic_spring"], found[f"{q}.churning"]
+        units = spring.effect.unit(plant), other.effect.unit(plant)
+        assert units == (cubic, churning)
+        scale = 0.2 * force if force else found[f"{q}.coulomb"].effect.magnitude
+        assert spring.effect.magnitude == pytest.approx(scale / reach**3)
+        assert other.effect.magnitude == pytest.approx(scale / (reach * speed**3))
+        smooth = {effect.name for effect in registry.smooth_effects(plant)}
+        assert (f"{q}.cubic_spring" in smooth) == (name != "ode")
+    assert slowed(CubicSpring("q", 2.0), 1.5, 0.1) == pytest.approx(
+        integrated(CubicSpring("q", 2.0), 1.5, 0.1)
+    )
 
 
 def test_a_project_names_effects_of_a_model(tmp_path: Path) -> None:

@@ -121,6 +121,13 @@ class Product(AbstractLikelihood):
     floor: Float[Array, " c"]
     y: float
 
+    @property
+    def n_nuisances(self) -> int:
+        return 1
+
+    def first_noise(self) -> Noise:
+        return Noise(jnp.ones(1), jnp.ones(len(self.counts)))
+
     def blocks(
         self,
         z: Float[Array, " p"],

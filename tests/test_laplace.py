@@ -7,15 +7,13 @@ import pytest
 import scipy.optimize
 
 import descents
-from descents import whitened
+from descents import Curves, curves, some_noise, whitened
 from sim2gp.errors import DeadParameters, NotConverged, NotFinite
 from sim2gp.inference import estimate as estimates
-from sim2gp.inference import least_squares as ls
 from sim2gp.inference.arrowhead import Noise
 from sim2gp.inference.estimate import CONVERGED, NOT_FINITE, expected_noise
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.levenberg_marquardt import GRADIENT_TOLERANCE
-from sim2gp.inference.likelihood import AbstractLikelihood
 
 pytestmark = pytest.mark.usefixtures("float64")
 
@@ -300,33 +298,6 @@ def test_a_step_that_gains_nothing_is_not_taken():
 
 
 # Nuisances
-
-
-def curves(z, e):
-    """Three windows, two channels, four samples: nonlinear in ``z`` and each ``e``."""
-    t = jnp.linspace(0.0, 1.0, 4)[None] + 0.3 * jnp.arange(3.0)[:, None]
-    first = jnp.sin(z[0] * t + e[:, :1]) * jnp.exp(0.3 * e[:, 1:])
-    second = z[1] * t**2 + e[:, 1:] ** 2 * t - z[0]
-    target = jnp.stack([jnp.cos(3.0 * t), t], axis=-1)
-    return jnp.stack([first, second], axis=-1) - target
-
-
-def some_noise():
-    return Noise(jnp.asarray([0.2, 0.05]), jnp.asarray([1.0, 0.6, 2.0]))
-
-
-class Curves(AbstractLikelihood):
-    counts: jax.Array
-    floor: jax.Array
-
-    def blocks(self, z, e, scale):
-        def one(w):
-            r = lambda z, own: curves(z, e.at[w].set(own))[w]  # noqa: E731
-            by_z, by_e = jax.jacfwd(r, argnums=(0, 1))(z, e[w])
-            J = jnp.concatenate([by_e, by_z], axis=-1)
-            return jax.vmap(ls.factor, in_axes=1)(J, r(z, e[w]))
-
-        return jnp.stack([one(w) for w in range(3)])
 
 
 def stacked(x):

@@ -11,6 +11,7 @@ import pytest
 from sim2gp.errors import InputError
 from sim2gp.experiments import mismatch, swingup
 from sim2gp.experiments.swingup import CONDITIONS, METHODS, WITH_TERM, Cell
+from sim2gp.models import PointEstimate
 from sim2gp.planning.tasks import MACHINES, furuta_swingup
 from sim2gp.runs import Progress
 from sim2gp.systems import Delay, Furuta
@@ -54,6 +55,15 @@ def test_the_right_term_is_there_for_delays_as_well():
     table = {p.name: p for p in model.system.parameters.free}
     assert (table["voltage.delay"].low, table["voltage.delay"].high) == (low, high)
     assert model.system.history == 2  # 40 ms of past actions, every 20 ms
+
+
+def test_a_learner_that_wraps_another_keeps_its_past_actions(monkeypatch):
+    right = METHODS[WITH_TERM]
+    monkeypatch.setitem(METHODS, "wrapped", lambda *x: PointEstimate(right(*x)))
+    cell = Cell("furuta", "delay strong", "wrapped", 0, 2)
+    for method, expected in (("wrapped", 2), (WITH_TERM, 2), ("SIM2GP", 0)):
+        _, model, history = swingup.meeting(cell, method, 0)
+        assert history == model.history == expected
 
 
 def test_the_box_of_a_learner_is_the_tasks():

@@ -24,6 +24,7 @@ from sim2gp.planning.episode import world_of
 from sim2gp.planning.exploration import InformationGain, Optimistic
 from sim2gp.robot.export import export_model
 from sim2gp.runs.sinks import each_episode
+from sim2gp.systems import Delay, free_parts
 from sim2gp.types import single as in_float32
 
 KEY = jax.random.key(0)
@@ -313,3 +314,13 @@ def test_a_belief_says_how_large_its_noise_is() -> None:
 
     with pytest.raises(TypeError, match="noise"):
         Silent()
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_model_says_how_many_past_actions_its_states_carry(name, monkeypatch):
+    """Those of its machine, whatever it is wrapped in; none without delayed inputs."""
+    assert MODELS[name]().history == 0
+    delay = Delay(SYSTEM.actions[0].name, 2.5 * DT)
+    late = free_parts(SYSTEM, [delay], period=DT)
+    monkeypatch.setitem(globals(), "SYSTEM", late)
+    assert late.history == MODELS[name]().history == 3

@@ -7,7 +7,7 @@ import pytest
 import scipy.integrate
 import scipy.stats
 
-from sim2gp.experiments import scoring
+from sim2gp.experiments import compare, scoring
 from sim2gp.experiments.scoring import Paired
 
 
@@ -130,7 +130,7 @@ def test_ties_keep_the_simpler_and_runaways_lose() -> None:
         assert scoring.supported(np.stack(sums), RNG(0)) == kept
 
 
-NAMES = ("SIM2GP", "RES", "NLM")
+WHAT = {name: compare.MODELS[name].what for name in ("SIM2GP", "RES", "NLM")}
 SAME = Paired(0.0, 0.0, 0.0, 0, 6)
 
 
@@ -148,8 +148,19 @@ def test_the_verdict_in_words(
     res: float, nlm: float, kept: int, words: list[str]
 ) -> None:
     pairs = [SAME, *(Paired(x, x - 0.03, x + 0.03, 5, 6) for x in (res, nlm))]
-    said = scoring.sentence(NAMES, pairs, kept, "logs")
+    said = scoring.sentence(WHAT, pairs, kept, "logs")
     for word in words:
         assert word in said
     assert "nan" not in said
     assert "inf" not in said
+
+
+def test_every_learner_that_is_compared_has_words() -> None:
+    """A learner of one's own is one entry of the table; the verdict says it."""
+    own = compare.Learner(lambda sim, reach: sim, "a table of numbers")
+    known = {**compare.MODELS, "OWN": own}
+    what = {name: learner.what for name, learner in known.items()}
+    pairs = [SAME, *[Paired(-0.1, -0.2, -0.05, 5, 6)] * (len(what) - 1)]
+    for kept, (name, words) in list(enumerate(what.items()))[1:]:
+        said = scoring.sentence(what, pairs, kept, "logs")
+        assert f"support {words} ({name})" in said

@@ -103,6 +103,11 @@ def _joint_along(
 class AbstractModel(eqx.Module):
     """A recipe; it keeps the prior, and has no data."""
 
+    @property
+    def history(self) -> int:
+        """Number of past actions that its states carry: of a machine of late inputs."""
+        return 0
+
     @abstractmethod
     def init(self, key: Key) -> AbstractBelief:
         """The belief before any data."""

@@ -37,6 +37,10 @@ class OneStepLikelihood(AbstractLikelihood):
         self.counts = jnp.full((1, d), jnp.sum(self.data.mask, dtype=float))
         self.floor = FLOOR * _rms_change(self.data, d)
 
+    @property
+    def n_nuisances(self) -> int:
+        return 0
+
     def rows(
         self, tt: Float[Array, " p"], scale: Float[Array, "p p"]
     ) -> tuple[Float[Array, "N d"], Float[Array, "N d p"]]:
@@ -70,8 +74,8 @@ class OneStepLikelihood(AbstractLikelihood):
         r, J = self.rows(tt, scale)
         return jax.vmap(factor, in_axes=1)(J, r)[None]
 
-    def large_noise(self) -> Noise:
-        """The states' own change in a step: it traps no first MAP."""
+    def first_noise(self) -> Noise:
+        """The states' own change in a step."""
         d = self.floor.size
         return Noise(_rms_change(self.data, d), jnp.ones(1))
 

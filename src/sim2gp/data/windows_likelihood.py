@@ -49,6 +49,10 @@ class WindowsLikelihood(AbstractLikelihood):
         mask = self.windows.mask.astype(self.windows.y.dtype)
         self.counts, self.floor = jnp.sum(mask, axis=1), self.windows.floor
 
+    @property
+    def n_nuisances(self) -> int:
+        return int(self.windows.start.shape[1])
+
     def simulated(
         self, window: Windows, tt: Float[Array, " p"], e: Float[Array, " n"]
     ) -> tuple[Float[Array, "L c"], Float[Array, "L n"], Float[Array, " m"]]:
@@ -80,8 +84,8 @@ class WindowsLikelihood(AbstractLikelihood):
         return found
 
     @eqx.filter_jit
-    def large_noise(self) -> Noise:
-        """The measurements' sd about each window's mean: it traps no first MAP."""
+    def first_noise(self) -> Noise:
+        """The measurements' sd about each window's mean."""
         windows = self.windows
         mask = windows.mask.astype(windows.y.dtype)
         y = jnp.where(windows.mask, windows.y, 0.0)

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -57,14 +57,31 @@ MOST_FOLDS = 6  # more recordings are left out in groups
 LAST = 0.25  # of a single recording is left out
 REACH = 1.2  # half-width of a state without limits, in the largest seen
 
-Makers = Mapping[str, Callable[[Sim2GP, dict[str, float]], AbstractModel]]
+
+class Learner(NamedTuple):
+    """How a model is made of the simulator and a reach, and what it is in words."""
+
+    make: Callable[[Sim2GP, dict[str, float]], AbstractModel]
+    what: str
+
+
+Learners = Mapping[str, Learner]
+WITH_RESIDUAL = "the simulator plus a learned residual"
 #: From simple to complex; each from the simulator with its constants given.
-MODELS: Makers = {
-    "SIM2GP": lambda sim, reach: sim,
-    "RES": lambda sim, reach: Residual(sim, reach=reach),
-    "RES-FS": lambda sim, reach: ResidualFunctionSpace(sim, reach=reach),
-    "FS": lambda sim, reach: FunctionSpace(sim, reach=reach),
-    "NLM": lambda sim, reach: NLM(sim.system, reach=reach),
+MODELS: Learners = {
+    "SIM2GP": Learner(lambda sim, reach: sim, "the simulator alone"),
+    "RES": Learner(lambda sim, reach: Residual(sim, reach=reach), WITH_RESIDUAL),
+    "RES-FS": Learner(
+        lambda sim, reach: ResidualFunctionSpace(sim, reach=reach), WITH_RESIDUAL
+    ),
+    "FS": Learner(
+        lambda sim, reach: FunctionSpace(sim, reach=reach),
+        "a network that starts from the simulator",
+    ),
+    "NLM": Learner(
+        lambda sim, reach: NLM(sim.system, reach=reach),
+        "a black box rather than the simulator",
+    ),
 }
 
 
@@ -93,7 +110,7 @@ def run(
     seed: int,
     progress: Progress,
     horizons: Sequence[float] = HORIZONS,
-    models: Makers = MODELS,
+    models: Learners = MODELS,
 ) -> dict[str, Any]:
     """Fit, train and judge all models fold by fold; writes and returns the summary.
 
@@ -116,7 +133,7 @@ def run(
         units = {c.name: c.unit for c in project.system.physical_states}
         summary, arrays = summarise(
             parts,
-            list(models),
+            {name: learner.what for name, learner in models.items()},
             names,
             setup.logs,
             np.asarray(setup.steps.steps) * setup.period,
@@ -196,7 +213,7 @@ def prepare(
 def fold(
     setup: Setup,
     left: Sequence[int],
-    models: Makers,
+    models: Learners,
     key: jax.Array,
     done: Callable[[str], None],
 ) -> Held:
@@ -220,9 +237,9 @@ def fold(
     training = set(recordings(setup.logs)) - {setup.logs[k].source for k in left}
     inflation = inflation_of(len(training))
     error, sd, steps = [], [], []
-    for (name, make), key in zip(models.items(), keys, strict=True):
+    for (name, learner), key in zip(models.items(), keys, strict=True):
         begin, learn, roll = jax.random.split(key, 3)
-        model = make(sim, setup.reach)
+        model = learner.make(sim, setup.reach)
         fitted = model.fit(model.init(begin), train, key=learn)
         found = ensemble(fitted, setup.steps, start_sd, draws=DRAWS, key=roll)
         off = found.point - setup.steps.y

@@ -60,7 +60,7 @@ class Table:
 
 def summarise(
     parts: Sequence[Held],
-    models: Sequence[str],
+    what: Mapping[str, str],
     channels: Sequence[str],
     logs: Sequence[Log],
     seconds: Float[np.ndarray, " R"],
@@ -70,9 +70,10 @@ def summarise(
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Summary keys and curves; the verdict counts ``horizons`` alone.
 
-    ``seconds`` are the horizons of all steps that were judged; ``horizons`` are some
-    of them.
+    ``what`` gives each model in words. ``seconds`` are the horizons of all steps that
+    were judged; ``horizons`` are some of them.
     """
+    models = list(what)
     held = Held.joined(parts)
     crps = scoring.crps(held.error, held.sd)
     table = _table(held, crps)
@@ -96,7 +97,7 @@ def summarise(
         held, table.rmse[kept], models[kept], channels, at, horizons, units
     )
     summary = {
-        "headline": " ".join([scoring.sentence(models, against, kept, words), *said]),
+        "headline": " ".join([scoring.sentence(what, against, kept, words), *said]),
         "best": models[kept],
         "horizons": list(horizons),
         "windows": int(held.valid[:, at].any(axis=(1, 2)).sum()),

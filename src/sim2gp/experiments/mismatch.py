@@ -31,10 +31,10 @@ from sim2gp.experiments.swingup import (
 from sim2gp.planning.tasks import SOLVED
 from sim2gp.runs import Progress, new_run
 from sim2gp.runs.cells import Old
-from sim2gp.systems.effects.strengths import STRENGTHS
+from sim2gp.systems.effects.strengths import STRENGTHS, graded
 
 MACHINE = "furuta"
-EFFECTS = ("coulomb", "dead_zone", "spring", "delay", "drag")
+EFFECTS = graded(MACHINE)
 SEEDS, EPISODES = 5, 3
 QUICK_SEEDS, QUICK_EFFECTS = 1, ("spring",)
 #: Auto's regret is asked to be at most this many times that of the best fixed model.

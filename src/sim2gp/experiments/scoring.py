@@ -11,7 +11,7 @@ so that a bootstrap draws recordings, not windows.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -132,25 +132,21 @@ def percent(found: Paired) -> str:
 
 
 def sentence(
-    names: Sequence[str], against: Sequence[Paired], kept: int, unit: str
+    what: Mapping[str, str], against: Sequence[Paired], kept: int, unit: str
 ) -> str:
     """What the logs support, as one would say it to whoever runs the machine.
 
-    ``against`` holds each model against the first, the simulator alone.
+    ``what`` gives each model in words, by name. ``against`` holds each against the
+    first, the simulator alone.
     """
+    names = list(what)
     if kept:
         found = against[kept]
-        what = {
-            "RES": "the simulator plus a learned residual",
-            "RES-FS": "the simulator plus a learned residual",
-            "FS": "a network that starts from the simulator",
-            "NLM": "a black box rather than the simulator",
-        }[names[kept]]
         return (
-            f"The logs support {what} ({names[kept]}): on data left out it is better "
-            f"than the simulator alone in {found.better} of {found.units} {unit}, CRPS "
-            f"{percent(found)}. The simulator's equations lack something that these "
-            "logs show again and again."
+            f"The logs support {what[names[kept]]} ({names[kept]}): on data left out "
+            f"it is better than the simulator alone in {found.better} of "
+            f"{found.units} {unit}, CRPS {percent(found)}. The simulator's equations "
+            "lack something that these logs show again and again."
         )
     best = min(range(1, len(names)), key=lambda k: against[k].change)
     found = against[best]

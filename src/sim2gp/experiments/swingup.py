@@ -220,8 +220,7 @@ def meeting(
     options: dict[str, Any] = {"reach": reach_of(task, system)}
     options |= QUICK_TRAINING if cell.quick else {}
     model = METHODS[method](system, lacking, options)
-    # Only a model of delayed inputs has any.
-    return task, model, getattr(model, "system", system).history
+    return task, model, model.history
 
 
 def learner_cell(cell: Cell, redrawn: int) -> dict[str, Any]:

@@ -45,7 +45,7 @@ def fit_windows(
     likelihood = WindowsLikelihood(system, windows)
     if warm_start is None:
         first = drawn_starts(jnp.zeros((1, p)), starts, key)
-        e, noise = jnp.zeros(windows.start.shape), likelihood.large_noise()
+        e, noise = jnp.zeros(windows.start.shape), likelihood.first_noise()
         rounds = NOISE_ROUNDS
     else:
         z = jnp.linalg.solve(prior.scale, warm_start.posterior.mean - prior.mean)

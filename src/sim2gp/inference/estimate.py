@@ -209,19 +209,24 @@ def estimate(
     prior: AbstractPrior,
     *,
     starts: Float[Array, "starts p"],
-    nuisances: Float[Array, "W n"],
-    noise: Noise,
     rounds: int,
+    nuisances: Float[Array, "W n"] | None = None,
+    noise: Noise | None = None,
     freedom: float | Scalar = jnp.inf,
     needed: Int[Array, ""] | None = None,
 ) -> Estimate:
     """Descend from each of the whitened ``starts``, then ``rounds`` of EM.
 
-    ``noise`` is where EM begins: a large one traps no first MAP. Rounds beyond those
-    ``needed``, and starts that are no number, are compiled and not taken. What did not
-    converge is reported by `Convergence.check`.
+    ``nuisances`` and ``noise`` are those of another fit to begin with; zeros and the
+    likelihood's own first noise without. Rounds beyond those ``needed``, and starts
+    that are no number, are compiled and not taken. What did not converge is reported by
+    `Convergence.check`.
     """
     counts, floor = likelihood.counts, likelihood.floor
+    if nuisances is None:
+        nuisances = jnp.zeros((len(counts), likelihood.n_nuisances))
+    if noise is None:
+        noise = likelihood.first_noise()
 
     def update(at: Point, noise: Noise) -> Noise:
         squares, spread = laplace(at, noise).squares()

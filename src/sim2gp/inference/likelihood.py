@@ -1,7 +1,8 @@
 """What an estimate asks of data: factors of their rows, how many there are, a floor.
 
 One-step data (`sim2gp.data.one_step`) and windows of logs
-(`sim2gp.data.windows_likelihood`) are likelihoods; nothing here knows of simulators.
+(`sim2gp.data.windows_likelihood`) are likelihoods, and so are several together
+(`sim2gp.inference.stacked`); nothing here knows of simulators.
 """
 
 from abc import abstractmethod
@@ -10,7 +11,7 @@ import equinox as eqx
 from equinox import AbstractVar
 from jaxtyping import Array, Float
 
-from sim2gp.inference.arrowhead import Blocks
+from sim2gp.inference.arrowhead import Blocks, Noise
 
 
 class AbstractLikelihood(eqx.Module):
@@ -22,6 +23,15 @@ class AbstractLikelihood(eqx.Module):
 
     counts: AbstractVar[Float[Array, "W c"]]
     floor: AbstractVar[Float[Array, " c"]]
+
+    @property
+    @abstractmethod
+    def n_nuisances(self) -> int:
+        """Number of unknowns that each window has of its own, ``n``."""
+
+    @abstractmethod
+    def first_noise(self) -> Noise:
+        """The noise that a new fit begins with: a large one traps no first MAP."""
 
     @abstractmethod
     def blocks(

@@ -118,6 +118,10 @@ class Auto(AbstractModel):
             raise InputError("E148", "models", where="Auto", got=got, expected=expected)
         self.models = tuple(models)
 
+    @property
+    def history(self) -> int:
+        return max(model.history for model in self.models)
+
     @in_float64
     def init(self, key: Key) -> AutoBelief:
         """All priors; the simplest model speaks."""

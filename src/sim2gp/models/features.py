@@ -37,6 +37,7 @@ class Encoding(eqx.Module):
     low: tuple[float, ...] = eqx.field(static=True)
     high: tuple[float, ...] = eqx.field(static=True)
     outputs: int = eqx.field(static=True)  # physical states
+    history: int = eqx.field(static=True)  # past actions among the inputs
 
     @classmethod
     def of(cls, system: AbstractSystem, reach: Mapping[str, float]) -> "Encoding":
@@ -57,7 +58,8 @@ class Encoding(eqx.Module):
             low.append(-half if given else channel.low)
             high.append(half if given else channel.high)
         angles = tuple(channel.angle for channel in channels)
-        return cls(angles, tuple(low), tuple(high), len(system.physical_states))
+        outputs = len(system.physical_states)
+        return cls(angles, tuple(low), tuple(high), outputs, system.history)
 
     @property
     def size(self) -> int:

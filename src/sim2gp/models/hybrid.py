@@ -172,6 +172,10 @@ class AbstractHybrid(AbstractModel):
         self.steps = steps
         self.refit_steps = refit_steps
 
+    @property
+    def history(self) -> int:
+        return self.sim.history
+
     @abstractmethod
     def learn(
         self,

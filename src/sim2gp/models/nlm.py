@@ -189,6 +189,10 @@ class NLM(AbstractModel):
         self.steps = steps
         self.refit_steps = refit_steps
 
+    @property
+    def history(self) -> int:
+        return self.encoding.history
+
     @in_float64
     def init(self, key: Key) -> NLMBelief:
         """Random features under the layer's prior: a random smooth machine."""

@@ -59,6 +59,10 @@ class PointEstimate(AbstractModel):
 
     model: AbstractModel
 
+    @property
+    def history(self) -> int:
+        return self.model.history
+
     def init(self, key: Key) -> DeterministicBelief:
         return DeterministicBelief(self.model.init(key))
 
@@ -79,6 +83,10 @@ class PriorMean(AbstractModel):
     """The simulator as delivered: acts on the prior mean and never learns."""
 
     model: AbstractModel
+
+    @property
+    def history(self) -> int:
+        return self.model.history
 
     def init(self, key: Key) -> DeterministicBelief:
         return DeterministicBelief(self.model.init(key))

@@ -117,6 +117,10 @@ class Sim2GP(AbstractModel):
         self.dt = dt
         self.frozen = frozen
 
+    @property
+    def history(self) -> int:
+        return self.system.history
+
     def with_prior(self, prior: Gaussian) -> "Sim2GP":
         """The same recipe, starting from another belief about the constants."""
         return eqx.tree_at(lambda m: m.prior, self, prior)
@@ -190,8 +194,6 @@ def _fit(
         likelihood,
         ParameterPrior(model.prior, model.system.parameters),
         starts=starts,
-        nuisances=jnp.zeros((1, 0)),
-        noise=likelihood.large_noise(),
         rounds=NOISE_ROUNDS,
     )
 

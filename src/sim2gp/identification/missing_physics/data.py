@@ -142,8 +142,6 @@ class OneStepData(AbstractData):
             likelihood,
             ParameterPrior(table.prior(), table),
             starts=drawn_starts(jnp.zeros((1, len(table))), 1 + DRAWN, key),
-            nuisances=jnp.zeros((1, 0)),
-            noise=likelihood.large_noise(),
             rounds=self.rounds,
         )
         rows = int(likelihood.counts[0, 0])

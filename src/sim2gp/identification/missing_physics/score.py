@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sim2gp.identification.missing_physics.data import AbstractData
-from sim2gp.inference.arrowhead import Blocks, eliminate
+from sim2gp.inference.arrowhead import Blocks, Noise, eliminate
 from sim2gp.inference.estimate import Estimate, estimate
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.least_squares import prior_rows
@@ -141,11 +141,12 @@ def _linear(
     z0 = jnp.asarray(z)
     standard = Gaussian(jnp.zeros_like(z0), jnp.eye(z0.size))
     found = estimate(
-        _LinearLikelihood(counts, floor, jnp.asarray(blocks), z0, bare.nuisances),
+        _LinearLikelihood(
+            counts, floor, jnp.asarray(blocks), z0, bare.nuisances, bare.noise
+        ),
         _LinearPrior(standard, rows, z0),
         starts=z0[None],
         nuisances=bare.nuisances,
-        noise=bare.noise,
         rounds=ROUNDS,
         freedom=jnp.asarray(data.freedom),
     )
@@ -157,13 +158,24 @@ def _linear(
 
 
 class _LinearLikelihood(AbstractLikelihood):
-    """A likelihood that is its own linearisation at ``(z0, e0)``, whitened already."""
+    """A likelihood that is its own linearisation at ``(z0, e0)``, whitened already.
+
+    ``noise`` is that of the fit about which it is.
+    """
 
     counts: Float[Array, "W c"]
     floor: Float[Array, " c"]
     base: Blocks
     z0: Float[Array, " p"]
     e0: Float[Array, "W n"]
+    noise: Noise
+
+    @property
+    def n_nuisances(self) -> int:
+        return self.e0.shape[1]
+
+    def first_noise(self) -> Noise:
+        return self.noise
 
     def blocks(
         self,

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from sim2gp.errors import InputError
 from sim2gp.inference.parameters import Parameter
 from sim2gp.systems.base import AbstractPlant, index_of
+from sim2gp.systems.effects.units import law_unit
 from sim2gp.systems.function_checks import check_returns
 from sim2gp.systems.mechanism import AbstractMechanism, Inertia, Pair
 from sim2gp.systems.parts import AbstractPart, around_nothing
@@ -66,8 +67,14 @@ class AbstractJointForce(AbstractForce):
     """A force along one joint, by its own position and velocity: on any plant.
 
     A plant without a mass matrix takes it as an acceleration
-    (`sim2gp.systems.effects.kicks`).
+    (`sim2gp.systems.effects.kicks`). ``powers`` are those of position and velocity that
+    the magnitude multiplies, (0, 1) for damping: its unit and its prior follow.
     """
+
+    powers: AbstractClassVar[tuple[int, int]]
+
+    def unit(self, plant: AbstractPlant) -> str:
+        return law_unit(plant, self.where, self.powers)
 
     @abc.abstractmethod
     def along(self, x: Scalar, q: Scalar, v: Scalar) -> Scalar:

@@ -19,7 +19,7 @@ from sim2gp.systems.effects.friction_laws import (
     quadratic_drag,
     slowed_by_coulomb,
 )
-from sim2gp.systems.effects.units import force_unit, gravity_of, only_on, unit_per
+from sim2gp.systems.effects.units import gravity_of, only_on
 from sim2gp.systems.mechanism import AbstractMechanism, Pair
 from sim2gp.systems.plants.cartpole import CartPole
 from sim2gp.types import Scalar
@@ -32,14 +32,12 @@ class Coulomb(AbstractJointForce):
     magnitude: float = eqx.field(static=True)
     width: float = eqx.field(static=True, default=0.05)
     what: ClassVar[str] = "coulomb"
+    powers: ClassVar[tuple[int, int]] = 0, 0
     meaning: ClassVar[str] = "dry friction"
     max_substep: ClassVar[float] = COULOMB_SUBSTEP
 
     def __check_init__(self) -> None:
         checks.positive("Coulomb", width=self.width)
-
-    def unit(self, plant: AbstractPlant) -> str:
-        return force_unit(plant, self.where)
 
     def along(self, x: Scalar, q: Scalar, v: Scalar) -> Scalar:
         return -coulomb(v, x, self.width)
@@ -84,14 +82,12 @@ class Stribeck(AbstractJointForce):
     width: float = eqx.field(static=True, default=0.05)
     speed: float = eqx.field(static=True, default=1.0)
     what: ClassVar[str] = "stribeck"
+    powers: ClassVar[tuple[int, int]] = 0, 0
     meaning: ClassVar[str] = "friction that falls from rest to motion"
     max_substep: ClassVar[float] = COULOMB_SUBSTEP
 
     def __check_init__(self) -> None:
         checks.positive("Stribeck", width=self.width, speed=self.speed)
-
-    def unit(self, plant: AbstractPlant) -> str:
-        return force_unit(plant, self.where)
 
     def along(self, x: Scalar, q: Scalar, v: Scalar) -> Scalar:
         return -coulomb(v, self._level(x, v), self.width)
@@ -112,11 +108,9 @@ class Viscous(AbstractJointForce):
     magnitude: float = eqx.field(static=True)
     #: Older project files and runs say ``back_emf``.
     what: str = eqx.field(static=True, default="viscous")
+    powers: ClassVar[tuple[int, int]] = 0, 1
     meaning: ClassVar[str] = "damping, such as a motor's back-EMF"
     max_substep: ClassVar[float] = SUBSTEP
-
-    def unit(self, plant: AbstractPlant) -> str:
-        return unit_per(plant, self.where, " s")
 
     def along(self, x: Scalar, q: Scalar, v: Scalar) -> Scalar:
         return -x * v
@@ -131,11 +125,9 @@ class Drag(AbstractJointForce):
     where: str = eqx.field(static=True)
     magnitude: float = eqx.field(static=True)
     what: ClassVar[str] = "drag"
+    powers: ClassVar[tuple[int, int]] = 0, 2
     meaning: ClassVar[str] = "quadratic drag"
     max_substep: ClassVar[float] = SUBSTEP
-
-    def unit(self, plant: AbstractPlant) -> str:
-        return unit_per(plant, self.where, " s^2", square=True)
 
     def along(self, x: Scalar, q: Scalar, v: Scalar) -> Scalar:
         return -quadratic_drag(v, x)

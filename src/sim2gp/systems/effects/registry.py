@@ -8,13 +8,14 @@ A candidate adds one scalar to a machine: the magnitude of an effect with a Gaus
 prior around nothing, a delay, or the time constant of a low pass. Priors are a fifth of
 what the machine itself does, so that no candidate is favoured by its unit: a force by
 the largest of its motor or weight, a stiffness and a drag by that force at a typical
-position and speed, a dead zone by the input's range.
+position and speed, a dead zone by the input's range. A force on a joint that is listed
+in `_FORCES` is a candidate of every machine: its powers give its unit and its prior.
 """
 
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +28,7 @@ from sim2gp.systems.effects.base import (
     AbstractEffect,
     AbstractInputEffect,
     AbstractJointEffect,
+    AbstractJointForce,
     check_effect,
 )
 from sim2gp.systems.effects.forces import BaseTilt, BaseTiltSide, Payload, RailTilt
@@ -50,7 +52,15 @@ from sim2gp.systems.plants.two_link import TwoLink, UniformRodArm
 from sim2gp.systems.sensors import EncoderOffset
 from sim2gp.types import in_float64
 
-_JOINT: tuple[Any, ...] = Coulomb, Stribeck, Viscous, Drag, Spring, EncoderOffset
+#: On every joint. Each of these is a candidate too: `_force` gives it a prior.
+_FORCES: tuple[type[AbstractJointForce], ...] = (
+    Coulomb,
+    Stribeck,
+    Spring,
+    Drag,
+    Viscous,
+)
+_JOINT: tuple[Any, ...] = *_FORCES, EncoderOffset
 #: Every part by what it acts on; `possible` says which machines can have it.
 REGISTRY: dict[str, tuple[Any, ...]] = {
     "hinge": (*_JOINT, BaseTilt, BaseTiltSide, Payload, PoleGeometry, RodInertia),
@@ -85,7 +95,10 @@ def named(what: str, where: str, magnitude: float, **options: float) -> Abstract
 
 def options_of(what: str) -> tuple[str, ...]:
     """What an effect has besides its channel, magnitude and name."""
-    kind = ALIASES.get(what) or _BY_NAME[what]
+    return _options(ALIASES.get(what) or _BY_NAME[what])
+
+
+def _options(kind: Any) -> tuple[str, ...]:
     return tuple(f.name for f in dataclasses.fields(kind)[2:] if f.name != "what")
 
 
@@ -206,36 +219,55 @@ def _of_input(name: str, high: float, *, lag: bool) -> list[Candidate]:
     ]
 
 
-def _of_joint(
-    name: str,
-    force: float,
-    speed: float,
-    reach: float = 1.0,
-    *,
-    width: float = 0.05,
-    slip: float = 1.0,
-) -> list[Candidate]:
-    """Stribeck friction, a spring, drag and damping.
+class _Joint(NamedTuple):
+    """What moves a joint, and how it moves: rad and rad/s of a hinge.
 
-    ``force`` in N or N m is what moves the joint, at a typical ``speed`` and ``reach``.
+    ``force`` is in N or N m, or an acceleration where a plant has no mass matrix.
+    ``width`` and ``slip`` are the speeds of a friction's sign and of its fall.
     """
-    scale = SHARE * force
-    return [
-        Candidate(Stribeck(name, scale, width, slip)),
-        Candidate(Spring(name, scale / reach)),
-        Candidate(Drag(name, scale / speed**2)),
-        Candidate(Viscous(name, scale / speed)),
-    ]
+
+    name: str
+    force: float
+    speed: float = 10.0  # typical
+    reach: float = 1.0  # likewise
+    width: float = 0.05
+    slip: float = 1.0
+
+
+def _slide(name: str, force: float) -> _Joint:
+    """Of a slide, in m and m/s."""
+    return _Joint(name, force, speed=1.0, reach=0.3, width=0.01, slip=0.1)
+
+
+def _force(kind: type[AbstractJointForce], joint: _Joint) -> Candidate:
+    """A force ``x q^i v^j`` on a joint, at its typical position and speed."""
+    of_position, of_velocity = kind.powers
+    sd = SHARE * joint.force / (joint.reach**of_position * joint.speed**of_velocity)
+    speeds = {"width": joint.width, "speed": joint.slip}
+    options = {k: x for k, x in speeds.items() if k in _options(kind)}
+    made: Any = kind
+    return Candidate(made(joint.name, sd, **options))
+
+
+def _but_dry(joint: _Joint) -> list[Candidate]:
+    """All forces but dry friction, which comes first."""
+    return [_force(kind, joint) for kind in _FORCES if kind is not Coulomb]
+
+
+def _of_joint(joint: _Joint) -> list[Candidate]:
+    """All that any joint may lack."""
+    offset = Candidate(EncoderOffset(joint.name, OFFSET), sign=0)
+    return [_force(Coulomb, joint), *_but_dry(joint), offset]
 
 
 def _furuta() -> list[Candidate]:
     # The motor's stall torque at 5 V; the pendulum's weight at its lever arm.
-    arm, pendulum = 0.025, 0.015  # N m
+    arm, pendulum = _Joint("theta", 0.025), _Joint("alpha", 0.015, speed=15.0)
     return [
-        Candidate(Coulomb("theta", SHARE * arm)),
-        Candidate(Coulomb("alpha", SHARE * pendulum)),
-        *_of_joint("theta", arm, 10.0),
-        *_of_joint("alpha", pendulum, 15.0),
+        _force(Coulomb, arm),
+        _force(Coulomb, pendulum),
+        *_but_dry(arm),
+        *_but_dry(pendulum),
         Candidate(EncoderOffset("alpha", OFFSET), sign=0),
         Candidate(BaseTilt(magnitude=OFFSET), sign=0),
         Candidate(BaseTiltSide(magnitude=OFFSET), sign=0),
@@ -246,12 +278,12 @@ def _furuta() -> list[Candidate]:
 
 def _cartpole() -> list[Candidate]:
     # The motor's stall force at 10 V; the pole's weight at its lever arm.
-    cart, pole = 12.6, 0.21  # N, N m
+    cart, pole = _slide("x", 12.6), _Joint("theta", 0.21)
     return [
         Candidate(RailFriction(magnitude=SHARE * 0.5)),
-        Candidate(Coulomb("theta", SHARE * pole)),
-        *_of_joint("x", cart, 1.0, 0.3, width=0.01, slip=0.1),
-        *_of_joint("theta", pole, 10.0),
+        _force(Coulomb, pole),
+        *_but_dry(cart),
+        *_but_dry(pole),
         Candidate(EncoderOffset("theta", OFFSET), sign=0),
         Candidate(RailTilt(magnitude=OFFSET), sign=0),
         Candidate(PoleGeometry(), sign=0),
@@ -262,11 +294,7 @@ def _cartpole() -> list[Candidate]:
 def _arm(plant: TwoLink | UniformRodArm) -> list[Candidate]:
     found = []
     for joint, channel in zip(plant.states[:2], plant.actions, strict=True):
-        found += [
-            Candidate(Coulomb(joint.name, SHARE * channel.high)),
-            *_of_joint(joint.name, channel.high, 10.0),
-            Candidate(EncoderOffset(joint.name, OFFSET), sign=0),
-        ]
+        found += _of_joint(_Joint(joint.name, channel.high))
     return found
 
 
@@ -277,15 +305,8 @@ def _of_any(plant: AbstractPlant) -> list[Candidate]:
     for joint in joints_of(plant):
         if f"{joint.name}.velocity" not in names:
             continue
-        slide = joint.unit == "m"
-        width, slip = (0.01, 0.1) if slide else (0.05, 1.0)
-        speed, reach = (1.0, 0.3) if slide else (10.0, 1.0)
-        force = most[velocity_of(plant, joint.name)]
-        found += [
-            Candidate(Coulomb(joint.name, SHARE * force, width)),
-            *_of_joint(joint.name, force, speed, reach, width=width, slip=slip),
-            Candidate(EncoderOffset(joint.name, OFFSET), sign=0),
-        ]
+        made = _slide if joint.unit == "m" else _Joint
+        found += _of_joint(made(joint.name, most[velocity_of(plant, joint.name)]))
     return found
 
 

@@ -49,6 +49,12 @@ def catalogue(machine: str) -> tuple[str, ...]:
     return tuple(_known(_STRENGTHS, machine))
 
 
+def graded(machine: str) -> tuple[str, ...]:
+    """Those of the catalogue whose strengths differ: the rows of the mismatch map."""
+    known = _known(_STRENGTHS, machine)
+    return tuple(name for name, (_, sizes) in known.items() if len(set(sizes)) > 1)
+
+
 def effect(machine: str, name: str, strength: str) -> AbstractPart:
     """A registered effect at one of `STRENGTHS`; E145 names the nearest known one."""
     made, magnitudes = _known(_known(_STRENGTHS, machine), name)

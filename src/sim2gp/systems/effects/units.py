@@ -1,6 +1,6 @@
 """Where an effect can be: its machines and channels, and the units it has there."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from sim2gp.errors import InputError
 from sim2gp.systems.base import AbstractPlant, AbstractSystem, Channel, index_of
@@ -45,19 +45,34 @@ def velocity_of(plant: AbstractPlant, name: str) -> int:
 
 def force_unit(plant: AbstractPlant, name: str) -> str:
     """N on a slide, N m on a hinge; of a plant without a mass matrix acceleration."""
+    return law_unit(plant, name, (0, 0))
+
+
+def law_unit(plant: AbstractPlant, name: str, powers: tuple[int, int]) -> str:
+    """Unit of ``x`` in a force ``x q^i v^j`` on a joint, ``powers`` being ``(i, j)``.
+
+    Raises `InputError` E103 for a joint that is not there.
+    """
+    of_position, of_velocity = powers
     position = joint_of(plant, name).unit
+    length, seconds = -of_position - of_velocity, of_velocity
     if isinstance(plant, AbstractMechanism):
-        return "N" if position == "m" else "N m"
+        force = [("N", 1)] if position == "m" else [("N", 1), ("m", 1)]
+        return _written([*force, ("s", seconds), (position, length)])
     velocity_of(plant, name)
-    return f"{position}/s^2"
+    return _written([(position, length + 1), ("s", seconds - 2)])
 
 
-def unit_per(
-    plant: AbstractPlant, name: str, seconds: str, square: bool = False
-) -> str:
-    """Unit of a force per position, per velocity, or per squared velocity."""
-    force, position = force_unit(plant, name), joint_of(plant, name).unit
-    if not isinstance(plant, AbstractMechanism):
-        return {"": "1/s^2", " s": "1/s"}.get(seconds, f"1/{position}")
-    power = "^2" if square else ""
-    return f"{force}{seconds}/{position}{power}"
+def _written(units: Sequence[tuple[str, int]]) -> str:
+    """A product of powers of units: ``N m s^2/rad^2``, ``1/(rad^2 s^2)``."""
+    above = [_power(unit, power) for unit, power in units if power > 0]
+    below = [_power(unit, -power) for unit, power in units if power < 0]
+    over = " ".join(above) or "1"
+    if not below:
+        return over
+    under = " ".join(below)
+    return f"{over}/({under})" if len(below) > 1 else f"{over}/{under}"
+
+
+def _power(unit: str, power: int) -> str:
+    return unit if power == 1 else f"{unit}^{power}"
