@@ -249,7 +249,7 @@ def _force(kind: type[AbstractJointForce], joint: _Joint) -> Candidate:
     return Candidate(made(joint.name, sd, **options))
 
 
-def _but_dry(joint: _Joint) -> list[Candidate]:
+def _other_forces(joint: _Joint) -> list[Candidate]:
     """All forces but dry friction, which comes first."""
     return [_force(kind, joint) for kind in _FORCES if kind is not Coulomb]
 
@@ -257,7 +257,7 @@ def _but_dry(joint: _Joint) -> list[Candidate]:
 def _of_joint(joint: _Joint) -> list[Candidate]:
     """All that any joint may lack."""
     offset = Candidate(EncoderOffset(joint.name, OFFSET), sign=0)
-    return [_force(Coulomb, joint), *_but_dry(joint), offset]
+    return [_force(Coulomb, joint), *_other_forces(joint), offset]
 
 
 def _furuta() -> list[Candidate]:
@@ -266,8 +266,8 @@ def _furuta() -> list[Candidate]:
     return [
         _force(Coulomb, arm),
         _force(Coulomb, pendulum),
-        *_but_dry(arm),
-        *_but_dry(pendulum),
+        *_other_forces(arm),
+        *_other_forces(pendulum),
         Candidate(EncoderOffset("alpha", OFFSET), sign=0),
         Candidate(BaseTilt(magnitude=OFFSET), sign=0),
         Candidate(BaseTiltSide(magnitude=OFFSET), sign=0),
@@ -282,8 +282,8 @@ def _cartpole() -> list[Candidate]:
     return [
         Candidate(RailFriction(magnitude=SHARE * 0.5)),
         _force(Coulomb, pole),
-        *_but_dry(cart),
-        *_but_dry(pole),
+        *_other_forces(cart),
+        *_other_forces(pole),
         Candidate(EncoderOffset("theta", OFFSET), sign=0),
         Candidate(RailTilt(magnitude=OFFSET), sign=0),
         Candidate(PoleGeometry(), sign=0),
