@@ -173,6 +173,7 @@ def arm_data() -> tuple[AbstractSystem, OneStepLikelihood, WindowsLikelihood]:
     return system, one_step, WindowsLikelihood(system, windows)
 
 
+@pytest.mark.nightly
 def test_one_step_data_and_windows_of_an_arm_are_one_least_squares() -> None:
     """MAP and Gauss-Newton covariance against scipy's dense solver of all residuals."""
     system, one_step, windows = arm_data()
