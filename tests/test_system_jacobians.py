@@ -74,17 +74,7 @@ def cases() -> list[Any]:
     return [n if n in whole else pytest.param(n, marks=night) for n in machines.every()]
 
 
-#: Half a minute of compilation each.
-LONG = ("two_link/actuated", "six")
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=pytest.mark.nightly) if name in LONG else name
-        for name in cases()
-    ],
-)
+@pytest.mark.parametrize("name", cases())
 def test_jacobians(name):
     forward, reverse, differences = jacobians(name)
     assert np.all(np.isfinite(forward))
