@@ -37,6 +37,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     Without ``argv`` the command is the process's own: a signal then ends the process
     within seconds, even where compiled code runs (`sim2gp.cli.interrupts`).
     """
+    # Matrices here are small. Threads of LAPACK's that wait for a busy core made a fit
+    # take 30 s in place of 4, measured next to four other processes.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     args = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in args
     with interruptible(entry=argv is None) as signals:
