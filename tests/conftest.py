@@ -19,7 +19,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 
-# As the command line: LAPACK's threads wait for each other where cores are busy.
+# As the command line (`sim2gp.cli.main`): threads that wait where cores are busy.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 jax.config.update("jax_numpy_rank_promotion", "raise")

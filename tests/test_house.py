@@ -248,6 +248,11 @@ def test_what_answers_first_loads_no_simulator(name: str) -> None:
     run_python(f"import sys, sim2gp.{name}\nassert 'jax' not in sys.modules")
 
 
+def test_lapack_is_loaded_after_its_threads_are_set() -> None:
+    """SciPy's library reads the variable once, and `main` sets it after the imports."""
+    run_python("import sys, sim2gp.cli\nassert 'scipy.linalg' not in sys.modules")
+
+
 def test_every_module_imports_without_extras() -> None:
     """An extra that is not installed breaks its own feature, never an import."""
     names = [module_name(path) for path in MODULES if path.stem != "__main__"]
