@@ -5,7 +5,6 @@ and lengths when it compiles a model is derived anew for every value that they t
 """
 
 import copy
-import math
 import os
 import threading
 from collections.abc import Iterator, Sequence
@@ -13,15 +12,19 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from sim2gp.errors import InputError
 from sim2gp.inference.parameters import Parameters
 from sim2gp.systems.mujoco.constants import CENTRED, DERIVED, Constant, set_constants
+from sim2gp.systems.mujoco.slopes.numbers import moved_by, numbers_of, tree_of
+from sim2gp.systems.mujoco.slopes.step import Model, acceleration_slopes, in_closed_form
 from sim2gp.systems.plants.external import AbstractSimulator, Differences, untouched
 
 #: Fewer steps than these are not worth waking other threads for.
 FEW = 256
+#: Linearised models that are kept: variants of one fit, at a few lengths of steps.
+KEPT = 32
 
 
 class Engine(AbstractSimulator):
@@ -46,6 +49,8 @@ class Engine(AbstractSimulator):
         self._pool = rollout.Rollout(nthread=threads if threads > 1 else 0)
         self._alone = rollout.Rollout(nthread=0)
         self._lock = threading.Lock()  # JAX may call from several programs at once
+        self._tree = tree_of(model) if in_closed_form(model) else None
+        self._known: dict[tuple[bytes, float], Model] = {}
 
     def with_values(self, theta: Float[np.ndarray, " p"]) -> Any:
         """A copy of the model in which the open constants have these values."""
@@ -85,6 +90,95 @@ class Engine(AbstractSimulator):
                     out[at] = self._rolled(chosen, models, s[at], a[at], float(span))
         return out
 
+    def substeps(self, span: Float[np.ndarray, "W L"]) -> Int[np.ndarray, "W L"]:
+        step = self.model.opt.timestep
+        return np.maximum(1, np.ceil(np.round(span, 12) / step - 1e-9)).astype(int)
+
+    def rollout(
+        self,
+        theta: Float[np.ndarray, "W p"],
+        x0: Float[np.ndarray, "W n"],
+        u: Float[np.ndarray, "W L m"],
+        span: Float[np.ndarray, "W L"],
+    ) -> Float[np.ndarray, "W L n"]:
+        lengths = np.unique(np.round(span[span > 0.0], 12))
+        rows = np.concatenate([theta, x0, u.reshape(len(u), -1)], axis=1)
+        if lengths.size != 1 or not np.isfinite(rows).all():
+            return super().rollout(theta, x0, u, span)
+        # All rows are equally long, or not there: each window is one call.
+        moving = span > 0.0
+        count = int(self.substeps(lengths)[0])
+        order = np.argsort(~moving, axis=1, kind="stable")
+        inputs = np.take_along_axis(u, order[..., None], axis=1)
+        inputs = inputs[:, : moving.sum(1).max()]
+        control = np.repeat(inputs, count, axis=1)
+        with self._lock:
+            values, which = np.unique(theta, axis=0, return_inverse=True)
+            models = self._models(values)
+            chosen = [models[k] for k in which.reshape(-1)]
+            h = float(lengths[0]) / count
+            states = self._stepped(chosen, models, x0, control, h)[:, count - 1 :: count]
+        whole = np.concatenate([x0[:, None], states], axis=1)
+        return np.take_along_axis(whole, np.cumsum(moving, axis=1)[..., None], axis=1)
+
+    def jacobian(
+        self,
+        theta: Float[np.ndarray, "B p"],
+        s: Float[np.ndarray, "B n"],
+        a: Float[np.ndarray, "B m"],
+        h: Float[np.ndarray, " B"],
+        after: Float[np.ndarray, "B n"],
+    ) -> Float[np.ndarray, "B n pnm"]:
+        """In closed form where the model's step has one, else by differences."""
+        n, p, nv = s.shape[1], theta.shape[1], self.model.nv
+        out = np.zeros((len(s), n, p + n + a.shape[1]))
+        out[:, :, p : p + n] = np.eye(n)
+        left = h > 0.0
+        if self._tree is not None:
+            known, which = np.unique(
+                np.column_stack([theta, np.round(h, 12)]), axis=0, return_inverse=True
+            )
+            for k, value in enumerate(known):
+                at = np.flatnonzero((which.reshape(-1) == k) & (h > 0.0))
+                if not at.size:
+                    continue
+                span, of = float(value[-1]), self._linearised(value[:-1], value[-1])
+                args = s[at, :nv].T, s[at, nv:].T, a[at].T, after[at, nv:].T
+                found = acceleration_slopes(of, *args, span)
+                good = at[found.hold]
+                rate = span * found.by[found.hold]
+                rate[:, :, p + nv : p + n] += np.eye(nv)
+                out[good, nv:] = rate
+                out[good, :nv] += span * rate
+                left[good] = False
+        rest = np.flatnonzero(left)
+        if rest.size:
+            out[rest] = self.slopes(theta[rest], s[rest], a[rest], h[rest])[1]
+        return out
+
+    def _linearised(self, theta: Float[np.ndarray, " p"], h: float) -> Model:
+        """The numbers of the model and what the constants change of them."""
+        key = theta.tobytes(), float(h)
+        with self._lock:
+            if key not in self._known:
+                model = copy.copy(self.model)
+                model.opt.timestep = h
+
+                def at(values: Float[np.ndarray, " p"]) -> Any:
+                    self._set(model, values, self._datas[0])
+                    return model
+
+                by = self.differences
+                step = by.constants * by.scale
+                changes = moved_by(at, theta, step, by.low, by.high)
+                tree = self._tree
+                assert tree is not None
+                if len(self._known) >= KEPT:
+                    self._known.clear()
+                found = Model(at(theta), tree, numbers_of(model), changes)
+                self._known[key] = found
+            return self._known[key]
+
     def _models(self, values: Float[np.ndarray, "U p"]) -> list[Any]:
         """A model for each vector of values; copies are used again."""
         while len(self._copies) < len(values):
@@ -105,20 +199,32 @@ class Engine(AbstractSimulator):
         a: Float[np.ndarray, "B m"],
         span: float,
     ) -> Float[np.ndarray, "B n"]:
-        count = max(1, math.ceil(span / self.model.opt.timestep - 1e-9))
+        count = int(self.substeps(np.asarray(span)))
+        control = np.broadcast_to(a[:, None], (len(a), count, a.shape[1]))
+        return self._stepped(chosen, models, s, control, span / count)[:, -1]
+
+    def _stepped(
+        self,
+        chosen: list[Any],
+        models: list[Any],
+        s: Float[np.ndarray, "B n"],
+        control: Float[np.ndarray, "B K m"],
+        h: float,
+    ) -> Float[np.ndarray, "B K n"]:
+        """States after each of ``K`` steps of ``h`` seconds."""
         for model in models:
-            model.opt.timestep = span / count
+            model.opt.timestep = h
         start = np.concatenate([np.zeros((len(s), 1)), s], axis=1)
-        few = len(s) * count < FEW
+        few = control.shape[0] * control.shape[1] < FEW
         pool = self._alone if few else self._pool
         datas = self._datas[:1] if few else self._datas
-        control = np.broadcast_to(a[:, None], (len(a), count, a.shape[1]))
         with _quiet():
             out, _ = pool.rollout(chosen, datas, start, np.ascontiguousarray(control))
-        time, state = out[:, -1, 0], out[:, -1, 1:]
         # Where a state runs away MuJoCo stops, or begins again.
-        stopped = time < span * (1.0 - 1e-6)
-        return np.where(stopped[:, None], np.nan, state)
+        due = h * np.arange(1, control.shape[1] + 1)
+        ahead = np.abs(out[..., 0] - due) < 1e-6 * due
+        going = np.logical_and.accumulate(ahead, axis=1)
+        return np.where(going[..., None], out[..., 1:], np.nan)
 
 
 def _check_centres(model: Any, constants: Sequence[Sequence[Constant]]) -> None:

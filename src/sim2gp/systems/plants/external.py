@@ -16,20 +16,22 @@ import abc
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp.inference.parameters import Parameters
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.machine import plant_of
-from sim2gp.types import Action, Scalar, State
+from sim2gp.types import Action, AnyArray, Scalar, State
 
 #: What a constant changes by less, of the largest number, it does not change.
 ROUNDING = 16.0 * float(np.finfo(float).eps)
+#: Rows whose slopes are found at once: more do not fit the processor's cache.
+BLOCK = 1024
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,15 @@ def _spreads(table: Parameters) -> list[float]:
         ends = jax.jit(jax.vmap(table.constrain))(np.stack([mean - sd, mean + sd]))
     spread: list[float] = (0.5 * np.abs(ends[1] - ends[0])).tolist()
     return spread
+
+
+class Arguments(NamedTuple):
+    """What a rollout of ``W`` windows depends on: constants, starts, inputs, spans."""
+
+    theta: Float[AnyArray, "W p"]
+    x0: Float[AnyArray, "W n"]
+    u: Float[AnyArray, "W L m"]
+    span: Float[AnyArray, "W L"]
 
 
 class AbstractSimulator(abc.ABC):
@@ -118,6 +129,81 @@ class AbstractSimulator(abc.ABC):
         moved[:p][np.abs(moved[:p]) <= nothing[:, None]] = 0.0
         J = moved / apart[..., None]
         return out[0], np.moveaxis(J, 0, -1)
+
+    def substeps(self, span: Float[np.ndarray, "W L"]) -> Int[np.ndarray, "W L"]:
+        """How many equal steps `slopes` divides each of these times into."""
+        return np.ones(span.shape, int)
+
+    def rollout(
+        self,
+        theta: Float[np.ndarray, "W p"],
+        x0: Float[np.ndarray, "W n"],
+        u: Float[np.ndarray, "W L m"],
+        span: Float[np.ndarray, "W L"],
+    ) -> Float[np.ndarray, "W L n"]:
+        """States at the end of each row of inputs that are held for its ``span`` (s)."""
+        out = np.empty((*span.shape, x0.shape[1]))
+        x = x0
+        for k in range(span.shape[1]):
+            out[:, k] = x = self.flow(theta, x, u[:, k], span[:, k])
+        return out
+
+    def linearised_rollout(
+        self, at: "Arguments", along: "Arguments"
+    ) -> tuple[Float[np.ndarray, "W L n"], Float[np.ndarray, "W L n k"]]:
+        """`rollout`, and its derivatives along ``k`` directions of its arguments.
+
+        ``along`` has their directions in a last axis (its spans are not read). Each row
+        is one of the linear recursion ``S' = A S + B`` of its own slopes.
+        """
+        (theta, x0, u, span), (of_theta, S, of_u, _) = at, along
+        counts = self.substeps(span)
+        most = int(counts.max(initial=1))
+        fine = np.arange(most) < counts[..., None]
+        fine = np.where(fine, (span / counts)[..., None], 0.0).reshape(len(span), -1)
+        inputs = np.repeat(u, most, axis=1)
+        states = self.rollout(theta, x0, inputs, fine)
+        before = np.concatenate([x0[:, None], states[:, :-1]], axis=1)
+        W, L, n = states.shape
+        p, out = theta.shape[1], np.empty((W, L // most, n, S.shape[-1]))
+        block = max(1, BLOCK // W)
+        for first in range(0, L, block):
+            rows = slice(first, min(first + block, L))
+            J = self._slopes_of(theta, before, inputs, fine, states, rows)
+            C = J[..., :p] @ of_theta[:, None]
+            which = np.arange(rows.start, rows.stop) // most
+            C += J[..., p + n :] @ of_u[:, which]
+            for k in range(rows.start, rows.stop):
+                S = J[:, k - first, :, p : p + n] @ S + C[:, k - first]
+                out[:, k // most] = S
+        return states[:, most - 1 :: most], out
+
+    def _slopes_of(
+        self,
+        theta: Float[np.ndarray, "W p"],
+        before: Float[np.ndarray, "W L n"],
+        u: Float[np.ndarray, "W L m"],
+        span: Float[np.ndarray, "W L"],
+        after: Float[np.ndarray, "W L n"],
+        rows: slice,
+    ) -> Float[np.ndarray, "W l n pnm"]:
+        """The Jacobian of each of some rows."""
+        s, a, h, end = (x[:, rows] for x in (before, u, span, after))
+        each = np.repeat(theta[:, None], s.shape[1], axis=1)
+        flat = [x.reshape(-1, x.shape[-1]) for x in (each, s, a, end)]
+        J = self.jacobian(flat[0], flat[1], flat[2], h.reshape(-1), flat[3])
+        return J.reshape(*s.shape, -1)
+
+    def jacobian(
+        self,
+        theta: Float[np.ndarray, "B p"],
+        s: Float[np.ndarray, "B n"],
+        a: Float[np.ndarray, "B m"],
+        h: Float[np.ndarray, " B"],
+        after: Float[np.ndarray, "B n"],
+    ) -> Float[np.ndarray, "B n pnm"]:
+        """That of `slopes`, where the states ``after`` are known already."""
+        return self.slopes(theta, s, a, h)[1]
 
 
 def on_host(system: AbstractSystem) -> bool:

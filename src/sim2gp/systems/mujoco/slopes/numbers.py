@@ -1,0 +1,159 @@
+"""The numbers of a compiled model that its equation of motion is made of.
+
+Each constant moves some of them; how, is told by differences of the compiled model,
+which cost no simulation.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+Table = Float[np.ndarray, "..."]
+
+
+class Numbers(NamedTuple):
+    """Numbers of bodies, joints (one degree of freedom each) and actuators.
+
+    ``inertia``: of each body about its frame's origin, rotation before translation,
+    kg m^2, kg m, kg. ``place``: of its frame in its parent's, m. ``drag`` and ``rate``
+    are those of MuJoCo's model of dry friction: the force is
+    ``-drag (acceleration + rate velocity)`` within ``+- frictionloss``. ``gain`` and
+    ``bias`` are the coefficients of 1, length and velocity.
+    """
+
+    inertia: Float[np.ndarray, "b 6 6"]
+    place: Float[np.ndarray, "b 3"]
+    gravity: Float[np.ndarray, " 3"]
+    armature: Float[np.ndarray, " n"]
+    damping: Float[np.ndarray, " n"]
+    stiffness: Float[np.ndarray, " n"]
+    frictionloss: Float[np.ndarray, " n"]
+    drag: Float[np.ndarray, " n"]
+    rate: Float[np.ndarray, " n"]
+    gear: Float[np.ndarray, " m"]
+    gain: Float[np.ndarray, "m 3"]
+    bias: Float[np.ndarray, "m 3"]
+
+
+class Tree(NamedTuple):
+    """What no constant moves: who carries whom, and which joint each actuator drives.
+
+    ``above[i, j]``: whether joint ``i`` moves joint ``j`` (not itself).
+    """
+
+    parent: Int[np.ndarray, " b"]
+    turn: Float[np.ndarray, "b 3 3"]  # of each body's frame in its parent's
+    joints: tuple[tuple[int, ...], ...]  # of each body, in order
+    body: Int[np.ndarray, " n"]  # of each joint
+    hinge: np.ndarray
+    axis: Float[np.ndarray, "n 3"]
+    anchor: Float[np.ndarray, "n 3"]
+    zero: Float[np.ndarray, " n"]  # position of the joint in the model's reference
+    spring: Float[np.ndarray, " n"]
+    above: np.ndarray
+    driven: Int[np.ndarray, " m"]
+
+
+def tree_of(model: Any) -> Tree | None:
+    """The tree of a model of hinges and slides whose actuators act on joints.
+
+    None where an actuator acts on something else, or has a state.
+    """
+    stateful = model.na or np.any(model.actuator_dyntype)
+    if stateful or np.any(model.actuator_trntype > 1):
+        return None
+    body, n = model.jnt_bodyid.copy(), model.njnt
+    parent = model.body_parentid.copy()
+    over = np.zeros((model.nbody, model.nbody), bool)  # proper ancestors of bodies
+    for b in range(1, model.nbody):
+        over[:, b] = over[:, parent[b]]
+        over[parent[b], b] = True
+    above = over[body][:, body]
+    same = body[:, None] == body[None]
+    above |= same & (np.arange(n)[:, None] < np.arange(n)[None])
+    return Tree(
+        parent,
+        np.stack([_rotation(quat) for quat in model.body_quat]),
+        tuple(tuple(np.flatnonzero(body == b).tolist()) for b in range(model.nbody)),
+        body,
+        model.jnt_type == 3,
+        model.jnt_axis.copy(),
+        model.jnt_pos.copy(),
+        model.qpos0.copy(),
+        model.qpos_spring.copy(),
+        above,
+        model.actuator_trnid[:, 0].copy(),
+    )
+
+
+def numbers_of(model: Any) -> Numbers:
+    """The numbers as they stand, in a model whose derived numbers are up to date."""
+    drag, rate = _dry_friction(model)
+    affine = np.asarray([[1.0, 0.0, 0.0], [1.0, 1.0, 1.0]])  # gains: fixed, affine
+    return Numbers(
+        np.stack([_inertia(model, b) for b in range(model.nbody)]),
+        model.body_pos.copy(),
+        model.opt.gravity.copy(),
+        model.dof_armature.copy(),
+        model.dof_damping.reshape(model.nv, -1)[:, 0].copy(),
+        model.jnt_stiffness.reshape(model.njnt, -1)[:, 0].copy(),
+        model.dof_frictionloss.copy(),
+        drag,
+        rate,
+        model.actuator_gear[:, 0].copy(),
+        model.actuator_gainprm[:, :3] * affine[model.actuator_gaintype.clip(0, 1)],
+        model.actuator_biasprm[:, :3] * (model.actuator_biastype == 1)[:, None],
+    )
+
+
+def moved_by(
+    at: Callable[[Float[np.ndarray, " p"]], Any],
+    theta: Float[np.ndarray, " p"],
+    step: Float[np.ndarray, " p"],
+    low: Float[np.ndarray, " p"],
+    high: Float[np.ndarray, " p"],
+) -> list[Numbers]:
+    """Derivatives of the numbers in each constant; ``at`` is the model of values."""
+    found = []
+    for i in range(theta.size):
+        up, down = theta.copy(), theta.copy()
+        up[i] = min(theta[i] + step[i], max(high[i], theta[i]))
+        down[i] = max(theta[i] - step[i], min(low[i], theta[i]))
+        ends = numbers_of(at(up)), numbers_of(at(down))
+        apart = up[i] - down[i]
+        found.append(Numbers(*((a - b) / apart for a, b in zip(*ends, strict=True))))
+    return found
+
+
+def _dry_friction(model: Any) -> tuple[Table, Table]:
+    """MuJoCo's regularised dry friction (its documentation, "Constraint model")."""
+    least, most = model.dof_solimp[:, 0], model.dof_solimp[:, 1]
+    impedance = np.clip(least, 1e-4, 0.9999)
+    most = np.clip(most, 1e-4, 0.9999)
+    softness = (1.0 - impedance) / impedance * model.dof_invweight0
+    time, ratio = model.dof_solref.T
+    time = np.maximum(time, 2.0 * model.opt.timestep)
+    direct = model.dof_solref[:, 0] <= 0.0  # its negative numbers are the rates
+    rate = np.where(direct, -ratio / most, 2.0 / (most * time))
+    return 1.0 / np.maximum(softness, 1e-15), rate
+
+
+def _inertia(model: Any, b: int) -> Table:
+    mass, centre = model.body_mass[b], model.body_ipos[b]
+    R = _rotation(model.body_iquat[b])
+    h = skew(mass * centre)
+    about = R * model.body_inertia[b] @ R.T - h @ skew(centre)
+    return np.block([[about, h], [h.T, mass * np.eye(3)]])
+
+
+def skew(x: Table) -> Table:
+    """The matrix of a cross product, ``skew(x) y = x cross y``."""
+    return np.asarray([[0, -x[2], x[1]], [x[2], 0, -x[0]], [-x[1], x[0], 0]])
+
+
+def _rotation(quat: Table) -> Table:
+    w, v = quat[0], quat[1:]
+    K = skew(v)
+    return np.eye(3) + 2.0 * (w * K + K @ K) / (quat @ quat)
