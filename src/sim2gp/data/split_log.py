@@ -22,7 +22,10 @@ from sim2gp.systems.simulate import DELAY_BLUR
 HALF_WIDTH = 0.025  # s, half the span of the local parabola that guesses a start
 PAST = 0.049  # s, the span of the causal one: 25 samples of 2 ms
 SPACING = 0.1  # s, between the starts of forecasts
-FAR = 10.0  # a start's unmeasured rate may lie so many times its rms away
+#: A start's unmeasured rate may lie so many times its rms away, or what slopes over
+#: different times differ by: a servo forgets its start's rate at once, and where noise
+#: alone decides it, it would go to where forces saturate.
+FAR = 10.0
 TOLERANCE = 0.05  # a substep may exceed its limit by this share of clock jitter
 Start = Literal["smoothed", "causal"]
 
@@ -121,6 +124,7 @@ def assemble(
     W, c = len(pieces), len(measured)
     held = [knots_of(log, actions, system.longest_delay) for log in logs]
     guesses = [_local_parabolas(log, measured, start) for log in logs]
+    twice = [_local_parabolas(log, measured, start, 2.0) for log in logs]
     steps = [_steps(log.time, system.window_substep) for log in logs]
     L = max(int(steps[k][0][j - 1] - steps[k][0][i]) + 1 for k, i, j in pieces)
     spans = [
@@ -129,7 +133,7 @@ def assemble(
     ]
     knots, area = inputs_since(held, spans, system.longest_delay)
     y, mask = np.zeros((W, L, c)), np.zeros((W, L, c), bool)
-    span, x0 = np.zeros((W, L)), np.zeros((W, len(names)))
+    span, (x0, wider) = np.zeros((W, L)), np.zeros((2, W, len(names)))
     for w, (k, i, j) in enumerate(pieces):
         values, valid = logs[k].measured(measured)
         row, lengths = steps[k]
@@ -137,9 +141,12 @@ def assemble(
         y[w, at], mask[w, at] = values[i:j], valid[i:j]
         span[w, 1 : at[-1] + 1] = lengths[row[i] : row[j - 1]]
         x0[w] = start_of(names, measured, *guesses[k](i))
+        wider[w] = start_of(names, measured, *twice[k](i))
     floor = np.asarray([resolution(logs, name) for name in measured])
     outputs = tuple(names.index(name) for name in measured)
-    spread = FAR * np.sqrt(np.mean(x0**2, axis=0))
+    # Slopes over twice the time differ by about what either is wrong by.
+    doubt = 1.5 * np.median(np.abs(x0 - wider), axis=0)
+    spread = FAR * np.minimum(np.sqrt(np.mean(x0**2, axis=0)), doubt)
     for index, quantum in zip(outputs, floor, strict=True):
         spread[index] = 100.0 * quantum
     spread = np.where(spread > 0.0, spread, 1.0)
@@ -237,17 +244,21 @@ def knots_of(
 
 
 def _local_parabolas(
-    log: Log, measured: Sequence[str], start: Start
+    log: Log, measured: Sequence[str], start: Start, width: float = 1.0
 ) -> Callable[[int], tuple[np.ndarray, np.ndarray]]:
     """Value and slope of each measured channel at a row, from the rows around it."""
     values, mask = log.measured(measured)
     before, after = (PAST, 0.0) if start == "causal" else (HALF_WIDTH, HALF_WIDTH)
+    before, after = width * before, width * after
 
     def at(i: int) -> tuple[np.ndarray, np.ndarray]:
         t = log.time - log.time[i]
+        # As long a span at the log's ends: half of it knows slopes ten times worse.
+        early = max(0.0, t[0] + before) if start == "smoothed" else 0.0
+        late = max(0.0, after - t[-1])
         near = slice(
-            int(np.searchsorted(t, -before)),
-            int(np.searchsorted(t, after, side="right")),
+            int(np.searchsorted(t, -before - late)),
+            int(np.searchsorted(t, after + early, side="right")),
         )
         value, slope = np.zeros(len(measured)), np.zeros(len(measured))
         for c in range(len(measured)):

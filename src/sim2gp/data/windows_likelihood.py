@@ -14,15 +14,16 @@ if off). ``window = 0`` is the paper's one-step likelihood: two rows, and ``S0 =
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from sim2gp.compilation import compile_async
+from sim2gp.data.window_slopes import AbstractAsked, slopes_on_host
 from sim2gp.data.windows import Windows
 from sim2gp.inference.arrowhead import Blocks, Noise, eliminate
 from sim2gp.inference.estimate import Estimate
@@ -30,7 +31,11 @@ from sim2gp.inference.least_squares import factor
 from sim2gp.inference.likelihood import AbstractLikelihood
 from sim2gp.inference.linearized import jacobian_by_columns, value_and_jacobian
 from sim2gp.systems.base import AbstractSystem
-from sim2gp.systems.plants.external import on_host
+from sim2gp.systems.plants.external import (
+    AbstractSimulator,
+    on_host,
+    simulator_of,
+)
 from sim2gp.systems.simulate import inputs_of, simulate
 from sim2gp.types import in_float64
 
@@ -53,6 +58,18 @@ class WindowsLikelihood(AbstractLikelihood):
     def n_nuisances(self) -> int:
         return int(self.windows.start.shape[1])
 
+    @property
+    def on_host(self) -> bool:
+        return self._simulator is not None
+
+    @property
+    def _simulator(self) -> AbstractSimulator | None:
+        return simulator_of(self.system)
+
+    def some(self, which: Int[np.ndarray, " w"]) -> "WindowsLikelihood":
+        """The likelihood of some of the windows, by number."""
+        return WindowsLikelihood(self.system, self.windows.some(which))
+
     def simulated(
         self, window: Windows, tt: Float[Array, " p"], e: Float[Array, " n"]
     ) -> tuple[Float[Array, "L c"], Float[Array, "L n"], Float[Array, " m"]]:
@@ -61,9 +78,7 @@ class WindowsLikelihood(AbstractLikelihood):
         params = self.system.record(values)
         x0 = window.start + window.start_sd * e
         states = simulate(self.system, params, window, x0)
-        r = states[:, np.asarray(window.outputs)] - window.y
-        r = jnp.where(window.mask, r, 0.0)
-        return r, states, self.system.delays(params)
+        return _residual(window, states), states, self.system.delays(params)
 
     def blocks(
         self,
@@ -72,6 +87,12 @@ class WindowsLikelihood(AbstractLikelihood):
         scale: Float[Array, "p p"],
     ) -> Blocks:
         n, p = e.shape[1], scale.shape[1]
+        simulator = None if isinstance(tt, jax.core.Tracer) else self._simulator
+        if simulator is not None:  # else its steps are called from compiled code
+            asked = _About(self.system, tt, scale)
+            args = simulator, asked, self.windows, e, n + p
+            states, slopes = slopes_on_host(*args)
+            return _factors(self.windows, states, slopes)
 
         def one(window: Windows, e: Array) -> Array:
             def residual(x: Array) -> Array:
@@ -93,6 +114,38 @@ class WindowsLikelihood(AbstractLikelihood):
         squares = jnp.sum(mask * (y - mean[:, None]) ** 2, axis=(0, 1))
         mean_square = squares / jnp.maximum(jnp.sum(mask, axis=(0, 1)), 1)
         return Noise(jnp.sqrt(mean_square) + self.floor, jnp.ones(len(windows)))
+
+
+class _About(AbstractAsked):
+    """A window at start ``e + x[:n]`` and constants ``tt + scale x[n:]``."""
+
+    system: AbstractSystem
+    tt: Float[Array, " p"]
+    scale: Float[Array, "p p"]
+
+    def __call__(self, window: Windows, e: Array, x: Array) -> tuple[Any, Windows, Any]:
+        n = e.size
+        tt = self.tt + self.scale @ x[n:]
+        params = self.system.record(self.system.values(tt, window.configuration))
+        return params, window, window.start + window.start_sd * (e + x[:n])
+
+
+def _residual(window: Windows, states: Float[Array, "L n"]) -> Float[Array, "L c"]:
+    r = states[:, np.asarray(window.outputs)] - window.y
+    return jnp.where(window.mask, r, 0.0)
+
+
+@eqx.filter_jit
+def _factors(windows: Windows, states: Array, slopes: Array) -> Blocks:
+    """Factors of ``[J r]`` of each window and channel."""
+
+    def one(window: Windows, states: Array, slopes: Array) -> Array:
+        J = slopes[:, np.asarray(window.outputs)]
+        J = jnp.where(window.mask[..., None], J, 0.0)
+        return jax.vmap(factor, in_axes=1)(J, _residual(window, states))
+
+    found: Array = windows.each(one, states, slopes)
+    return found
 
 
 def start_states(windows: Windows, fitted: Estimate) -> Float[np.ndarray, "W n"]:
@@ -120,15 +173,40 @@ def linearise(
 ) -> Linearised:
     """The windows' simulation at virtual values ``tt``, and its derivatives."""
     e, tt = jnp.asarray(fitted.nuisances), jnp.asarray(tt, float)
+    if (simulator := simulator_of(likelihood.system)) is not None:
+        asked = _About(likelihood.system, tt, fitted.prior.scale)
+        k = e.shape[1] + tt.size
+        found = slopes_on_host(simulator, asked, likelihood.windows, e, k)
+        return _rows(likelihood, tt, *found)
     return _linearise(likelihood, e, tt, fitted.prior.scale)
 
 
 @in_float64
 def compile_linearise(system: AbstractSystem, windows: Windows) -> None:
     """Start to compile `linearise` for windows like these and a fit to come."""
+    if simulator_of(system) is not None:
+        return  # nothing to compile: its programs are small
     prior, likelihood = system.parameters.prior(), WindowsLikelihood(system, windows)
     e = jnp.zeros(windows.start.shape)
     _linearise.compile_for(likelihood, e, prior.mean, prior.scale)
+
+
+@eqx.filter_jit
+def _rows(
+    likelihood: WindowsLikelihood, tt: Array, states: Array, slopes: Array
+) -> Linearised:
+    """Rows of windows that were simulated on the host; the start's columns go last."""
+    system, n = likelihood.system, states.shape[-1]
+
+    def one(window: Windows, states: Array, slopes: Array) -> Linearised:
+        J = slopes[:, np.asarray(window.outputs)]
+        J = jnp.roll(jnp.where(window.mask[..., None], J, 0.0), -n, axis=-1)
+        params = system.record(system.values(tt, window.configuration))
+        inputs = inputs_of(window, system.delays(params))
+        return Linearised(_residual(window, states), J, states, inputs)
+
+    found: Linearised = likelihood.windows.each(one, states, slopes)
+    return found
 
 
 @compile_async

@@ -25,6 +25,7 @@ from jaxtyping import Array, Float, Int
 from sim2gp.errors import DeadParameters, NotConverged, NotFinite
 from sim2gp.inference.arrowhead import Elimination, Noise, eliminate
 from sim2gp.inference.gaussian import LOG_2PI, Gaussian
+from sim2gp.inference.host_descent import NEAR, Report, best_start, descend
 from sim2gp.inference.least_squares import (
     Factor,
     gauss_newton_step,
@@ -34,7 +35,6 @@ from sim2gp.inference.least_squares import (
 )
 from sim2gp.inference.levenberg_marquardt import (
     GRADIENT_TOLERANCE,
-    JOINT_TOLERANCE,
     Point,
     evaluate,
     multi_start,
@@ -94,12 +94,13 @@ class Laplace(eqx.Module):
         largest = (jnp.max(jnp.abs(x), initial=0.0) for x in entries)
         return jnp.maximum(*largest)
 
-    def convergence(self, steps: Int[Array, ""]) -> "Convergence":
-        """Whether a descent of so many steps has ended at a MAP."""
-        gradient, step_sd = self.at.gradient, self.newton_step_sd()
-        there = (gradient <= GRADIENT_TOLERANCE) | (step_sd <= GRADIENT_TOLERANCE)
-        flat, short = JOINT_TOLERANCE
-        there |= (gradient <= flat) & (step_sd <= short)
+    def convergence(
+        self, steps: Int[Array, ""], away: float | Scalar = jnp.inf
+    ) -> "Convergence":
+        """Whether a descent of so many steps has ended at a MAP, or near enough."""
+        gradient = self.at.gradient
+        step_sd = jnp.minimum(self.newton_step_sd(), away)
+        there = (gradient <= GRADIENT_TOLERANCE) | (step_sd <= NEAR)
         status = jnp.where(there, CONVERGED, STALLED)
         data = self.arrow.data
         dead = jnp.all(data[:, :-1] == 0.0) & jnp.any(data[:, -1] != 0.0)
@@ -203,7 +204,6 @@ def drawn_starts(
     return jnp.concatenate([first, SPREAD * jax.random.normal(key, (count - k, p))])
 
 
-@eqx.filter_jit
 def estimate(
     likelihood: AbstractLikelihood,
     prior: AbstractPrior,
@@ -214,19 +214,103 @@ def estimate(
     noise: Noise | None = None,
     freedom: float | Scalar = jnp.inf,
     needed: Int[Array, ""] | None = None,
+    report: Report | None = None,
 ) -> Estimate:
     """Descend from each of the whitened ``starts``, then ``rounds`` of EM.
 
     ``nuisances`` and ``noise`` are those of another fit to begin with; zeros and the
     likelihood's own first noise without. Rounds beyond those ``needed``, and starts
-    that are no number, are compiled and not taken. What did not converge is reported by
-    `Convergence.check`.
+    that are no number, are compiled and not taken. A simulator on the host learns the
+    noise in turns with its steps until both rest, and says to ``report`` after each of
+    them where it stands. What did not converge is reported by `Convergence.check`.
     """
-    counts, floor = likelihood.counts, likelihood.floor
     if nuisances is None:
-        nuisances = jnp.zeros((len(counts), likelihood.n_nuisances))
+        shape = len(likelihood.counts), likelihood.n_nuisances
+        nuisances = jnp.zeros(shape)
     if noise is None:
         noise = likelihood.first_noise()
+    if likelihood.on_host:
+        start = starts, nuisances, noise
+        freedom = jnp.asarray(freedom)
+        return _estimate_on_host(likelihood, prior, start, freedom, report)
+    begin = starts, nuisances, noise
+    return _estimate(likelihood, prior, *begin, freedom, needed, rounds)
+
+
+def _estimate_on_host(
+    likelihood: AbstractLikelihood,
+    prior: AbstractPrior,
+    start: tuple[Float[Array, "starts p"], Float[Array, "W n"], Noise],
+    freedom: Scalar,
+    report: Report | None,
+) -> Estimate:
+    starts, e, noise = start
+    counts, floor = likelihood.counts, likelihood.floor
+
+    def update(at: Point, noise: Noise) -> Noise:
+        return _updated(at, noise, counts, floor, freedom)
+
+    best = best_start(likelihood, prior, starts, e, noise, _newton_step_sd)
+    begin = (best.at.z, best.at.e), noise, _newton_step_sd, update
+    for found in descend(likelihood, prior, *begin, damping=best.damping):
+        if report is not None:
+            report(found)
+    counted = jnp.asarray(found.steps), jnp.asarray(found.away)
+    return _about(found.at, found.noise, prior.gaussian, counts, *counted)
+
+
+@eqx.filter_jit
+def _updated(
+    at: Point, noise: Noise, counts: Array, floor: Array, freedom: Scalar
+) -> Noise:
+    squares, spread = laplace(at, noise).squares()
+    return expected_noise(noise, squares, spread, counts, floor, freedom)
+
+
+@eqx.filter_jit
+def _newton_step_sd(at: Point, noise: Noise) -> Scalar:
+    return laplace(at, noise).newton_step_sd()
+
+
+@eqx.filter_jit
+def _about(
+    at: Point,
+    noise: Noise,
+    prior: Gaussian,
+    counts: Float[Array, "W c"],
+    steps: Int[Array, ""],
+    away: float | Scalar = jnp.inf,
+) -> Estimate:
+    """Laplace's posterior about the point where a descent has ended.
+
+    ``away`` is how far the MAP may be, in posterior sd, where the descent knows.
+    """
+    found = laplace(at, noise)
+    return Estimate(
+        prior,
+        posterior(found.full, at.z, prior),
+        noise,
+        at.e,
+        found.arrow.data[:-1, :-1],
+        at.scores,
+        found.log_joint() + log_normaliser(noise, counts),
+        found.convergence(steps, away),
+    )
+
+
+@eqx.filter_jit
+def _estimate(
+    likelihood: AbstractLikelihood,
+    prior: AbstractPrior,
+    starts: Float[Array, "starts p"],
+    nuisances: Float[Array, "W n"],
+    noise: Noise,
+    freedom: float | Scalar,
+    needed: Int[Array, ""] | None,
+    rounds: int,
+) -> Estimate:
+    """The whole fit as one program, of simulators that JAX can compile."""
+    counts, floor = likelihood.counts, likelihood.floor
 
     def update(at: Point, noise: Noise) -> Noise:
         squares, spread = laplace(at, noise).squares()
@@ -242,17 +326,7 @@ def estimate(
         rounds=rounds,
         needed=needed,
     )
-    found = laplace(at, noise)
-    return Estimate(
-        prior.gaussian,
-        posterior(found.full, at.z, prior.gaussian),
-        noise,
-        at.e,
-        found.arrow.data[:-1, :-1],
-        at.scores,
-        found.log_joint() + log_normaliser(noise, counts),
-        found.convergence(steps),
-    )
+    return _about(at, noise, prior.gaussian, counts, steps)
 
 
 @eqx.filter_jit

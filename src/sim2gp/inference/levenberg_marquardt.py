@@ -151,29 +151,21 @@ def _descend(
 
     def improve(carry: tuple) -> tuple:
         here, damping, count, _ = carry
-        dz, de, predicted_reduction = _step(terms[1], here, noise, damping)
+        dz, de, predicted_reduction = step(terms[1], here, noise, damping)
         first = fresh & (count == 0)
         z = jnp.where(first, start[0], here.z + dz)
         e = jnp.where(first, start[1], here.e + de)
         there = evaluate(*terms, z, e, noise)
-        actual_reduction = here.cost - there.cost
-        # Rounding in the cost must not refuse the last, gradient-only digits.
-        slack = 1e-12 * (1.0 + there.cost)
-        flatter = there.gradient < here.gradient
-        lost_in_rounding = (jnp.abs(actual_reduction) <= slack) & flatter
-        keep = (actual_reduction > slack) | lost_in_rounding
-        settled = keep & (actual_reduction <= tolerance * (1.0 + there.cost))
+        keep, next_damping = judged(here, there, predicted_reduction, damping)
+        gain = here.cost - there.cost
+        settled = keep & (gain <= tolerance * (1.0 + there.cost))
         # Differences of a simulator on the host hide what such a step would gain.
         flat, short = JOINT_TOLERANCE
         vain = predicted_reduction <= 0.5 * short**2
         vain = ~keep & (damping < LEAST_DAMPING) & vain
         settled = jnp.where(exact, vain & (here.gradient <= flat), settled)
-        ratio = actual_reduction / predicted_reduction
-        ratio = jnp.where(lost_in_rounding, 1.0, ratio)  # rounding has none
-        lowered = damping * jnp.clip(1.0 - (2.0 * ratio - 1.0) ** 3, 0.1, 2.0)
-        raised = 4.0 * jnp.maximum(damping, LEAST_DAMPING)
         # A start has nothing to be compared with.
-        damping = jnp.where(first, damping, jnp.where(keep, lowered, raised))
+        damping = jnp.where(first, damping, next_damping)
         return _select(keep, there, here), damping, count + 1, settled
 
     def unfinished(carry: tuple) -> Array:
@@ -192,7 +184,24 @@ def _descend(
     return here, count
 
 
-def _step(
+def judged(
+    here: Point, there: Point, predicted_reduction: Scalar, damping: Scalar
+) -> tuple[Bool[Array, ""], Scalar]:
+    """Whether a step is kept, and the damping of the next one (Nielsen 1999)."""
+    actual_reduction = here.cost - there.cost
+    # Rounding in the cost must not refuse the last, gradient-only digits.
+    slack = 1e-12 * (1.0 + there.cost)
+    flatter = there.gradient < here.gradient
+    lost_in_rounding = (jnp.abs(actual_reduction) <= slack) & flatter
+    keep = (actual_reduction > slack) | lost_in_rounding
+    ratio = actual_reduction / predicted_reduction
+    ratio = jnp.where(lost_in_rounding, 1.0, ratio)  # rounding has none
+    lowered = damping * jnp.clip(1.0 - (2.0 * ratio - 1.0) ** 3, 0.1, 2.0)
+    raised = 4.0 * jnp.maximum(damping, LEAST_DAMPING)
+    return keep, jnp.where(keep, lowered, raised)
+
+
+def step(
     prior: AbstractPrior, here: Point, noise: Noise, damping: Scalar
 ) -> tuple[Float[Array, " p"], Float[Array, "W n"], Scalar]:
     """The damped step of the whole problem, and the cost that it should save."""

@@ -29,6 +29,11 @@ class AbstractLikelihood(eqx.Module):
     def n_nuisances(self) -> int:
         """Number of unknowns that each window has of its own, ``n``."""
 
+    @property
+    def on_host(self) -> bool:
+        """Whether `blocks` asks a simulator on the host, outside compiled programs."""
+        return False
+
     @abstractmethod
     def first_noise(self) -> Noise:
         """The noise that a new fit begins with: a large one traps no first MAP."""

@@ -51,6 +51,10 @@ class Stacked(AbstractLikelihood):
     def n_nuisances(self) -> int:
         return max(each.n_nuisances for each in self.likelihoods)
 
+    @property
+    def on_host(self) -> bool:
+        return any(each.on_host for each in self.likelihoods)
+
     def first_noise(self) -> Noise:
         found = [each.first_noise() for each in self.likelihoods]
         return Noise(

@@ -132,6 +132,19 @@ class AbstractSystem(eqx.Module):
         ``held`` are the held inputs, newest first; the last was held for ever before.
         """
 
+    @abc.abstractmethod
+    def enter(
+        self, params: Any, x0: Float[Array, " n"], inputs: Float[Array, "L m"]
+    ) -> tuple[Any, Float[Array, " n"], Float[Array, "L m"]]:
+        """What the plant is given: its constants, start, and the inputs of each step.
+
+        With `leave`, `flow` of a system without effects on its joints is the plant's.
+        """
+
+    @abc.abstractmethod
+    def leave(self, params: Any, states: Float[Array, "L n"]) -> Float[Array, "L n"]:
+        """What the system says that the plant's states are."""
+
     @property
     def physical_states(self) -> tuple[Channel, ...]:
         """The states that `flow` takes on, without the carried past actions."""
@@ -241,6 +254,17 @@ class AbstractPlant(AbstractSystem):
     ) -> Float[Array, "count m"]:
         """The newest input."""
         return jnp.broadcast_to(held[:1], (count, held.shape[1]))
+
+
+    def enter(
+        self, params: Any, x0: Float[Array, " n"], inputs: Float[Array, "L m"]
+    ) -> tuple[Any, Float[Array, " n"], Float[Array, "L m"]]:
+        """Constants, start and inputs of the plant itself."""
+        return params, x0, inputs
+
+    def leave(self, params: Any, states: Float[Array, "L n"]) -> Float[Array, "L n"]:
+        """States of the plant as the system's."""
+        return states
 
 
 class AbstractODE(AbstractPlant):

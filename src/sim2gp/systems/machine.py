@@ -16,6 +16,7 @@ from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -201,6 +202,32 @@ class Machine(AbstractSystem):
     ) -> State:
         """The plant's own with effects, at the true position, under the input that
         arrives; ``s`` is the physical state, ``a`` the delayed or filtered input."""
+        a = self._through(params, a)
+        if not self.sensors:
+            return self._moved(params, s, a, h)
+        offset = self._offset(params).astype(s.dtype)
+        return self._moved(params, s + offset, a, h) - offset
+
+    def enter(
+        self,
+        params: MachineParams,
+        x0: Float[Array, " n"],
+        inputs: Float[Array, "L m"],
+    ) -> tuple[Any, Float[Array, " n"], Float[Array, "L m"]]:
+        inputs = jax.vmap(lambda a: self._through(params, a))(inputs)
+        if self.sensors:
+            x0 = x0 + self._offset(params).astype(x0.dtype)
+        return params.plant, x0, inputs
+
+    def leave(
+        self, params: MachineParams, states: Float[Array, "L n"]
+    ) -> Float[Array, "L n"]:
+        if not self.sensors:
+            return states
+        return states - self._offset(params).astype(states.dtype)
+
+    def _through(self, params: MachineParams, a: Action) -> Action:
+        """The input behind the actuators' gains, offsets and effects."""
         if self._has(Gain):
             a = self._each(params, Gain, 1.0) * a
         if self._has(Offset):
@@ -209,13 +236,13 @@ class Machine(AbstractSystem):
             if isinstance(effect, AbstractInputEffect):
                 i = index_of(effect.where, self.actions)
                 a = a.at[i].set(effect.through(params.parts[effect.name], a[i]))
-        if not self.sensors:
-            return self._moved(params, s, a, h)
+        return a
+
+    def _offset(self, params: MachineParams) -> Float[Array, " n"]:
+        """What the encoders leave out of each state."""
         zero = jnp.zeros_like(params.parts[self.sensors[0].name])
         known = {p.where: params.parts[p.name] for p in self.sensors}
-        offset = jnp.stack([known.get(c.name, zero) for c in self.plant.states])
-        offset = offset.astype(s.dtype)
-        return self._moved(params, s + offset, a, h) - offset
+        return jnp.stack([known.get(c.name, zero) for c in self.plant.states])
 
     def delays(self, params: MachineParams) -> Float[Array, " m"]:
         """Delay of each input; a lag is none (E145 over windows of logs)."""

@@ -57,6 +57,14 @@ def inputs_of(
     return jax.vmap(channel, in_axes=(1, 0), out_axes=1)(window.area, delays)
 
 
+def arriving(
+    system: AbstractSystem, params: Any, window: HeldInputs
+) -> Float[Array, "L m"]:
+    """The inputs of each step, delayed as the machine delays them."""
+    blur = DELAY_BLUR if system.longest_delay else 0.0
+    return inputs_of(window, system.delays(params), blur)
+
+
 def _second_integral(
     knots: Float[Array, " H"], area: Float[Array, " H"]
 ) -> Callable[[Array], Array]:
@@ -87,8 +95,7 @@ def simulate(
         x = system.flow(params, x, u, h)
         return x, x
 
-    blur = DELAY_BLUR if system.longest_delay else 0.0
-    inputs = inputs_of(window, system.delays(params), blur)
+    inputs = arriving(system, params, window)
     # A gradient's way back takes each step again: a third of the time that it takes to
     # keep and fetch what every step has seen. What runs forward alone is not touched.
     again = jax.checkpoint(step, prevent_cse=False)

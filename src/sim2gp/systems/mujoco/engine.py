@@ -19,7 +19,12 @@ from sim2gp.inference.parameters import Parameters
 from sim2gp.systems.mujoco.constants import CENTRED, DERIVED, Constant, set_constants
 from sim2gp.systems.mujoco.slopes.numbers import moved_by, numbers_of, tree_of
 from sim2gp.systems.mujoco.slopes.step import Model, acceleration_slopes, in_closed_form
-from sim2gp.systems.plants.external import AbstractSimulator, Differences, untouched
+from sim2gp.systems.plants.external import (
+    AbstractSimulator,
+    Arguments,
+    Differences,
+    untouched,
+)
 
 #: Fewer steps than these are not worth waking other threads for.
 FEW = 256
@@ -153,8 +158,26 @@ class Engine(AbstractSimulator):
                 left[good] = False
         rest = np.flatnonzero(left)
         if rest.size:
-            out[rest] = self.slopes(theta[rest], s[rest], a[rest], h[rest])[1]
+            args = theta[rest], s[rest], a[rest], h[rest]
+            out[rest] = super().slopes(*args)[1]
         return out
+
+    def slopes(
+        self,
+        theta: Float[np.ndarray, "B p"],
+        s: Float[np.ndarray, "B n"],
+        a: Float[np.ndarray, "B m"],
+        h: Float[np.ndarray, " B"],
+    ) -> tuple[Float[np.ndarray, "B n"], Float[np.ndarray, "B n pnm"]]:
+        at = Arguments(theta, s, a[:, None], h[:, None])
+        sizes = np.cumsum([theta.shape[1], s.shape[1]])
+        of_theta, of_s, of_a = (
+            np.broadcast_to(part, (len(s), *part.shape))
+            for part in np.split(np.eye(sizes[-1] + a.shape[1]), sizes)
+        )
+        along = Arguments(of_theta, of_s, of_a[:, None], h)
+        states, J = self.linearised_rollout(at, along)
+        return states[:, 0], J[:, 0]
 
     def _linearised(self, theta: Float[np.ndarray, " p"], h: float) -> Model:
         """The numbers of the model and what the constants change of them."""

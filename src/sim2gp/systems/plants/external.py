@@ -25,7 +25,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp.inference.parameters import Parameters
 from sim2gp.systems.base import AbstractSystem
-from sim2gp.systems.machine import plant_of
+from sim2gp.systems.effects.base import AbstractJointEffect
+from sim2gp.systems.machine import Machine, plant_of
 from sim2gp.types import Action, AnyArray, Scalar, State
 
 #: What a constant changes by less, of the largest number, it does not change.
@@ -211,6 +212,19 @@ def on_host(system: AbstractSystem) -> bool:
     found = plant_of(system)
     engine = isinstance(getattr(found, "engine", None), AbstractSimulator)
     return engine and getattr(found, "mjx", None) is None
+
+
+def simulator_of(system: AbstractSystem) -> AbstractSimulator | None:
+    """The simulator that moves whole windows of a machine by itself.
+
+    None where JAX does, and where effects act on the joints between its steps.
+    """
+    machine = isinstance(system, Machine)
+    joints = machine and any(isinstance(e, AbstractJointEffect) for e in system.effects)
+    if joints or not on_host(system):
+        return None
+    engine: AbstractSimulator = plant_of(system).engine  # type: ignore[attr-defined]
+    return engine
 
 
 def untouched(
