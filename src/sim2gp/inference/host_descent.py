@@ -86,7 +86,7 @@ def descend(
     """
     here = _linearised(likelihood, prior, *start, noise)
     kept, change = jnp.asarray(damping), np.inf if update else 0.0
-    sd = float(step_sd(here, noise))
+    sd, refused = float(step_sd(here, noise)), 0
     yield Progress(here, noise, 1, sd, damping, sd)
     for count in range(2, most + 1):
         if not np.isfinite(float(here.cost)) or float(kept) >= MOST_DAMPING:
@@ -94,6 +94,8 @@ def descend(
         z, e, predicted, size = _proposed(prior, here, noise, kept)
         there = _linearised(likelihood, prior, z, e, noise)
         keep, kept = _judged(here, there, predicted, kept)
+        refused = 0 if bool(keep) else refused + 1
+        kept = kept * 4.0 ** max(0, refused - 1)  # each refusal raises it by more
         vain = float(size) <= NEAR and float(here.cost - there.cost) <= NOTHING
         if bool(keep):
             here = there

@@ -255,7 +255,6 @@ class AbstractPlant(AbstractSystem):
         """The newest input."""
         return jnp.broadcast_to(held[:1], (count, held.shape[1]))
 
-
     def enter(
         self, params: Any, x0: Float[Array, " n"], inputs: Float[Array, "L m"]
     ) -> tuple[Any, Float[Array, " n"], Float[Array, "L m"]]:

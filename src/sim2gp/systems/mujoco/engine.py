@@ -95,9 +95,10 @@ class Engine(AbstractSimulator):
                     out[at] = self._rolled(chosen, models, s[at], a[at], float(span))
         return out
 
-    def substeps(self, span: Float[np.ndarray, "W L"]) -> Int[np.ndarray, "W L"]:
-        step = self.model.opt.timestep
-        return np.maximum(1, np.ceil(np.round(span, 12) / step - 1e-9)).astype(int)
+    def substeps(self, span: Float[np.ndarray, "*r"]) -> Int[np.ndarray, "*r"]:
+        step = float(self.model.opt.timestep)
+        count = np.ceil(np.round(span, 12) / step - 1e-9)
+        return np.asarray(np.maximum(1, count), int)
 
     def rollout(
         self,
@@ -107,8 +108,8 @@ class Engine(AbstractSimulator):
         span: Float[np.ndarray, "W L"],
     ) -> Float[np.ndarray, "W L n"]:
         lengths = np.unique(np.round(span[span > 0.0], 12))
-        rows = np.concatenate([theta, x0, u.reshape(len(u), -1)], axis=1)
-        if lengths.size != 1 or not np.isfinite(rows).all():
+        finite = all(np.isfinite(x).all() for x in (theta, x0, u))
+        if lengths.size != 1 or not finite:
             return super().rollout(theta, x0, u, span)
         # All rows are equally long, or not there: each window is one call.
         moving = span > 0.0
@@ -122,9 +123,11 @@ class Engine(AbstractSimulator):
             models = self._models(values)
             chosen = [models[k] for k in which.reshape(-1)]
             h = float(lengths[0]) / count
-            states = self._stepped(chosen, models, x0, control, h)[:, count - 1 :: count]
+            states = self._stepped(chosen, models, x0, control, h)[
+                :, count - 1 :: count
+            ]
         whole = np.concatenate([x0[:, None], states], axis=1)
-        return np.take_along_axis(whole, np.cumsum(moving, axis=1)[..., None], axis=1)
+        return whole[np.arange(len(u))[:, None], np.cumsum(moving, axis=1)]
 
     def jacobian(
         self,

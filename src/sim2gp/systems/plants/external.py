@@ -131,7 +131,7 @@ class AbstractSimulator(abc.ABC):
         J = moved / apart[..., None]
         return out[0], np.moveaxis(J, 0, -1)
 
-    def substeps(self, span: Float[np.ndarray, "W L"]) -> Int[np.ndarray, "W L"]:
+    def substeps(self, span: Float[np.ndarray, "*r"]) -> Int[np.ndarray, "*r"]:
         """How many equal steps `slopes` divides each of these times into."""
         return np.ones(span.shape, int)
 
@@ -142,7 +142,7 @@ class AbstractSimulator(abc.ABC):
         u: Float[np.ndarray, "W L m"],
         span: Float[np.ndarray, "W L"],
     ) -> Float[np.ndarray, "W L n"]:
-        """States at the end of each row of inputs that are held for its ``span`` (s)."""
+        """States after each row of inputs, which are held for its ``span`` (s)."""
         out = np.empty((*span.shape, x0.shape[1]))
         x = x0
         for k in range(span.shape[1]):
@@ -219,9 +219,9 @@ def simulator_of(system: AbstractSystem) -> AbstractSimulator | None:
 
     None where JAX does, and where effects act on the joints between its steps.
     """
-    machine = isinstance(system, Machine)
-    joints = machine and any(isinstance(e, AbstractJointEffect) for e in system.effects)
-    if joints or not on_host(system):
+    effects = system.effects if isinstance(system, Machine) else ()
+    kicked = any(isinstance(effect, AbstractJointEffect) for effect in effects)
+    if kicked or not on_host(system):
         return None
     engine: AbstractSimulator = plant_of(system).engine  # type: ignore[attr-defined]
     return engine

@@ -1,6 +1,7 @@
 """Forces of actuators, springs and dampers on the joints, and their derivatives.
 
-    force = gain . (1, l, l') u + bias . (1, l, l'),     l = gear q,   torque = gear force
+    force = gain . (1, l, l') u + bias . (1, l, l')
+    l = gear q,        torque = gear force
 
 A force at its limit stays there, and so does a joint's torque. `implicitfast` takes
 the velocities of dampers and actuators at the end of the step, `Euler` those of the
@@ -10,7 +11,7 @@ dampers: MuJoCo's documentation, "Numerical integration".
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from sim2gp.systems.mujoco.slopes.numbers import Numbers, Tree
 
@@ -44,12 +45,17 @@ class Drives(NamedTuple):
     damping: Float[np.ndarray, "m B"]  # of the force in velocity
 
 
+def damps_late(model: Any) -> bool:
+    """Whether dampers see the velocity at the step's end."""
+    late: bool = model.opt.integrator == IMPLICIT_FAST
+    return late or not model.opt.disableflags & NO_EULER_DAMPING
+
+
 def torques(
     model: Any, tree: Tree, has: Numbers, q: Batch, v: Batch, after: Batch, u: Batch
 ) -> tuple[Torques, Drives]:
     """All of them at positions and velocities, under inputs."""
-    implicit = model.opt.integrator == IMPLICIT_FAST
-    damped = implicit or not model.opt.disableflags & NO_EULER_DAMPING
+    implicit, damped = model.opt.integrator == IMPLICIT_FAST, damps_late(model)
     away = q - tree.spring[:, None]
     drag = -has.damping[:, None] * (after if damped else v)
     tau = drag - has.stiffness[:, None] * away
@@ -68,9 +74,10 @@ def torques(
         (by_after if implicit else by_v)[j] += speed
         gain = has.gain[i, 0] + has.gain[i, 1] * drives.length[i]
         gain = gain + has.gain[i, 2] * drives.rate[i]
-        inside = _inside(u[i], model.actuator_ctrlrange[i])
-        inside = inside if model.actuator_ctrllimited[i] else 1.0
-        by_u[j, i] += gear[i] * drives.free[i] * gain * inside
+        moves = gear[i] * drives.free[i] * gain
+        if model.actuator_ctrllimited[i]:
+            moves = moves * _inside(u[i], model.actuator_ctrlrange[i])
+        by_u[j, i] += moves
     return Torques(tau, size, by_q, by_v, by_after, by_u), drives
 
 
@@ -92,6 +99,21 @@ def by_numbers(
     return out
 
 
+def late_by_numbers(
+    model: Any, tree: Tree, has: Numbers, by: Numbers, at: Drives
+) -> Batch:
+    """Change of minus the torques' slope in the velocity after the step."""
+    out = np.zeros((len(by.damping), at.u.shape[1]))
+    if damps_late(model):
+        out += by.damping[:, None]
+    if model.opt.integrator == IMPLICIT_FAST:
+        for i, j in enumerate(tree.driven):
+            change = by.gain[i, 2] * at.u[i] + by.bias[i, 2]
+            twice = 2.0 * has.gear[i] * by.gear[i] * at.damping[i]
+            out[j] -= at.free[i] * (has.gear[i] ** 2 * change + twice)
+    return out
+
+
 def _drives(
     model: Any, tree: Tree, has: Numbers, q: Batch, v: Batch, at: Batch, u: Batch
 ) -> tuple[Drives, Batch]:
@@ -103,13 +125,14 @@ def _drives(
     limited = model.actuator_ctrllimited.astype(bool)[:, None]
     u = np.where(limited, np.clip(u, low, high), u)
     gear = has.gear[:, None]
-    length = gear * q[tree.driven]
+    driven = list(tree.driven)
+    length = gear * q[driven]
     free, value = np.ones_like(u), np.zeros_like(u)
     slope = has.gain[:, 1, None] * u + has.bias[:, 1, None]
     damping = has.gain[:, 2, None] * u + has.bias[:, 2, None]
     rest = has.gain[:, 0, None] * u + has.bias[:, 0, None] + slope * length
-    before = rest + damping * gear * v[tree.driven]
-    rate = gear * at[tree.driven]
+    before = rest + damping * gear * v[driven]
+    rate = gear * at[driven]
     value = rest + damping * rate
     for i in np.flatnonzero(model.actuator_forcelimited):
         held = ~_inside(before[i], model.actuator_forcerange[i])
@@ -119,7 +142,7 @@ def _drives(
         )
     pull = gear * value
     for j in np.flatnonzero(model.jnt_actfrclimited):
-        mine = np.flatnonzero(tree.driven == j)
+        mine = np.flatnonzero(np.equal(driven, j))
         total = np.sum(gear[mine] * before[mine], axis=0)
         held = ~_inside(total, model.jnt_actfrcrange[j])
         if mine.size and held.any():
@@ -129,7 +152,7 @@ def _drives(
     return Drives(free, u, length, rate, value, slope, damping), pull
 
 
-def _inside(x: Batch, limits: Float[np.ndarray, " 2"]) -> Batch:
+def _inside(x: Batch, limits: Float[np.ndarray, " 2"]) -> Bool[np.ndarray, "... B"]:
     return (x > limits[0]) & (x < limits[1])
 
 

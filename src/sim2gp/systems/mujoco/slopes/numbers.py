@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 Table = Float[np.ndarray, "..."]
 
@@ -43,17 +43,17 @@ class Tree(NamedTuple):
     ``above[i, j]``: whether joint ``i`` moves joint ``j`` (not itself).
     """
 
-    parent: Int[np.ndarray, " b"]
+    parent: tuple[int, ...]  # of each body
     turn: Float[np.ndarray, "b 3 3"]  # of each body's frame in its parent's
     joints: tuple[tuple[int, ...], ...]  # of each body, in order
-    body: Int[np.ndarray, " n"]  # of each joint
+    body: tuple[int, ...]  # of each joint
     hinge: np.ndarray
     axis: Float[np.ndarray, "n 3"]
     anchor: Float[np.ndarray, "n 3"]
     zero: Float[np.ndarray, " n"]  # position of the joint in the model's reference
     spring: Float[np.ndarray, " n"]
     above: np.ndarray
-    driven: Int[np.ndarray, " m"]
+    driven: tuple[int, ...]
 
 
 def tree_of(model: Any) -> Tree | None:
@@ -74,17 +74,17 @@ def tree_of(model: Any) -> Tree | None:
     same = body[:, None] == body[None]
     above |= same & (np.arange(n)[:, None] < np.arange(n)[None])
     return Tree(
-        parent,
+        tuple(parent.tolist()),
         np.stack([_rotation(quat) for quat in model.body_quat]),
         tuple(tuple(np.flatnonzero(body == b).tolist()) for b in range(model.nbody)),
-        body,
+        tuple(body.tolist()),
         model.jnt_type == 3,
         model.jnt_axis.copy(),
         model.jnt_pos.copy(),
         model.qpos0.copy(),
         model.qpos_spring.copy(),
         above,
-        model.actuator_trnid[:, 0].copy(),
+        tuple(model.actuator_trnid[:, 0].tolist()),
     )
 
 

@@ -24,6 +24,7 @@ from jaxtyping import Float
 from sim2gp.systems.mujoco.slopes.numbers import Numbers, Tree
 
 Batch = Float[np.ndarray, "... B"]
+Vector = Float[np.ndarray, " 3"]
 
 
 class Motion(NamedTuple):
@@ -41,7 +42,7 @@ class Motion(NamedTuple):
 class Forces(NamedTuple):
     """What the bodies above each joint ask for together."""
 
-    I: Float[np.ndarray, "b 6 6 B"]  # noqa: E741
+    I: Float[np.ndarray, "b 6 6 B"]
     B2: Float[np.ndarray, "b 6 6 B"]  # twice B
     F: Float[np.ndarray, "b 6 B"]
 
@@ -123,7 +124,7 @@ def motion(tree: Tree, numbers: Numbers, q: Batch, v: Batch, a: Batch) -> Motion
 def forces(tree: Tree, inertia: Float[np.ndarray, "b 6 6"], at: Motion) -> Forces:
     """Inertias and forces of each body, summed from the leaves on."""
     bodies, _, B = at.v.shape
-    I, B2 = np.zeros((2, bodies, 6, 6, B))  # noqa: E741
+    I, B2 = np.zeros((2, bodies, 6, 6, B))
     F = np.zeros((bodies, 6, B))
     for b in range(bodies - 1, 0, -1):
         if inertia[b].any():
@@ -172,7 +173,19 @@ def row(at: Motion, of: Forces, j: int, b: int) -> tuple[Batch, Batch]:
     return apply(of.I[b], at.S[j]), np.einsum("ijB,iB->jB", of.B2[b], at.S[j])
 
 
-def by_place(tree: Tree, at: Motion, of: Forces, b: int, along: Batch) -> Batch:
+def by_numbers(tree: Tree, at: Motion, of: Forces, change: Numbers) -> Batch:
+    """Derivative of the torques along a change of the links' numbers."""
+    out = np.zeros((len(at.S), at.S.shape[-1]))
+    for b in np.flatnonzero(change.inertia.any((1, 2))).tolist():
+        out += _by_inertia(tree, at, b, change.inertia[b])
+    for b in np.flatnonzero(change.place.any(1)).tolist():
+        out += _by_place(tree, at, of, b, change.place[b])
+    if change.gravity.any():
+        out += _by_gravity(tree, at, of, change.gravity)
+    return out
+
+
+def _by_place(tree: Tree, at: Motion, of: Forces, b: int, along: Vector) -> Batch:
     """Derivative of the torques where body ``b`` sits further ``along`` (m, parent's).
 
     It is that of a slide between the body and its parent.
@@ -201,7 +214,7 @@ def by_place(tree: Tree, at: Motion, of: Forces, b: int, along: Batch) -> Batch:
     return out
 
 
-def by_inertia(
+def _by_inertia(
     tree: Tree, at: Motion, b: int, change: Float[np.ndarray, "6 6"]
 ) -> Batch:
     """Derivative of the torques in an inertia of body ``b``, which they are linear in.
@@ -222,7 +235,7 @@ def by_inertia(
     return out
 
 
-def by_gravity(tree: Tree, at: Motion, of: Forces, change: Batch) -> Batch:
+def _by_gravity(tree: Tree, at: Motion, of: Forces, change: Vector) -> Batch:
     """Derivative of the torques in the vector of gravity."""
     out = np.zeros((len(at.S), at.S.shape[-1]))
     for j, b in enumerate(tree.body):
@@ -238,7 +251,7 @@ def _in_body(x: Batch, R: Batch, p: Batch) -> Batch:
     )
 
 
-def _turned(R: Batch, axis: Float[np.ndarray, " 3"], angle: Batch) -> Batch:
+def _turned(R: Batch, axis: Vector, angle: Batch) -> Batch:
     """``R`` times the rotation about its own axis (Rodrigues)."""
     x, y, z = axis
     K = np.asarray([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -263,7 +276,7 @@ def _in_world(inertia: Float[np.ndarray, "6 6"], R: Batch, p: Batch) -> Batch:
     return out
 
 
-def _vector(K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 3"]:
+def _vector(K: Float[np.ndarray, "3 3"]) -> Vector:
     return np.asarray([K[2, 1], K[0, 2], K[1, 0]])
 
 

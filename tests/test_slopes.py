@@ -1,0 +1,195 @@
+"""Derivatives of MuJoCo's steps against differences of steps, and against MuJoCo's."""
+
+import mujoco
+import numpy as np
+import pytest
+
+import six_axis
+from sim2gp import Parameter
+from sim2gp.systems import MuJoCo
+from sim2gp.systems.mujoco.engine import Engine
+from sim2gp.systems.plants.external import AbstractSimulator, Arguments
+
+FRICTION = "joint/*/frictionloss"
+OPEN = ["joint/*/damping", "joint/*/armature", "joint/*/stiffness", "body/*/mass",
+        "body/*/length", "actuator/*/kp", "actuator/*/kv", "actuator/*/gear",
+        "body/*/com_x", "option/gravity"]  # fmt: skip
+LINKS = 4
+
+
+SIDE = """<body name="side" pos=".1 .2 0"><inertial pos="0 .1 .05" mass=".7"
+diaginertia=".01 .02 .015"/><joint name="side" axis="1 1 0" damping=".1" armature=".01"
+stiffness=".5" frictionloss=".01"/><joint name="side2" axis="0 1 0" damping=".1"
+armature=".02" stiffness=".3" frictionloss=".02"/></body>"""
+
+
+def tree(integrator: str, friction: bool = True, more: str = "") -> str:
+    """Links at odd angles, a slide and a branch among them; servos that saturate."""
+    rng = np.random.default_rng(3)
+
+    def row(*x: float) -> str:
+        return " ".join(f"{v:.4f}" for v in x)
+
+    def link(k: int) -> str:
+        if k == LINKS:
+            return ""
+        kind = "slide" if k == 1 else "hinge"
+        dry = f'frictionloss="{0.3 * rng.uniform():.3f}"' if friction else ""
+        side = SIDE if k == 1 else ""  # a branch
+        return (
+            f'<body name="link{k}" pos="{row(*rng.normal(0, 0.2, 3))}" '
+            f'quat="{row(*rng.normal(size=4))}">'
+            f'<inertial pos="{row(*rng.normal(0, 0.1, 3))}" '
+            f'quat="{row(*rng.normal(size=4))}" mass="{1 + rng.uniform():.3f}" '
+            f'diaginertia=".02 .03 .025"/>'
+            f'<joint name="j{k}" type="{kind}" axis="{row(*rng.normal(size=3))}" '
+            f'pos="{row(*rng.normal(0, 0.1, 3))}" damping="{0.5 * rng.uniform():.3f}" '
+            f'armature=".05" stiffness="1" springref=".2" {dry}/>{link(k + 1)}{side}'
+            "</body>"
+        )
+
+    servos = "".join(
+        f'<position joint="j{k}" kp="20" kv="3" gear="{1 + 0.3 * k}" '
+        'forcerange="-8 8"/>'
+        for k in range(LINKS)
+    )
+    return (
+        f'<mujoco><option integrator="{integrator}" timestep=".004" {more}/>'
+        f"<worldbody>{link(0)}</worldbody><actuator>{servos}</actuator></mujoco>"
+    )
+
+
+def opened(text: str, constants: list[str]) -> tuple[Engine, np.ndarray]:
+    """A model's engine, and the values of its open constants."""
+    model = mujoco.MjModel.from_xml_string(text)
+    centred = Parameter("", "", "", "identity", mean=0.0, sd=0.1)
+    bodies = [model.body(b).name for b in range(1, model.nbody)]
+    named = "body/*/com_x" in constants
+    priors = {f"body/{name}/com_x": centred for name in bodies if named}
+    engine = MuJoCo(model, constants, priors).engine
+    return engine, np.asarray([g[0].get(model) for g in engine.constants])
+
+
+def points(engine: Engine, theta: np.ndarray, count: int) -> tuple[np.ndarray, ...]:
+    rng, n, m = np.random.default_rng(0), engine.model.nv, engine.model.nu
+    q = rng.normal(size=(count, n))
+    # Half of them creep: dry friction holds there.
+    v = rng.normal(size=(count, n)) * np.where(np.arange(count) % 2, 1.0, 0.01)[:, None]
+    u = rng.normal(size=(count, m))
+    h = np.full(count, engine.model.opt.timestep)
+    return np.tile(theta, (count, 1)), np.concatenate([q, v], axis=1), u, h
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+@pytest.mark.parametrize("friction", [True, False])
+def test_a_step_is_differentiated_as_its_differences_are(integrator, friction):
+    constants = OPEN + [FRICTION] * friction
+    engine, theta = opened(tree(integrator, friction), constants)
+    x = points(engine, theta, 40)
+    out, expected = AbstractSimulator.slopes(engine, *x)
+    # Nothing is left to differences.
+    engine.flow = None
+    J = engine.jacobian(*x, out)
+    size = np.abs(expected).max(axis=(0, 1))
+    assert np.sum(size > 0.0) >= size.size - 1  # where the tree stands moves nothing
+    assert np.all(np.abs(J - expected).max(axis=(0, 1)) <= 1e-6 * size + 1e-10)
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+def test_a_step_is_differentiated_as_mujoco_does(integrator):
+    engine, theta = opened(tree(integrator), ["body/*/mass"])
+    theta_, s, u, h = points(engine, theta, 6)
+    out = engine.flow(theta_, s, u, h)
+    J = engine.jacobian(theta_, s, u, h, out)
+    data = mujoco.MjData(engine.model)
+    n, m, p = s.shape[1], u.shape[1], theta.size
+    for k in range(len(s)):
+        data.qpos[:], data.qvel[:] = np.split(s[k], 2)
+        data.ctrl[:] = u[k]
+        A, B = np.zeros((n, n)), np.zeros((n, m))
+        mujoco.mjd_transitionFD(engine.model, data, 1e-6, True, A, B, None, None)
+        assert np.allclose(J[k, :, p : p + n], A, atol=1e-5 * np.abs(A).max())
+        assert np.allclose(J[k, :, p + n :], B, atol=1e-5 * np.abs(B).max())
+
+
+@pytest.mark.parametrize(
+    "more", ['density="900" viscosity=".5"', 'integrator="RK4"', 'wind="9 0 0"']
+)
+def test_what_the_closed_form_does_not_know_is_seen_in_the_step(more):
+    """A fluid's drag: no attribute is asked for, the step itself tells."""
+    text = tree("Euler", more='density="900"' if "wind" in more else "")
+    if "RK4" in more:
+        text = tree("RK4")
+    elif "wind" in more or "density" in more:
+        text = tree("Euler", more=more + (' density="900"' if "wind" in more else ""))
+    engine, theta = opened(text, ["joint/*/damping"])
+    x = points(engine, theta, 6)
+    out, expected = AbstractSimulator.slopes(engine, *x)
+    assert np.allclose(engine.jacobian(*x, out), expected, rtol=1e-9, atol=1e-12)
+
+
+CONTACT = """<mujoco><option timestep=".002"/><worldbody>
+<geom type="plane" size="1 1 .1"/><body pos="0 0 .31"><joint name="lift" type="slide"
+axis="0 0 1" damping="1"/><joint name="turn" axis="0 1 0" damping=".1"/>
+<geom name="foot" type="sphere" size=".1" pos=".1 0 -.2" mass="1"/></body></worldbody>
+<actuator><motor joint="turn"/></actuator></mujoco>"""
+
+
+def test_contacts_and_limits_are_left_to_differences():
+    engine, theta = opened(CONTACT, ["joint/*/damping"])
+    s = np.asarray([[-0.012, 0.0, -0.1, 0.2], [0.5, 0.0, -0.1, 0.2]])
+    x = np.tile(theta, (2, 1)), s, np.asarray([[0.3], [0.3]]), np.full(2, 0.002)
+    out, expected = AbstractSimulator.slopes(engine, *x)
+    free = np.abs(s[0, 2] - 9.81 * 0.002 - out[0, 2])
+    assert free > 1e-3  # it touches
+    J = engine.jacobian(*x, out)
+    assert np.allclose(J, expected, rtol=1e-6, atol=1e-8)
+    data = mujoco.MjData(engine.model)
+    data.qpos[:], data.qvel[:] = np.split(s[0], 2)
+    data.ctrl[:] = 0.3
+    A, B = np.zeros((4, 4)), np.zeros((4, 1))
+    mujoco.mjd_transitionFD(engine.model, data, 1e-6, True, A, B, None, None)
+    assert np.allclose(J[0, :, 2:6], A, atol=1e-4)
+
+
+@pytest.mark.parametrize("text", [tree("implicitfast"), six_axis.model_text()])
+def test_whole_windows_are_one_linear_recursion(text):
+    constants = ["joint/*/damping", "joint/*/armature", "body/*/mass", FRICTION]
+    engine, theta = opened(text, constants)
+    rng, (W, L), n = np.random.default_rng(1), (2, 30), engine.model.nv
+    x0 = np.concatenate([0.3 * rng.normal(size=(W, n)), np.zeros((W, n))], axis=1)
+    m = engine.model.nu
+    u = x0[:, None, :m] + 0.02 * np.cumsum(rng.normal(size=(W, L, m)), axis=1)
+    span = np.full((W, L), 0.01)  # two or three steps of the model each
+    span[:, 0] = span[1, -4:] = 0.0
+    p, k = theta.size, theta.size + 2 * n + engine.model.nu
+    of_theta = np.zeros((W, p, k))
+    of_theta[:, range(p), range(p)] = engine.differences.scale
+    of_x0, of_u = np.zeros((W, 2 * n, k)), np.zeros((W, L, engine.model.nu, k))
+    of_x0[:, range(2 * n), range(p, p + 2 * n)] = 1.0
+    of_u[:, :, range(m), range(p + 2 * n, k)] = 1.0
+    at = Arguments(np.tile(theta, (W, 1)), x0, u, span)
+    states, S = engine.linearised_rollout(at, Arguments(of_theta, of_x0, of_u, span))
+    one_by_one = AbstractSimulator.rollout(engine, *at)
+    assert np.allclose(states, one_by_one, atol=1e-8)
+    for i in range(k):
+        d = 2e-5 if i < p else 1e-6
+        ends = [
+            engine.rollout(
+                at.theta + d * sign * of_theta[..., i],
+                x0 + d * sign * of_x0[..., i],
+                u + d * sign * of_u[..., i],
+                span,
+            )
+            for sign in (1.0, -1.0)
+        ]
+        expected = (ends[0] - ends[1]) / (2.0 * d)
+        assert np.abs(S[..., i] - expected).max() <= 1e-6 * np.abs(expected).max()
+
+
+def test_a_state_that_runs_away_is_no_number():
+    engine, theta = opened(tree("Euler"), ["joint/*/damping"])
+    x0, u = np.zeros((1, 2 * engine.model.nv)), np.zeros((1, 5, LINKS))
+    x0[0, engine.model.nv] = 1e12
+    out = engine.rollout(theta[None], x0, u, np.full((1, 5), 0.004))
+    assert np.isnan(out[0, -1]).all()
