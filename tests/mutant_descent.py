@@ -106,15 +106,15 @@ DESCENTS = (
     Mutant(
         "arrived by the gradient alone",
         ESTIMATE,
-        " | (step_sd <= GRADIENT_TOLERANCE)",
+        " | (step_sd <= NEAR)",
         "",
         ("test_sim2gp.py", "without_noise"),
     ),
     Mutant(
         "first start not descended",
         DESCENDS,
-        "jnp.where(first, damping, jnp.where(keep, lowered, raised))",
-        "jnp.where(keep, lowered, raised)",
+        "jnp.where(first, damping, next_damping)",
+        "next_damping",
         ("test_laplace.py", "every"),
     ),
     Mutant(

@@ -78,10 +78,10 @@ FIRST_DRAFT = (
         ("test_draft.py", "coarse"),
     ),
     Mutant(
-        "a small step makes a MAP of a cusp",
-        "inference/estimate.py",
-        "(gradient <= flat) & (step_sd <= short)",
-        "step_sd <= short",
-        ("test_laplace.py", "stalled"),
+        "whatever stalls is near its MAP",
+        "inference/convergence.py",
+        "NEAR = 0.03",
+        "NEAR = 30.0",
+        ("test_laplace.py", "no_arrival"),
     ),
 )

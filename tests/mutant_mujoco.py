@@ -22,13 +22,6 @@ ON_THE_HOST = (
         ("test_forecast.py", "stepped_as_in_a_fit"),
     ),
     Mutant(
-        "the host is asked for one column after the other",
-        "data/windows_likelihood.py",
-        "at_once=on_host(likelihood.system)",
-        "at_once=False",
-        ("test_black_box.py", "asked_for_once"),
-    ),
-    Mutant(
         "each rounding of a span has a rollout",
         "systems/mujoco/engine.py",
         "h = np.round(h, 12)",
@@ -87,15 +80,15 @@ ON_THE_HOST = (
     Mutant(
         "mujoco: what stopped early counts",
         ENGINE,
-        "np.where(stopped[:, None], np.nan, state)",
-        "np.where(stopped[:, None], state, state)",
+        "np.where(going[..., None], out[..., 1:], np.nan)",
+        "out[..., 1:]",
         ("test_mujoco_system.py", "ran_away"),
     ),
     Mutant(
         "mujoco: every substep is the file's",
         ENGINE,
-        "model.opt.timestep = span / count",
-        "pass",
+        "model.opt.timestep = h\n        start",
+        "pass\n        start",
         ("test_mujoco_system.py", "uneven"),
     ),
     Mutant(

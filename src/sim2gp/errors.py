@@ -52,7 +52,9 @@ class InputError(Sim2GPError):
 
 
 class NotConverged(Sim2GPError):
-    """E201: the MAP was not reached, so no posterior is formed around it."""
+    """E201: the MAP was not reached; ``known`` is the posterior where a fit stood."""
+
+    known: object = None
 
 
 class DeadParameters(Sim2GPError):

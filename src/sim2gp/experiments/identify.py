@@ -18,6 +18,7 @@ from sim2gp.data.logs import Log, note_lines
 from sim2gp.data.windows import Windows
 from sim2gp.data.windows_likelihood import WindowsLikelihood, information_at
 from sim2gp.experiments.configurations import told
+from sim2gp.experiments.first_answer import FirstAnswer
 from sim2gp.experiments.identified import PROJECT, physical
 from sim2gp.experiments.longer import advice
 from sim2gp.experiments.motion import film
@@ -51,6 +52,8 @@ from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.parameters import Parameters
 from sim2gp.project import Project
 from sim2gp.runs import Progress, new_run
+from sim2gp.runs.store import Writer
+from sim2gp.systems.base import AbstractSystem
 
 #: Forecasts to draw: of whom, and what and where they are.
 Drawn = tuple[Gaussian, Picture, Grid]
@@ -85,9 +88,13 @@ def run(
         task.advance(f"{len(windows)} windows")
         key, robust = jax.random.key(seed), project.spec.likelihood.robust
         grid = evaluation_windows(logs, project.system, longest=CURVE[-1])
-        compile_forecast(project.system, grid)
-        compile_corrected(project.system, windows)
-        fitted = fit_windows(project.system, windows, key=key, robust=robust)
+        _compile(project.system, grid, windows)
+        progress.say(_sizes(project, windows))
+        first = FirstAnswer(project, logs, out, task)
+        with first.of_failures():
+            fitted = fit_windows(
+                project.system, windows, key=key, robust=robust, report=first
+            )
         task.advance("posterior")
         band, own = _own_forecasts(project, fitted.posterior, grid, logs)
         known = fitted.with_measurements(project.system.parameters)
@@ -109,14 +116,40 @@ def run(
         alarm = summary["misfit"]["alarm"]
         summary |= advice(project, logs, honest, alarm=alarm, key=key, asked=longer)
         summary |= provenance(line, started) | {"project": _place(project, out)}
-        from sim2gp.report import write_report
-
-        writer.write_summary(summary)
-        writer.write_arrays("arrays.npz", arrays)
-        writer.write_text(PROJECT, project.source.text)
-        writer.write_text("report.html", write_report(summary, arrays))
+        _write(writer, project, summary, arrays)
         task.advance("report")
+    first.replaced()
     return summary
+
+
+def _sizes(project: Project, windows: Windows) -> str:
+    """What a fit is about, before it begins."""
+    parameters, columns = len(project.system.parameters), len(windows.outputs)
+    seconds = float(np.asarray(windows.span).sum(axis=1).max())
+    return (
+        f"{parameters} parameters, {len(windows)} windows of {seconds:.3g} s, "
+        f"{columns} measured columns"
+    )
+
+
+def _compile(system: AbstractSystem, grid: Grid, windows: Windows) -> None:
+    """Begin to compile what follows the fit."""
+    compile_forecast(system, grid)
+    compile_corrected(system, windows)
+
+
+def _write(
+    writer: Writer,
+    project: Project,
+    summary: dict[str, Any],
+    arrays: dict[str, np.ndarray],
+) -> None:
+    from sim2gp.report import write_report
+
+    writer.write_summary(summary)
+    writer.write_arrays("arrays.npz", arrays)
+    writer.write_text(PROJECT, project.source.text)
+    writer.write_text("report.html", write_report(summary, arrays))
 
 
 def _command(project: Project, out: Path, seed: int, asked: dict[str, bool]) -> str:
@@ -242,6 +275,7 @@ def _summarise(
         "headline": headline(found["parameters"]),
         "seed": seed,
         "converged": True,
+        "convergence": fitted.convergence.as_dict(),
         "noise": noise,
         "intervals": about,
         "misfit": {

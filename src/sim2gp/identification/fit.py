@@ -1,13 +1,18 @@
 """The posterior of a machine's parameters, from windows of its logs."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Int
 
 from sim2gp import checks
 from sim2gp.data.windows import Windows
 from sim2gp.data.windows_likelihood import WindowsLikelihood
-from sim2gp.inference.estimate import Estimate, drawn_starts, estimate
+from sim2gp.errors import NotConverged
+from sim2gp.inference.arrowhead import Noise
+from sim2gp.inference.estimate import Estimate, Report, drawn_starts, estimate
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.prior import ParameterPrior
 from sim2gp.systems.base import AbstractSystem
@@ -15,6 +20,8 @@ from sim2gp.types import Key, in_float64
 
 NOISE_ROUNDS = 8  # fewer leave noise and starts of real logs short of a fixed point
 WARM_ROUNDS = 3  # of a fit that begins with the noise of another one
+#: Share of the windows that a fit on the host begins with, and how few they may be.
+SHARE, LEAST = 0.2, 4
 FREEDOM = 4.0  # degrees of freedom of the Student-t weight
 
 
@@ -28,13 +35,16 @@ def fit_windows(
     robust: bool = False,
     starts: int = 2,
     warm_start: Estimate | None = None,
+    report: Report | None = None,
 ) -> Estimate:
     """Posterior of the parameters given windows of logs.
 
     Noise by EM, one Student-t weight per window where ``robust``. A ``prior`` is what
     is believed but for measured sums. The descent begins at the prior's mean and
     elsewhere, or at the ``warm_start``, another fit of windows like these: that is
-    quick, and with as many ``starts`` compiles nothing. Raises `NotConverged`,
+    quick, and with as many ``starts`` compiles nothing. Where a simulator on the host
+    moves the machine, ``report`` is told of each step, and starts are compared on some
+    of the windows. Raises `NotConverged`,
     `NotFinite` or `DeadParameters`, and `InputError` E148 for no starts, E140 for a
     prior of another number of parameters.
     """
@@ -55,15 +65,29 @@ def fit_windows(
     # By way of NumPy: JAX compiles again for numbers whose type it calls weak.
     begin = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)), begin)
     first, e, noise, needed, freedom = begin
-    found = estimate(
-        likelihood,
-        ParameterPrior(prior, system.parameters),
-        starts=first,
-        nuisances=e,
-        noise=noise,
-        rounds=NOISE_ROUNDS,
-        freedom=freedom,
-        needed=needed,
-    )
-    found.convergence.check(system.parameters.names, f"{len(windows)} windows")
+    about = ParameterPrior(prior, system.parameters)
+    same: dict[str, Any] = {"freedom": freedom, "needed": needed, "report": report}
+    same["rounds"] = NOISE_ROUNDS
+    some = _some(likelihood) if warm_start is None else None
+    if some is not None:
+        part = likelihood.some(some)
+        found = estimate(part, about, starts=first, **same)
+        first, e = found.z()[None], e.at[some].set(found.nuisances)
+        noise = Noise(found.noise.sd, jnp.ones(len(windows)))
+    from_here = {"starts": first, "nuisances": e, "noise": noise}
+    found = estimate(likelihood, about, **from_here, **same)
+    try:
+        found.convergence.check(system.parameters.names, f"{len(windows)} windows")
+    except NotConverged as error:
+        error.known = found
+        raise
     return found
+
+
+def _some(likelihood: WindowsLikelihood) -> Int[np.ndarray, " w"] | None:
+    """Windows that a fit on the host begins with, spread over all; None for all."""
+    W = len(likelihood.counts)
+    count = max(LEAST, round(SHARE * W))
+    if not likelihood.on_host or 2 * count > W:
+        return None
+    return np.linspace(0, W - 1, count).round().astype(int)

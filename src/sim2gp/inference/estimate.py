@@ -16,16 +16,26 @@ parameter expansion, Liu, Rubin and Wu 1998, Biometrika 85.
 """
 
 import dataclasses
+from collections.abc import Callable
+from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from sim2gp.errors import DeadParameters, NotConverged, NotFinite
 from sim2gp.inference.arrowhead import Elimination, Noise, eliminate
+from sim2gp.inference.convergence import (
+    CONVERGED,
+    DEAD,
+    NEAR,
+    NOT_FINITE,
+    STALLED,
+    Convergence,
+    converged,
+)
 from sim2gp.inference.gaussian import LOG_2PI, Gaussian
-from sim2gp.inference.host_descent import NEAR, Report, best_start, descend
+from sim2gp.inference.host_descent import Progress, best_start, descend
 from sim2gp.inference.least_squares import (
     Factor,
     gauss_newton_step,
@@ -45,8 +55,11 @@ from sim2gp.inference.parameters import Parameters
 from sim2gp.inference.prior import AbstractPrior, ParameterPrior
 from sim2gp.types import Key, Scalar, in_float64
 
-CONVERGED, STALLED, NOT_FINITE, DEAD = 0, 1, 2, 3
 SPREAD = 0.7  # prior sd, of starts that are drawn
+
+
+#: Told of each step that a fit on the host keeps, and how to have its posterior.
+Report = Callable[[Progress, Callable[[], "Estimate"]], None]
 
 
 class Laplace(eqx.Module):
@@ -96,7 +109,7 @@ class Laplace(eqx.Module):
 
     def convergence(
         self, steps: Int[Array, ""], away: float | Scalar = jnp.inf
-    ) -> "Convergence":
+    ) -> Convergence:
         """Whether a descent of so many steps has ended at a MAP, or near enough."""
         gradient = self.at.gradient
         step_sd = jnp.minimum(self.newton_step_sd(), away)
@@ -107,53 +120,15 @@ class Laplace(eqx.Module):
         status = jnp.where(dead, DEAD, status)
         finite = jnp.isfinite(self.at.cost) & jnp.all(jnp.isfinite(self.full))
         status = jnp.where(finite, status, NOT_FINITE)
-        return Convergence(status, gradient, step_sd, steps)
+        dz = gauss_newton_step(self.full)
+        away_each = jnp.abs(dz) / jnp.linalg.norm(self.scale(), axis=1)
+        return Convergence(status, gradient, step_sd, steps, away_each)
 
 
 def laplace(at: Point, noise: Noise) -> Laplace:
     """The Gaussian about a point, given the noise."""
     arrow = eliminate(at.blocks, at.e, noise)
     return Laplace(at, arrow, stack(arrow.data, at.prior))
-
-
-class Convergence(eqx.Module):
-    """How a descent ended; ``newton_step_sd`` is the undamped step that remains."""
-
-    status: Int[Array, ""]
-    gradient: Scalar  # ``||g||_inf / (1 + cost)``
-    newton_step_sd: Scalar  # its largest entry, in posterior sd
-    steps: Int[Array, ""]
-
-    def check(self, names: tuple[str, ...], where: str) -> None:
-        """Raise a typed error on the host, naming what to look at."""
-        status = int(self.status)
-        if status == NOT_FINITE:
-            raise NotFinite(
-                "E203",
-                "the simulation is not finite at any start of the fit",
-                where=where,
-                fix="narrow the priors, or shorten the step",
-            )
-        if status == DEAD:
-            raise DeadParameters(
-                "E146",
-                "no parameter reaches the data",
-                where=where,
-                got=f"zero sensitivity to {', '.join(names)}",
-                expected="data that depend on one of them at least",
-                fix="check the columns, the excitation and what is fixed",
-            )
-        if status == STALLED:
-            step = f"{float(self.newton_step_sd):.1e} posterior sd"
-            raise NotConverged(
-                "E201",
-                "the MAP did not converge",
-                where=where,
-                got=f"scaled gradient {float(self.gradient):.1e} "
-                f"({step}) after {int(self.steps)} steps",
-                expected=f"at most {GRADIENT_TOLERANCE:.0e}",
-                fix="check units and bounds, or add starts",
-            )
 
 
 class Estimate(eqx.Module):
@@ -252,11 +227,15 @@ def _estimate_on_host(
 
     best = best_start(likelihood, prior, starts, e, noise, _newton_step_sd)
     begin = (best.at.z, best.at.e), noise, _newton_step_sd, update
+
+    def about(found: Progress) -> Estimate:
+        counted = jnp.asarray(found.steps), jnp.asarray(found.away)
+        return _about(found.at, found.noise, prior.gaussian, counts, *counted)
+
     for found in descend(likelihood, prior, *begin, damping=best.damping):
         if report is not None:
-            report(found)
-    counted = jnp.asarray(found.steps), jnp.asarray(found.away)
-    return _about(found.at, found.noise, prior.gaussian, counts, *counted)
+            report(found, partial(about, found))
+    return about(found)
 
 
 @eqx.filter_jit
@@ -344,7 +323,7 @@ def estimate_noise(likelihood: AbstractLikelihood, prior: AbstractPrior) -> Esti
     squares, spread = found.squares()
     counts, floor = likelihood.counts, likelihood.floor
     noise = expected_noise(unit, squares, spread, counts, floor)
-    misfit, zero = jnp.sum(squares / noise.sd[None] ** 2), jnp.zeros(())
+    misfit = jnp.sum(squares / noise.sd[None] ** 2)
     return Estimate(
         prior.gaussian,
         prior.gaussian,
@@ -353,7 +332,7 @@ def estimate_noise(likelihood: AbstractLikelihood, prior: AbstractPrior) -> Esti
         jnp.zeros((p, p)),
         jnp.zeros((W, p)),
         -0.5 * misfit + log_normaliser(noise, counts),
-        Convergence(jnp.asarray(CONVERGED), zero, zero, jnp.zeros((), int)),
+        converged(p),
     )
 
 

@@ -14,9 +14,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from sim2gp.inference.arrowhead import Blocks, Noise, eliminate
+from sim2gp.inference.convergence import NEAR
 from sim2gp.inference.least_squares import stack
 from sim2gp.inference.levenberg_marquardt import (
     FIRST_DAMPING,
@@ -34,8 +35,8 @@ from sim2gp.types import Scalar
 #: rests. A start is compared with others already where its step is a rough one.
 SMALL, ROUGH = 1e-2, 0.3
 STILL = 1e-3
-#: A step so short (posterior sd) that gains no more (nats) is the last.
-NEAR, NOTHING = 0.03, 1e-3
+#: A step shorter than `NEAR` that gains no more (nats) is the last.
+NOTHING = 1e-3
 #: Steps that a descent may take; a start among others, fewer.
 MOST_STEPS, FIRST_STEPS = 100, 30
 NOISE_TURNS = 10  # of EM at one point
@@ -59,10 +60,6 @@ class Progress(NamedTuple):
     step_sd: float
     damping: float
     away: float
-
-
-#: Told of each step that is kept.
-Report = Callable[[Progress], None]
 
 
 def descend(
@@ -189,12 +186,3 @@ def _largest(x: Array) -> Scalar:
 
 
 _judged = jax.jit(judged)
-
-
-def some_windows(
-    likelihood: AbstractLikelihood, share: float, least: int
-) -> Int[np.ndarray, " w"] | None:
-    """Windows to begin with, spread over all; None where these are as good as all."""
-    W = len(likelihood.counts)
-    count = max(least, round(share * W))
-    return None if 2 * count > W else np.linspace(0, W - 1, count).round().astype(int)

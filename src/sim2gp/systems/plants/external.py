@@ -191,7 +191,8 @@ class AbstractSimulator(abc.ABC):
         """The Jacobian of each of some rows."""
         s, a, h, end = (x[:, rows] for x in (before, u, span, after))
         each = np.repeat(theta[:, None], s.shape[1], axis=1)
-        flat = [x.reshape(-1, x.shape[-1]) for x in (each, s, a, end)]
+        B = s.shape[0] * s.shape[1]
+        flat = [x.reshape(B, x.shape[-1]) for x in (each, s, a, end)]
         J = self.jacobian(flat[0], flat[1], flat[2], h.reshape(-1), flat[3])
         return J.reshape(*s.shape, -1)
 

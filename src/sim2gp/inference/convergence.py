@@ -1,0 +1,77 @@
+"""How a descent ended: at a MAP, near enough to one, or not."""
+
+import math
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from sim2gp.errors import DeadParameters, NotConverged, NotFinite
+from sim2gp.types import Scalar
+
+CONVERGED, STALLED, NOT_FINITE, DEAD = 0, 1, 2, 3
+#: A MAP that is no farther than this, in posterior sd, is an answer.
+NEAR = 0.03
+
+
+class Convergence(eqx.Module):
+    """How a descent ended; ``newton_step_sd`` is the undamped step that remains."""
+
+    status: Int[Array, ""]
+    gradient: Scalar  # ``||g||_inf / (1 + cost)``
+    newton_step_sd: Scalar  # its largest entry, in posterior sd
+    steps: Int[Array, ""]
+    away: Float[Array, " p"]  # that step, of each parameter in its posterior sd
+
+    def as_dict(self) -> dict[str, float | int]:
+        """For summary.json: steps, and how far the MAP may be in posterior sd."""
+        step_sd, gradient = float(self.newton_step_sd), float(self.gradient)
+        finite = {"newton_step_sd": step_sd, "gradient": gradient}
+        known = {name: x for name, x in finite.items() if math.isfinite(x)}
+        return {"steps": int(self.steps), **known}
+
+    def check(self, names: tuple[str, ...], where: str) -> None:
+        """Raise a typed error on the host, naming what to look at."""
+        status = int(self.status)
+        if status == NOT_FINITE:
+            raise NotFinite(
+                "E203",
+                "the simulation is not finite at any start of the fit",
+                where=where,
+                fix="narrow the priors, or shorten the step",
+            )
+        if status == DEAD:
+            raise DeadParameters(
+                "E146",
+                "no parameter reaches the data",
+                where=where,
+                got=f"zero sensitivity to {', '.join(names)}",
+                expected="data that depend on one of them at least",
+                fix="check the columns, the excitation and what is fixed",
+            )
+        if status == STALLED:
+            step = f"{float(self.newton_step_sd):.1e} posterior sd"
+            raise NotConverged(
+                "E201",
+                "the MAP did not converge",
+                where=where,
+                got=f"scaled gradient {float(self.gradient):.1e} "
+                f"({step}) after {int(self.steps)} steps; farthest off: "
+                f"{self._farthest(names)}",
+                expected=f"at most {NEAR:g} posterior sd",
+                fix="hold these, or check units, bounds and columns",
+            )
+
+    def _farthest(self, names: tuple[str, ...]) -> str:
+        """The three parameters that the last step would move most."""
+        away = np.asarray(self.away)
+        away = np.where(np.isfinite(away), away, np.inf)
+        order = np.argsort(-away)[:3]
+        return ", ".join(f"{names[i]} ({away[i]:.2g} sd)" for i in order)
+
+
+def converged(p: int) -> Convergence:
+    """Of ``p`` parameters that needed no descent."""
+    zero, none = jnp.zeros(()), jnp.zeros((), int)
+    return Convergence(jnp.asarray(CONVERGED), zero, zero, none, jnp.zeros(p))
