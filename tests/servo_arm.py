@@ -20,7 +20,7 @@ LINKS = (
 def arm_xml(links: slice = slice(None), *, limited: bool = True) -> str:
     """An MJCF of some of the links, one after the other, each with a servo."""
     bodies, servos, place = "", "", "0 0 0.1"
-    some = list(enumerate(LINKS, 1))[links]
+    some = list(enumerate(LINKS[links], 1))
     for k, (mass, length, damping, armature, dry, kp, kv, force, axis) in some:
         reach = 'range="-2.8 2.8" limited="true"' if limited else 'limited="false"'
         bodies += (
@@ -36,7 +36,8 @@ def arm_xml(links: slice = slice(None), *, limited: bool = True) -> str:
         )
         place = f"{length} 0 .02"
     return (
-        '<mujoco><compiler angle="radian"/><option timestep="0.002" integrator="implicitfast"/><worldbody>'
+        '<mujoco><compiler angle="radian"/>'
+        '<option timestep="0.002" integrator="implicitfast"/><worldbody>'
         f"{bodies}{'</body>' * len(some)}</worldbody>"
         f"<actuator>{servos}</actuator></mujoco>"
     )

@@ -16,7 +16,6 @@ import numpy as np
 from sim2gp.data.logs import Budget, Column, Log, read_log
 from sim2gp.data.logs.formats import recordings
 from sim2gp.data.logs.units import UNITS
-from sim2gp.errors import InputError
 from sim2gp.project.columns import Match, match, time_column
 from sim2gp.project.draft_text import Contents, draft_text, open_parameters
 from sim2gp.project.project import (
@@ -25,13 +24,21 @@ from sim2gp.project.project import (
     system_class,
     unknown_system,
 )
-from sim2gp.project.readings import SURE, Found, Question, Reading, find_readings
+from sim2gp.project.readings import (
+    SURE,
+    Found,
+    Question,
+    Reading,
+    find_readings,
+    finer,
+)
 from sim2gp.project.replace import replace_project
 from sim2gp.systems import MuJoCo
 from sim2gp.systems.base import AbstractSystem, Channel
 from sim2gp.systems.effects.units import joints_of
 
 LARGE = 3.2  # rad or m of travel that may be degrees or millimetres
+TURNS = 25.0  # rad or m: more is rather degrees or millimetres
 FAR = 10.0  # times the range of a joint: no log in the right unit travels so far
 SHARE = 0.8  # of the time, after which no further reading is begun
 _SMALLER = {"rad": "deg", "m": "mm"}
@@ -182,11 +189,13 @@ def _options(
 
 
 def _units(channel: Channel, travel: float) -> list[str | None]:
-    """The units that a column may be in, by how far it travels; the last is the finer."""
+    """The units that a column may be in, by its travel, the likely one first."""
     smaller, reach = _SMALLER.get(channel.unit), FAR * (channel.high - channel.low)
     if smaller is None or travel <= min(LARGE, reach):
         return [None]
-    return [None, smaller] if travel <= reach else [smaller]
+    if travel > reach:
+        return [smaller]
+    return [smaller, None] if travel > TURNS else [None, smaller]
 
 
 def _together(
@@ -207,7 +216,7 @@ def _in_unit(
     joint = name.removesuffix(".velocity")
     if joint not in options:
         return column
-    return Reading(unit=options[joint][-1].unit).of(column, rate=name != joint)
+    return Reading(unit=finer(options[joint])).of(column, rate=name != joint)
 
 
 def _logs(
@@ -254,7 +263,9 @@ def _as_read(
     if surer > SURE:
         why = "the model predicts the log best so"
     else:
-        why = "the logs hardly tell: look"
+        rival = readings.rivals[name].items()
+        other = [f"{n} {_words(r)}" for n, r in rival if r != readings.readings[n]]
+        why = f"look: the log hardly tells this from {' and '.join(other)}"
     return Match(column, f"{found.why}; {words} ({why})")
 
 

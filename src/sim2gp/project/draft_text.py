@@ -1,4 +1,4 @@
-"""The words of a first project file: what was found, guess by guess, with its reason."""
+"""The words of a first project file: what was found, and the reason of each guess."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -148,8 +148,8 @@ def _window(longest: float) -> list[str]:
     """A servo hides masses and friction for some tenths of a second."""
     window = min(WINDOW, int(1e3 * longest) / 1e3)
     return [
-        "# Servos hide masses and friction in short windows: of a six-axis arm, windows",
-        "# of .2, .5, 1, 2.5 and 5 s left median errors of .14, .089, .023, .027, .029.",
+        "# Servos hide masses and friction in short windows: of a six-axis arm,",
+        "# .2, .5, 1, 2.5 and 5 s left median errors of .14, .089, .023, .027, .029.",
         "[likelihood]",
         f"window = {window!r}",
     ]

@@ -6,10 +6,11 @@ reading of a channel. A window's score is the mean over measured channels of
     1/2 log( error^2 / motion^2 )
 
 and one reading beats another where its score is lower in most windows (a sign test).
-All readings are tried where they are few. Otherwise each joint is tried with the inputs
-that act on it, twice around, while the other channels keep the best reading so far. The
-plainest reading stays unless another beats it; what the time did not suffice for, and
-what no window decides, is reported.
+All readings are tried where they are few. Otherwise each joint is tried
+with the inputs that act on it, twice around, while the other channels keep the best
+reading so far: first by its own prediction, then by those of all. The plainest reading
+stays unless another beats it; what the time did not suffice for, and what no window
+decides, is reported.
 """
 
 import itertools
@@ -18,6 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -25,9 +27,8 @@ from sim2gp.data.logs import Column, Log
 from sim2gp.data.logs.units import factor
 from sim2gp.data.split_log import cut
 from sim2gp.data.windows import Windows
+from sim2gp.systems import MuJoCo
 from sim2gp.systems.base import AbstractSystem
-from sim2gp.systems.machine import plant_of
-from sim2gp.systems.plants.external import on_host
 from sim2gp.types import in_float64
 
 SURE = 3.0  # (windows won - windows lost) / sqrt(windows): the sign test's z
@@ -69,14 +70,19 @@ Readings = dict[str, Reading]  # of joints and inputs, by channel
 class Question:
     """The logs of a machine, and how each of its channels may be read.
 
-    ``logs`` are read in the last unit of each channel's options. ``options`` lists the
-    readings of joints and inputs by name, the plainest first; ``together`` names the
-    channels that are tried in one go.
+    ``logs`` are read in the `finer` unit of each channel's options. ``options`` lists
+    the readings of joints and inputs by name, the plainest first; ``together`` names
+    the channels that are tried in one go.
     """
 
     logs: Sequence[Log]
     options: Mapping[str, Sequence[Reading]]
     together: Sequence[Sequence[str]]
+
+
+def finer(options: Sequence[Reading]) -> str | None:
+    """The unit in which no number of a channel is too large; None is its own."""
+    return next((reading.unit for reading in options if reading.unit), None)
 
 
 @dataclass
@@ -85,12 +91,14 @@ class Found:
 
     ``surer[name]``: the sign test's z against the best reading in which the channel
     differs, infinite where it has no other; a channel that was not tried has no entry.
+    ``rivals[name]``: that other reading, of all channels that were tried with it.
     ``images`` readings, this one among them, the machine cannot tell apart: a pendulum
     and its mirror image.
     """
 
     readings: Readings
     surer: dict[str, float] = field(default_factory=dict)
+    rivals: dict[str, Readings] = field(default_factory=dict)
     images: int = 1
 
 
@@ -106,11 +114,9 @@ def find_readings(system: AbstractSystem, asked: Question, *, until: float) -> F
     try:
         trial = _Trial(system, asked, until)
         for turn in range(1 if len(groups) == 1 else 2):
-            before, found.images = dict(found.readings), 1
+            found.images = 1
             for names in groups:
-                _settle(trial, asked, names, found)
-            if turn == 0 and found.readings == before:
-                break
+                _settle(trial, asked, names, found, alone=turn == 0 < len(groups) - 1)
     except TimeoutError:
         pass
     return found
@@ -126,37 +132,45 @@ def _groups(asked: Question) -> Sequence[Sequence[str]]:
 
 
 def _settle(
-    trial: "_Trial", asked: Question, names: Sequence[str], found: Found
+    trial: "_Trial",
+    asked: Question,
+    names: Sequence[str],
+    found: Found,
+    *,
+    alone: bool,
 ) -> None:
-    """Try all readings of some channels; the others keep theirs."""
+    """Try all readings of some channels; the others keep theirs.
+
+    ``alone``: by the predictions of these channels, while others may be misread.
+    """
     choices = itertools.product(*(asked.options[name] for name in names))
     tried = [dict(zip(names, choice, strict=True)) for choice in choices]
-    scores = trial.scores([found.readings | each for each in tried])
+    judged = names if alone else ()
+    scores = trial.scores([found.readings | each for each in tried], judged)
     plain = {name: asked.options[name][0] for name in names}
     mean = scores.mean(axis=1).round(6)
     best = int(np.argmin(mean))
     good = np.flatnonzero(_surer(scores, best) <= SURE)
-    chosen = min(good, key=lambda k: (_departs(tried[k], plain), mean[k]))
+    chosen = min(good.tolist(), key=lambda k: (_departs(tried[k], plain), mean[k]))
     same = np.abs(scores - scores[chosen]).max(axis=1) <= _SAME
     surer = _surer(scores, chosen)
     found.images *= int(same.sum())
     for name in names:
         others = [
-            surer[k]
+            (float(surer[k]), k)
             for k, each in enumerate(tried)
             if each[name] != tried[chosen][name] and not same[k]
         ]
-        found.surer[name] = float(min(others, default=np.inf))
+        found.surer[name], k = min(others, default=(np.inf, chosen))
+        found.rivals[name] = tried[k]
     found.readings |= tried[chosen]
 
 
-def _departs(readings: Readings, plain: Readings) -> int:
-    """How many of sign, zero and unit are not as they stand."""
-    pairs = [(r, plain[name]) for name, r in readings.items()]
-    return sum(
-        (r.sign != p.sign) + (r.offset != p.offset) + (r.unit != p.unit)
-        for r, p in pairs
-    )
+def _departs(readings: Readings, plain: Readings) -> tuple[int, int]:
+    """How many channels have another sign or zero than they stand in; another unit."""
+    pairs = [(reading, plain[name]) for name, reading in readings.items()]
+    moved = sum((r.sign, r.offset) != (p.sign, p.offset) for r, p in pairs)
+    return moved, sum(r.unit != p.unit for r, p in pairs)
 
 
 def _surer(scores: Scores, k: int) -> Float[np.ndarray, " K"]:
@@ -177,17 +191,27 @@ class _Trial:
         self.inputs = _inputs(self.windows)
         self.states = [c.name for c in system.physical_states]
         self.actions = [c.name for c in system.actions]
-        self.units = {c.name: c.unit for c in (*system.physical_states, *system.actions)}
-        self.base = {name: options[-1].unit for name, options in asked.options.items()}
+        self.units = {
+            c.name: c.unit for c in (*system.physical_states, *system.actions)
+        }
+        self.base = {name: finer(options) for name, options in asked.options.items()}
         self.step, self.until = _step_of(system), until
 
-    def scores(self, readings: Sequence[Readings]) -> Scores:
-        """Of each reading and window; `TimeoutError` where time is over."""
+    def scores(self, readings: Sequence[Readings], names: Sequence[str]) -> Scores:
+        """Of each reading and window, by some channels or, where none is measured, all.
+
+        Raises `TimeoutError` where time is over.
+        """
         many = max(1, ROWS // len(self.windows))
         parts = range(0, len(readings), many)
-        return np.concatenate([self._scores(readings[i : i + many]) for i in parts])
+        each = np.concatenate([self._shares(readings[i : i + many]) for i in parts])
+        seen = [self.states[i].removesuffix(".velocity") for i in self.windows.outputs]
+        own = [i for i, name in enumerate(seen) if name in names]
+        found: Scores = each[..., own or range(len(seen))].mean(axis=2)
+        return found
 
-    def _scores(self, readings: Sequence[Readings]) -> Scores:
+    def _shares(self, readings: Sequence[Readings]) -> Float[np.ndarray, "K W c"]:
+        """Log of error over motion, of each reading, window and channel."""
         w, K = self.windows, len(readings)
         seen = list(w.outputs)
         scale, zero = self._read(readings, self.states)
@@ -210,8 +234,7 @@ class _Trial:
         motion = _motion(w).mean(axis=0) * scale[:, None, seen] ** 2
         share = np.sqrt(error / np.maximum(motion, 1e-30))
         share = np.where(np.isfinite(share), np.clip(share, _FLOOR, _CAP), _CAP)
-        found: Scores = np.log(share).mean(axis=2)
-        return found
+        return np.asarray(np.log(share))
 
     def _read(
         self, readings: Sequence[Readings], names: Sequence[str]
@@ -238,11 +261,15 @@ def _beginning(logs: Sequence[Log]) -> list[Log]:
         if rows.stop < 2:
             break
         left -= float(log.time[rows][-1] - log.time[0])
-        parts = {
-            name: {key: x[rows] for key, x in getattr(log, name).items()}
-            for name in ("channels", "inputs", "mask")
-        }
-        some.append(replace(log, time=log.time[rows], **parts))
+        some.append(
+            replace(
+                log,
+                time=log.time[rows],
+                channels={name: x[rows] for name, x in log.channels.items()},
+                inputs={name: x[rows] for name, x in log.inputs.items()},
+                mask={name: x[rows] for name, x in log.mask.items()},
+            )
+        )
     return some
 
 
@@ -273,10 +300,9 @@ def _step_of(system: AbstractSystem) -> Callable[..., Float[np.ndarray, "B n"]]:
     MuJoCo's own engine where it is one: nothing is compiled then.
     """
     values = system.parameters.nominal()
-    if on_host(system):
-        plant: object = plant_of(system)
-        engine, names = plant.engine, plant.names  # type: ignore[attr-defined]
-        theta = np.asarray([values[name] for name in names], float)
+    if isinstance(system, MuJoCo):
+        engine = system.engine
+        theta = np.asarray([values[name] for name in system.names], float)
 
         def on_the_host(s: np.ndarray, u: np.ndarray, h: np.ndarray) -> np.ndarray:
             rows = np.broadcast_to(theta, (len(s), theta.size))
@@ -284,6 +310,6 @@ def _step_of(system: AbstractSystem) -> Callable[..., Float[np.ndarray, "B n"]]:
             return found
 
         return on_the_host
-    params = system.record(values)
+    params = system.record({name: jnp.asarray(x) for name, x in values.items()})
     step = jax.jit(jax.vmap(lambda s, u, h: system.flow(params, s, u, h)))
     return lambda s, u, h: np.asarray(step(s, u, h))

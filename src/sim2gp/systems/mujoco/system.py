@@ -119,9 +119,7 @@ class MuJoCo(AbstractPlant):
     def servos(self) -> tuple[str, ...]:
         """The inputs that are positions of joints, which a servo drives to."""
         model = self.engine.model
-        return tuple(
-            c.name for i, c in enumerate(self.inputs) if is_servo(model, i)
-        )
+        return tuple(c.name for i, c in enumerate(self.inputs) if is_servo(model, i))
 
     def by_path(self, values: Mapping[str, float]) -> dict[str, float]:
         """Values by name as those of every constant: what is tied has the same."""
