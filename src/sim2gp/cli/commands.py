@@ -68,6 +68,8 @@ class Init(Common):
     """What it may take; readings that were not tried by then are named in the file."""
     no_readings: bool = False
     """Take signs, zeros and units as they stand."""
+    seed: int = 0
+    """Draws the phases of the first experiment."""
 
     def run(self, progress: Progress) -> dict[str, Any]:
         out = self.out or Path(Path(self.model).stem + ".toml")
@@ -81,6 +83,7 @@ class Init(Common):
             constant=numbers("--constant", self.constant),
             readings=not self.no_readings,
             seconds=self.budget,
+            seed=self.seed,
             progress=progress,
         )
 

@@ -5,8 +5,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
+
+from sim2gp.cleanup import replace_file
+from sim2gp.experiments.first_experiment import PERIOD, Excitation, safe_excitation
 from sim2gp.project.draft import Request, draft_project, told
 from sim2gp.runs import Progress
+from sim2gp.runs.store import check_absent
+from sim2gp.systems.base import AbstractSystem
 
 
 def run(
@@ -19,9 +25,10 @@ def run(
     constant: Mapping[str, float],
     readings: bool,
     seconds: float,
+    seed: int,
     progress: Progress,
 ) -> dict[str, Any]:
-    """Write the project file; returns the summary.
+    """Write the project file, and without logs a first experiment; the summary.
 
     Raises `InputError` as `sim2gp.project.draft.draft_project` does.
     """
@@ -36,5 +43,35 @@ def run(
         seconds=seconds,
         started=time.monotonic(),
     )
-    progress.say("matching columns and trying how to read them")
-    return told(draft_project(asked), out)
+    if logs:
+        progress.say("matching columns and trying how to read them")
+        return told(draft_project(asked), out)
+    table = out.with_name(f"{out.stem}-experiment.csv")
+    check_absent(table)
+    draft = draft_project(asked)
+    summary = told(draft, out)
+    progress.say("simulating a first experiment")
+    until = asked.started + seconds
+    found = safe_excitation(draft.system, key=jax.random.key(seed), until=until)
+    summary["experiment"] = found.words
+    if found.commands is not None and found.states is not None:
+        replace_file(table, _csv(draft.system, found).encode(), lambda _: None)
+        summary["commands"] = str(table)
+    summary["headline"] = (
+        f"Wrote {out}, which says what a log needs; for an experiment that is chosen "
+        f"for what it tells: sim2gp design {out} (slow on a MuJoCo model)"
+    )
+    return summary
+
+
+def _csv(system: AbstractSystem, found: Excitation) -> str:
+    """A row for each period: time, commands, and the positions expected."""
+    names = [c.name for c in system.physical_states]
+    shown = [i for i, name in enumerate(names) if not name.endswith(".velocity")]
+    inputs = [c.name for c in system.actions]
+    text = [",".join(["time", *inputs, *(f"expected.{names[i]}" for i in shown)])]
+    assert found.commands is not None
+    assert found.states is not None
+    for k, (u, x) in enumerate(zip(found.commands, found.states, strict=True)):
+        text.append(",".join(f"{v:.9g}" for v in (PERIOD * k, *u, *x[shown])))
+    return "\n".join(text) + "\n"

@@ -122,16 +122,17 @@ def _wanted(system: AbstractSystem) -> list[str]:
     """Without a log: the columns that one needs, and how it is named here."""
     states = [c for c in system.physical_states if not c.name.endswith(".activation")]
     joints = [c for c in states if not c.name.endswith(".velocity")]
-    rates = [c.name for c in states if c.name.endswith(".velocity")]
+    rates = [c for c in states if c.name.endswith(".velocity")]
     rows = ["# There is no log yet. One needs a row for each sample, with the columns"]
     rows.append("#   time in s")
     rows += [f"#   {c.name} in {_unit(c.unit)}, measured" for c in joints]
     rows += [f"#   {c.name} in {_unit(c.unit)}, as commanded" for c in system.actions]
     if rates:
-        rows.append(f"# and, where they are measured, {', '.join(rates)}.")
+        rows.append("# and, where they are measured, the velocities")
+        rows += [f"#   {c.name} in {c.unit}" for c in rates]
     rows += [
         "# Record the commands that were sent, in the units of the model. Then run",
-        "# sim2gp init again with the log, or add it here:",
+        "# sim2gp init MODEL LOG --out FILE for another draft, or add the log here:",
         "# [[logs]]",
         '# files = ["run.csv"]',
         "# [logs.columns]",
