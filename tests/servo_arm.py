@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-import mujoco
 import numpy as np
 
 #: Of each link: kg, m, N m s/rad, kg m^2, N m, N m/rad, N m s/rad, N m, and its axis.
@@ -56,6 +55,8 @@ def write_arm_log(
     ``read``: by column (q1, u1, ...) the sign, the zero in rad, and the unit in rad of
     the numbers in the file: ``value = sign * unit * number + zero``.
     """
+    import mujoco
+
     model = mujoco.MjModel.from_xml_string(xml)
     data, rng = mujoco.MjData(model), np.random.default_rng(seed)
     n, model.opt.timestep = model.nu, 0.0025

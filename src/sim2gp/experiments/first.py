@@ -44,7 +44,7 @@ def run(
         started=time.monotonic(),
     )
     if logs:
-        progress.say("matching columns and trying how to read them")
+        progress.say("matching columns, then trying readings of them on the machine")
         return told(draft_project(asked), out)
     table = out.with_name(f"{out.stem}-experiment.csv")
     check_absent(table)

@@ -27,6 +27,7 @@ DRAWS = 8  # of the prior, next to the nominal parameters
 SHARES = (0.4, 0.25, 0.15, 0.1, 0.05)  # of the way to the limits of each input
 SLOW = 3.0  # s, in which the target of a servo crosses its range at the fastest
 MARGIN = 0.05  # of a joint's range, kept free at each end
+LOOK = 50  # steps, after which a simulation is looked at
 FORCE = 0.9  # of an actuator's largest force
 
 Commands = Float[np.ndarray, "T m"]
@@ -67,13 +68,13 @@ def safe_excitation(system: AbstractSystem, *, key: Key, until: float) -> Excita
     box = Limits(low - home, high - home, rate, -none, none)
     signal = Multisine(PERIOD, round(SECONDS / PERIOD), tones=TONES, highest=HIGHEST)
     U = np.asarray(signal.commands(signal.random(key, len(low)), box))
-    why = ""
+    step, why = _step_of(system, key), ""
     for share in SHARES:
         if time.monotonic() > until:
             return Excitation("no experiment: the time was over")
         commands = home + share * U
-        states = _simulated(system, start, commands, key)
-        why = _leaves(system, states) or _strain(system, start, commands)
+        states, why = _simulated(system, step, start, commands)
+        why = why or _strain(system, start, commands)
         if not why:
             words = f"a sum of sines, at most {share:.0%} of the way to each limit"
             return Excitation(words, commands, states[0])
@@ -123,18 +124,25 @@ def _start(
 
 def _simulated(
     system: AbstractSystem,
+    step: Callable[..., Any],
     start: Float[np.ndarray, " n"],
     commands: Commands,
-    key: Key,
-) -> Float[np.ndarray, "K T n"]:
-    """States at each command's end, nominal parameters first, then draws."""
-    step = _step_of(system, key)
+) -> tuple[Float[np.ndarray, "K T n"], str]:
+    """States at each command's end, nominal parameters first, and what goes wrong.
+
+    It ends soon after a joint has left its range.
+    """
     x = np.tile(start, (1 + DRAWS, 1))
-    found = []
-    for u in commands:
+    found: list[np.ndarray] = []
+    why = ""
+    for k, u in enumerate(commands):
         x = step(x, np.tile(u, (len(x), 1)))
         found.append(x)
-    return np.stack(found, axis=1)
+        if k % LOOK == LOOK - 1 or k == len(commands) - 1:
+            why = _leaves(system, np.stack(found[-LOOK:], axis=1))
+            if why:
+                break
+    return np.stack(found, axis=1), why
 
 
 def _step_of(system: AbstractSystem, key: Key) -> Callable[..., Any]:

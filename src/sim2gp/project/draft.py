@@ -87,10 +87,9 @@ def draft_project(asked: Request) -> Draft:
     """
     system = _machine(asked)
     if not asked.files:
-        found = Found({})
-        text = draft_text(Contents(asked.model, asked.files, asked.out, system))
-        replace_project(asked.out, text, lambda _: None)
-        return Draft(system, text, {}, found)
+        bare = Contents(asked.model, (), asked.out, system, asked.root)
+        replace_project(asked.out, draft_text(bare), lambda _: None)
+        return Draft(system, draft_text(bare), {}, Found({}))
     time_, columns, travel = _columns(asked, system)
     options = _options(system, columns, travel)
     read = {n: _in_unit(n, m.column, options) for n, m in columns.items()}
