@@ -127,7 +127,7 @@ def _simulated(
     step: Callable[..., Any],
     start: Float[np.ndarray, " n"],
     commands: Commands,
-) -> tuple[Float[np.ndarray, "K T n"], str]:
+) -> tuple[Float[np.ndarray, "K L n"], str]:
     """States at each command's end, nominal parameters first, and what goes wrong.
 
     It ends soon after a joint has left its range.
