@@ -13,6 +13,7 @@ from servo_arm import arm_xml, write_arm_log
 from sim2gp.cli import main
 from sim2gp.errors import InputError
 from sim2gp.project import load_project
+from test_interrupts import CODES, SECONDS, everything_in, started, stopped
 
 mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is absent")
 DEG = float(np.pi / 180)
@@ -151,6 +152,28 @@ def test_a_mesh_behind_a_link_and_the_root(tmp_path: Path, capsys: Any) -> None:
     assert "--root DIR" in said
     assert main([*words, "--root", str(tmp_path)]) == 0
     assert load_project(tmp_path / "arm.toml").spec.options == {"root": "."}
+
+
+def test_ctrl_c_ends_init_while_it_tries_readings(tmp_path: Path) -> None:
+    """Of a six-axis arm without stops: the most readings that a draft tries."""
+    xml = arm_xml(limited=False)
+    write_arm_log(xml, tmp_path / "run.csv", seconds=10.0)
+    (tmp_path / "arm.xml").write_text(xml)
+    call = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from sim2gp.cli import main; raise SystemExit(main())"
+    )
+    words = ["init", str(tmp_path / "arm.xml"), str(tmp_path / "run.csv")]
+    (tmp_path / "run").mkdir()
+    with started(tmp_path / "run", ["-c", call, *words]) as child:
+        assert child.stderr is not None
+        assert any("readings" in line for line in child.stderr)
+        time.sleep(3.0)  # columns are matched by then
+        seconds, _, said = stopped(child, "SIGINT")
+        assert child.returncode == CODES["SIGINT"]
+    assert seconds < SECONDS
+    assert said.splitlines() == ["interrupted; nothing half-written is left"]
+    assert everything_in(tmp_path / "run") == ["temporary", "work"]
 
 
 @pytest.mark.nightly

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import pytest
 
-from servo_arm import arm_xml, write_arm_log
 from sim2gp.cli.interrupts import Terminated, interruptible
 from sim2gp.runs import load_run
 from simulated_logs import simulated
@@ -333,29 +332,6 @@ def test_an_end_within_a_commit_leaves_all_or_nothing(
     assert everything_in(tmp_path)[:2] == (["b", "b/a"] if late else [])
     if late:
         assert load_run(tmp_path / "b" / "a").summary == {"value": 1}
-
-
-def test_ctrl_c_ends_init_while_it_tries_readings(tmp_path: Path) -> None:
-    """Of a six-axis arm without stops: the most readings that a draft tries."""
-    pytest.importorskip("mujoco", reason="the extra `mujoco` is absent")
-    xml = arm_xml(limited=False)
-    write_arm_log(xml, tmp_path / "run.csv", seconds=10.0)
-    (tmp_path / "arm.xml").write_text(xml)
-    call = (
-        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "from sim2gp.cli import main; raise SystemExit(main())"
-    )
-    words = ["init", str(tmp_path / "arm.xml"), str(tmp_path / "run.csv")]
-    (tmp_path / "run").mkdir()
-    with started(tmp_path / "run", ["-c", call, *words]) as child:
-        assert child.stderr is not None
-        assert any("readings" in line for line in child.stderr)
-        time.sleep(3.0)  # columns are matched by then
-        seconds, _, said = stopped(child, "SIGINT")
-        assert child.returncode == CODES["SIGINT"]
-    assert seconds < SECONDS
-    assert said.splitlines() == ["interrupted; nothing half-written is left"]
-    assert everything_in(tmp_path / "run") == ["temporary", "work"]
 
 
 @pytest.mark.nightly
