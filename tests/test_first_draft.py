@@ -18,7 +18,12 @@ from test_interrupts import CODES, SECONDS, everything_in, started, stopped
 mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is absent")
 DEG = float(np.pi / 180)
 #: Of each column: sign, zero in rad, unit in rad.
-ODD = {"q1": (-1, 0.0, DEG), "u1": (-1, 0.0, 1.0), "q2": (-1, 0.0, 1.0)}
+ODD = {
+    "q1": (-1, 0.0, DEG),
+    "u1": (-1, 0.0, 1.0),
+    "q2": (-1, 0.0, 1.0),
+    "u2": (1, 0.0, DEG),
+}
 
 
 def drafted(folder: Path, *options: str, capsys: Any) -> tuple[dict[str, Any], str]:
@@ -47,7 +52,7 @@ def test_signs_and_units_of_a_servo_arm(tmp_path: Path, capsys: Any) -> None:
         "joint1": (-1, "deg"),
         "joint2": (-1, ""),
         "servo1": (-1, ""),
-        "servo2": (1, ""),
+        "servo2": (1, "deg"),
     }
     assert not told["warnings"]
     project = load_project(tmp_path / "arm.toml")

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 
 from sim2gp.cleanup import replace_file
+from sim2gp.data.logs import Budget
 from sim2gp.experiments.first_experiment import PERIOD, Excitation, safe_excitation
 from sim2gp.project.draft import Request, draft_project, told
 from sim2gp.runs import Progress
@@ -42,6 +43,7 @@ def run(
         readings=readings,
         seconds=seconds,
         started=time.monotonic(),
+        budget=Budget().times(max(1.0, seconds / 60.0)),  # of reading: more on request
     )
     if logs:
         progress.say("matching columns, then trying readings of them on the machine")
