@@ -4,36 +4,108 @@ from mutant_list import Mutant
 
 COLUMNS, READINGS = "project/columns.py", "project/readings.py"
 DRAFT, ZEROS = "project/draft.py", "systems/machine.py"
+TEXT, EXPERIMENT = "project/draft_text.py", "experiments/first_experiment.py"
 ODD = ("test_draft.py", "odd_log")
+SERVOS = ("test_first_draft.py", "servo_arm")
 
 FIRST_DRAFT = (
     Mutant(
         "draft: no sign is turned",
-        READINGS,
+        DRAFT,
         "for s in (1, -1)]",
         "for s in (1, 1)]",
         ODD,
     ),
     Mutant(
         "draft: no zero is moved",
-        READINGS,
-        "[: 1 + turns]",
-        "[:1]",
+        DRAFT,
+        "zeros = (0.0, np.pi) if turns else (0.0,)",
+        "zeros = (0.0,)",
         ODD,
     ),
     Mutant(
         "draft: starts keep the old zero",
         READINGS,
-        "windows.start * sign + zero,",
-        "windows.start * sign,",
+        "w.start * scale[:, None] + zero[:, None]",
+        "w.start * scale[:, None]",
         ODD,
     ),
     Mutant(
         "draft: nothing is in degrees",
         DRAFT,
-        "for columns in (stated, _in_other_units(system, stated)):",
-        "for columns in (stated, stated):",
+        "if smaller is None or travel <= min(LARGE, reach):",
+        "if True:",
         ODD,
+    ),
+    Mutant(
+        "draft: the last reading is as good as the best",
+        READINGS,
+        "_surer(scores, best) <= SURE",
+        "_surer(scores, best) <= np.inf",
+        SERVOS,
+    ),
+    Mutant(
+        "draft: a target is no angle",
+        "systems/mujoco/system.py",
+        'unit = ("m" if model.jnt_type[j] == 2 else "rad") if servo else "1"',
+        'unit = "1"',
+        SERVOS,
+    ),
+    Mutant(
+        "draft: the gains of servos are open",
+        TEXT,
+        '_GAINS = ("kp", "kv")',
+        "_GAINS = ()",
+        SERVOS,
+    ),
+    Mutant(
+        "draft: a servo has short windows",
+        TEXT,
+        "WINDOW = 1.0",
+        "WINDOW = 0.2",
+        SERVOS,
+    ),
+    Mutant(
+        "draft: a window longer than the log",
+        TEXT,
+        "min(WINDOW, int(1e3 * longest) / 1e3)",
+        "WINDOW",
+        ("test_first_draft.py", "short_log"),
+    ),
+    Mutant(
+        "draft: readings have no deadline",
+        READINGS,
+        "if time.monotonic() > self.until:",
+        "if False:",
+        ("test_first_draft.py", "not_tried"),
+    ),
+    Mutant(
+        "first experiment: at the limits of joints",
+        EXPERIMENT,
+        "if states[..., i].min() < low or states[..., i].max() > high:",
+        "if False:",
+        ("test_first_draft.py", "none_is_safe"),
+    ),
+    Mutant(
+        "first experiment: targets jump",
+        EXPERIMENT,
+        "(high - low) / SLOW, np.inf)",
+        "np.inf, np.inf)",
+        ("test_first_draft.py", "without_logs"),
+    ),
+    Mutant(
+        "a missing column of an input cannot be a number",
+        "data/logs/read.py",
+        "raise _or_constant(error, plan) from error",
+        "raise",
+        ("test_first_draft.py", "without_a_column"),
+    ),
+    Mutant(
+        "root: a draft forgets it",
+        TEXT,
+        "if c.root is not None:",
+        "if False:",
+        ("test_first_draft.py", "root"),
     ),
     Mutant(
         "draft: a rate has no sign",

@@ -197,7 +197,7 @@ def test_bad_input_is_one_line_and_nothing_is_written(tmp_path: Path, capsys) ->
     log = str(tmp_path / "log.csv")
     for words, fault in (
         (["two_lnik", log], "E160 unknown system"),
-        (["furuta"], "E160 missing LOGS"),
+        ([], "E160 missing MODEL"),
         (["furuta", str(tmp_path / "none.csv")], "E130"),
         (["furuta", log], "E103 no column for input voltage"),
     ):

@@ -22,6 +22,7 @@ def check_arguments(args: Sequence[str], commands: dict[str, type]) -> None:
         known = ["--help", "--version"] if kind == "option" else list(commands)
         raise _unknown(kind, name, known)
     fields = _fields(commands[name])
+    optional = _optional(commands[name])
     options = {option: kind for option, (kind, _) in fields.items() if option[0] == "-"}
     loose: list[str] = []
     words = list(args[1:])
@@ -41,7 +42,8 @@ def check_arguments(args: Sequence[str], commands: dict[str, type]) -> None:
         if not values or not values[0]:
             raise usage_error(option, "nothing", f"{option} VALUE", "add the value")
         _check_value(option, values[0], kind)
-    _check_loose(loose, {n: k for n, k in fields.items() if n[0] != "-"})
+    wanted = {n: k for n, k in fields.items() if n[0] != "-"}
+    _check_loose(loose, wanted, sum(n not in optional for n in wanted))
 
 
 def usage_error(
@@ -104,6 +106,12 @@ def _fields(command: type) -> dict[str, tuple[Any, str]]:
     return found
 
 
+def _optional(command: type) -> set[str]:
+    """The fields that have a default."""
+    missing = dataclasses.MISSING
+    return {f.name for f in dataclasses.fields(command) if f.default is not missing}
+
+
 def _values(words: list[str], many: bool) -> list[str]:
     """Take the value, or all, that follow an option; a number may be negative."""
     taken: list[str] = []
@@ -123,17 +131,19 @@ def _is_number(word: str) -> bool:
     return True
 
 
-def _check_loose(words: list[str], wanted: dict[str, tuple[Any, str]]) -> None:
+def _check_loose(
+    words: list[str], wanted: dict[str, tuple[Any, str]], least: int
+) -> None:
     shown = [name for _, name in wanted.values()]
     many = bool(wanted) and get_origin([*wanted.values()][-1][0]) is tuple
     if len(words) > len(wanted) and not many:
         expected = " ".join(shown) or "options only"
         word = words[len(wanted)]
         raise usage_error("unexpected argument", word, expected, "remove it")
-    if len(words) < len(wanted):
+    if len(words) < least:
         got, lacking = " ".join(words) or "nothing", shown[len(words)]
         raise usage_error(f"missing {lacking}", got, " ".join(shown), f"add {lacking}")
-    for word, (kind, name) in zip(words, wanted.values(), strict=not many):
+    for word, (kind, name) in zip(words, wanted.values(), strict=False):
         _check_value(name, word, kind)
 
 

@@ -12,7 +12,7 @@ from tyro.conf import Positional, arg
 
 from sim2gp.cli.arguments import numbers, pairs, usage_error
 from sim2gp.cli.late import FIGURES, budget, experiment, read_project, run_directory
-from sim2gp.cli.options import Budgeted, Chosen, Common, Reads, Wide, Writes
+from sim2gp.cli.options import Chosen, Common, Reads, Wide, Writes
 from sim2gp.runs import Progress, load_run
 from sim2gp.runs.store import check_absent
 from sim2gp.runs.workers import cores
@@ -49,37 +49,43 @@ class Demo(Writes):
 
 
 @dataclass(kw_only=True)
-class Init(Budgeted):
+class Init(Common):
     """Draft a project file from a model and logs: columns, signs, units, zeros."""
 
     model: Annotated[Positional[str], arg(metavar="MODEL")]
     """A bundled machine's name, or an MJCF or URDF file."""
-    logs: Annotated[Positional[tuple[Path, ...]], arg(metavar="LOGS...")]
-    """Recordings of the machine, alike in their columns."""
+    logs: Annotated[Positional[tuple[Path, ...]], arg(metavar="LOGS...")] = ()
+    """Recordings of the machine, alike in their columns; none designs the first one."""
     out: Annotated[Path | None, arg(metavar="FILE")] = None
     """The project file; default MODEL's name, here."""
+    root: Annotated[Path | None, arg(metavar="DIR")] = None
+    """The folder that holds all files of the model; default the model's own."""
     period: float | None = None
     """Time between rows in s, where no column says it."""
+    constant: Annotated[tuple[str, ...], arg(metavar="NAME=VALUE...")] = ()
+    """Inputs that the logs have no column of, and the number they were held at."""
+    budget: Annotated[float, arg(metavar="SECONDS")] = 60.0
+    """What it may take; readings that were not tried by then are named in the file."""
+    no_readings: bool = False
+    """Take signs, zeros and units as they stand."""
     seed: int = 0
-    """Draws the constants that readings are tried with."""
+    """Draws the phases of the first experiment."""
 
     def run(self, progress: Progress) -> dict[str, Any]:
-        import jax
-
         out = self.out or Path(Path(self.model).stem + ".toml")
         check_absent(out)
-        drafts = import_module("sim2gp.project.draft")
-        progress.say("trying readings of the columns on the machine")
-        draft = drafts.draft_project(
+        return experiment("first")(
             self.model,
             self.logs,
-            out,
-            key=jax.random.key(self.seed),
+            out=out,
+            root=self.root,
             period=self.period,
-            budget=budget(self.budget),
+            constant=numbers("--constant", self.constant),
+            readings=not self.no_readings,
+            seconds=self.budget,
+            seed=self.seed,
+            progress=progress,
         )
-        found: dict[str, Any] = drafts.told(draft, out)
-        return found
 
 
 @dataclass(kw_only=True)

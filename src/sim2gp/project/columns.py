@@ -316,11 +316,13 @@ def _unmatched(
     where: str,
 ) -> InputError:
     names = ", ".join(c.name for c in channels)
+    held = " ".join(f"{c.name}=0.0" for c in channels)
+    either = f", say --constant {held} if held there," if what == "input" else ""
     return InputError(
         "E103",
         f"no column for {what} {names}",
         where=where,
         got=", ".join(columns)[:160] or "no other column",
         expected=f"columns that name {names}",
-        fix="rename the columns, or write the project file by hand",
+        fix=f"rename the columns{either} or write the project file by hand",
     )

@@ -1,39 +1,72 @@
 """The first project file: a model and some recordings in, a checked draft out.
 
-Every guess stands in the file with its reason, for whoever knows the machine to read.
-What is written can be identified as it stands: it is loaded, with its logs, before it
-takes its place.
+Every guess is in the file with its reason, for the user who knows the machine to read.
+What is written can be identified as it is: it is loaded, with its logs, before it takes
+its place. Without recordings the file says which columns they need.
 """
 
-import os
+import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sim2gp.data.logs import Budget, Column, read_log
+from sim2gp.data.logs import Budget, Column, Log, read_log
 from sim2gp.data.logs.formats import recordings
 from sim2gp.data.logs.units import UNITS
-from sim2gp.errors import InputError
 from sim2gp.project.columns import Match, match, time_column
+from sim2gp.project.draft_text import Contents, draft_text, open_parameters
 from sim2gp.project.project import (
     SYSTEMS,
     is_model,
     system_class,
     unknown_system,
 )
-from sim2gp.project.readings import SURE, Found, Reading, Version, find_readings
-from sim2gp.project.replace import key as toml_key
-from sim2gp.project.replace import quoted, replace_project
-from sim2gp.systems.base import AbstractSystem
+from sim2gp.project.readings import (
+    SURE,
+    Found,
+    Question,
+    Reading,
+    find_readings,
+    finer,
+)
+from sim2gp.project.replace import replace_project
+from sim2gp.systems import MuJoCo
+from sim2gp.systems.base import AbstractSystem, Channel
 from sim2gp.systems.effects.units import joints_of
-from sim2gp.types import Key
 
-DELAY = 0.04  # s, the longest that a draft lets an input be late
 LARGE = 3.2  # rad or m of travel that may be degrees or millimetres
-LISTED = 40  # constants that are named in the file
+TURNS = 25.0  # rad or m: more is rather degrees or millimetres
+FAR = 10.0  # times the range of a joint: no log in the right unit travels so far
+SHARE = 0.8  # of the time, after which no further reading is begun
+_SMALLER = {"rad": "deg", "m": "mm"}
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a draft is made of.
+
+    model: a bundled machine's name or a model's file; ``root`` the folder in which all
+        files of that model lie, its own if None.
+    files: the recordings, alike in their columns; none is a draft without logs.
+    period: s between rows, in place of a column of time.
+    constant: inputs that have no column, and the number that each was held at.
+    readings: whether signs, zeros and units are tried; ``seconds`` that the whole draft
+        may take from ``started`` (of `time.monotonic`).
+    """
+
+    model: str
+    files: Sequence[Path]
+    out: Path
+    root: Path | None = None
+    period: float | None = None
+    constant: Mapping[str, float] = field(default_factory=dict)
+    readings: bool = True
+    seconds: float = 60.0
+    started: float = field(default_factory=time.monotonic)
+    budget: Budget = field(default_factory=Budget)
 
 
 @dataclass(frozen=True)
@@ -46,154 +79,198 @@ class Draft:
     found: Found
 
 
-def draft_project(
-    model: str,
-    files: Sequence[Path],
-    out: Path,
-    *,
-    key: Key,
-    period: float | None = None,
-    budget: Budget | None = None,
-) -> Draft:
-    """Write the project file ``out`` for a bundled machine or a model's file.
+def draft_project(asked: Request) -> Draft:
+    """Write the project file for a bundled machine or a model's file.
 
-    ``period`` in s stands for a column of time; reading one file may take the
-    ``budget``. Raises `InputError` E103 where a joint
-    or an input finds no column, E160 for an unknown machine, and the codes of models
-    and logs.
+    Raises `InputError` E103 where a joint or an input finds no column, E160 for an
+    unknown machine, and the codes of models and logs.
     """
-    system = _machine(model)
-    budget = budget or Budget()
-    time, columns = _columns(files[0], system, period, budget)
-    stated = {name: m.column for name, m in columns.items()}
-    versions = _versions(system, files, stated, time, period, budget)
-    found = find_readings(system, versions, key=key)
-    said = {name: _as_read(name, m, found) for name, m in columns.items()}
-    text = _text(model, files, out, system, time, period, said, found)
-    replace_project(out, text, lambda p: replace(p, budget=budget).load_logs())
+    system = _machine(asked)
+    if not asked.files:
+        bare = Contents(asked.model, (), asked.out, system, asked.root)
+        replace_project(asked.out, draft_text(bare), lambda _: None)
+        return Draft(system, draft_text(bare), {}, Found({}))
+    time_, columns, travel = _columns(asked, system)
+    options = _options(system, columns, travel)
+    read = {n: _in_unit(n, m.column, options) for n, m in columns.items()}
+    logs = _logs(asked, system, read, time_)
+    question = Question(logs, options, _together(system, options))
+    until = asked.started + SHARE * asked.seconds
+    if not asked.readings:
+        until = -np.inf
+    found = find_readings(system, question, until=until)
+    reason = f"the {asked.seconds:g} s were over" if asked.readings else "--no-readings"
+    said = {n: _as_read(n, m, found, options, reason) for n, m in columns.items()}
+    text = draft_text(
+        Contents(
+            asked.model, asked.files, asked.out, system, asked.root, time_,
+            asked.period, said, asked.constant, found.images,
+            max(float(np.ptp(log.time)) for log in logs),
+        )
+    )  # fmt: skip
+    budget = asked.budget
+    replace_project(asked.out, text, lambda p: replace(p, budget=budget).load_logs())
     return Draft(system, text, said, found)
 
 
-def _machine(model: str) -> AbstractSystem:
+def _machine(asked: Request) -> AbstractSystem:
     """A bundled machine by name, or a model by its file."""
-    if model in SYSTEMS:
-        kind: Any = system_class(model)  # concrete, and content without arguments
+    if asked.model in SYSTEMS:
+        kind: Any = system_class(asked.model)  # concrete, and content without arguments
         bare: AbstractSystem = kind()
         return bare
-    if is_model(model):
-        from sim2gp.systems import MuJoCo
-
-        return MuJoCo(Path(model))
-    raise unknown_system(model, "the command line")
+    if is_model(asked.model):
+        return MuJoCo(Path(asked.model), root=asked.root)
+    raise unknown_system(asked.model, "the command line")
 
 
 def _columns(
-    file: Path, system: AbstractSystem, period: float | None, budget: Budget
-) -> tuple[Match | None, dict[str, Match]]:
-    """The column of time, where the format needs one, and those of the channels."""
+    asked: Request, system: AbstractSystem
+) -> tuple[Match | None, dict[str, Match], dict[str, float]]:
+    """The column of time, where the format needs one, and those of the channels.
+
+    And how far each of these travels, in the numbers of the file.
+    """
+    file, budget = asked.files[0], asked.budget
+    period = asked.period
     tables = recordings(file, None, period=period, budget=budget)[0].tables
     main = max(tables, key=lambda t: len(t.rows.numbers) * len(t.columns))
-    columns, clock, time = dict(main.columns), main.clock, None
+    columns, clock, named = dict(main.columns), main.clock, None
     where = main.rows.source
     if period is not None:
         clock = period * np.arange(len(main.rows.numbers))
     elif clock is None:
-        time = time_column(columns, where)
-        clock = _seconds(columns.pop(time.column.column), time.column)
+        named = time_column(columns, where)
+        clock = _seconds(columns.pop(named.column.column), named.column)
     for other in tables:
         if other is not main and other.clock is not None:
             for name, x in other.columns.items():  # to be looked at, not to be fitted
                 columns[name] = np.interp(clock, other.clock, x)
-    found = match(columns, clock, system.physical_states, system.actions, where)
-    return time, found
+    open_ = [c for c in system.actions if c.name not in asked.constant]
+    found = match(columns, clock, system.physical_states, open_, where)
+    travel = {name: _travel(columns[m.column.column]) for name, m in found.items()}
+    return named, found, travel
+
+
+def _travel(x: np.ndarray) -> float:
+    known = x[np.isfinite(x)]
+    return float(np.ptp(known)) if known.size else 0.0
 
 
 def _seconds(x: np.ndarray, column: Column) -> np.ndarray:
     return np.asarray(x * UNITS[column.unit or "s"][1])
 
 
-def _versions(
+def _options(
+    system: AbstractSystem, columns: Mapping[str, Match], travel: Mapping[str, float]
+) -> dict[str, list[Reading]]:
+    """Both signs, half a turn's zero where a joint turns freely, and two units.
+
+    Degrees or millimetres where no name gives the unit and the column travels far.
+    """
+    joints = {c.name: c for c in joints_of(system)}
+    drives = system.drives if isinstance(system, MuJoCo) else {}
+    servos = system.servos if isinstance(system, MuJoCo) else ()
+    found = {}
+    for channel in (*joints.values(), *system.actions):
+        name = channel.name
+        if name not in columns:
+            continue
+        joint = joints.get(name)
+        if joint is None and name in servos:
+            joint = joints.get(drives.get(name, ""))
+        turns = joint is not None and joint.angle
+        zeros = (0.0, np.pi) if turns else (0.0,)
+        stated = columns[name].column.unit is not None
+        units = [None] if stated else _units(channel, travel[name])
+        found[name] = [Reading(s, z, u) for u in units for z in zeros for s in (1, -1)]
+    return found
+
+
+def _units(channel: Channel, travel: float) -> list[str | None]:
+    """The units that a column may be in, by its travel, the likely one first."""
+    smaller, reach = _SMALLER.get(channel.unit), FAR * (channel.high - channel.low)
+    if smaller is None or travel <= min(LARGE, reach):
+        return [None]
+    if travel > reach:
+        return [smaller]
+    return [smaller, None] if travel > TURNS else [None, smaller]
+
+
+def _together(
+    system: AbstractSystem, options: Mapping[str, Sequence[Reading]]
+) -> list[list[str]]:
+    """Each joint with the inputs that act on it: to turn one alone is never right."""
+    drives = system.drives if isinstance(system, MuJoCo) else {}
+    groups: dict[str, list[str]] = {}
+    for name in options:
+        groups.setdefault(drives.get(name, name), []).append(name)
+    return list(groups.values())
+
+
+def _in_unit(
+    name: str, column: Column, options: Mapping[str, Sequence[Reading]]
+) -> Column:
+    """The column in the last unit that it may be in: no number is too large then."""
+    joint = name.removesuffix(".velocity")
+    if joint not in options:
+        return column
+    return Reading(unit=finer(options[joint])).of(column, rate=name != joint)
+
+
+def _logs(
+    asked: Request,
     system: AbstractSystem,
-    files: Sequence[Path],
-    stated: Mapping[str, Column],
-    time: Match | None,
-    period: float | None,
-    budget: Budget,
-) -> list[Version]:
-    """The logs in the units that names tell, and in others that may be meant."""
-    versions: list[Version] = []
-    first: InputError | None = None
-    for columns in (stated, _in_other_units(system, stated)):
-        if versions and not _large(versions[0], system):
-            break
-        try:
-            logs = [
-                log
-                for file in files
-                for log in read_log(
-                    file,
-                    columns,
-                    states=system.physical_states,
-                    actions=system.actions,
-                    time=None if time is None else time.column,
-                    period=period,
-                    budget=budget,
-                )
-            ]
-            versions.append(Version(columns, logs))
-        except InputError as error:
-            first = first or error
-            if error.code != "E107":
-                raise
-    if not versions and first is not None:
-        raise first
-    return versions
+    columns: Mapping[str, Column],
+    clock: Match | None,
+) -> list[Log]:
+    return [
+        log
+        for file in asked.files
+        for log in read_log(
+            file,
+            {**columns, **asked.constant},
+            states=system.physical_states,
+            actions=system.actions,
+            time=None if clock is None else clock.column,
+            period=asked.period,
+            budget=asked.budget,
+        )
+    ]
 
 
-def _in_other_units(
-    system: AbstractSystem, stated: Mapping[str, Column]
-) -> dict[str, Column]:
-    """Degrees for radians, millimetres for metres, wherever no name says what it is."""
-    meant = {"rad": "deg", "rad/s": "deg/s", "m": "mm", "m/s": "mm/s"}
-    own = {c.name: c.unit for c in system.physical_states}
-    return {
-        name: replace(column, unit=column.unit or meant.get(own.get(name, "")))
-        for name, column in stated.items()
-    }
-
-
-def _large(version: Version, system: AbstractSystem) -> bool:
-    """Whether a joint without a unit travels so far that it may be in a smaller one."""
-    joints = [c.name for c in joints_of(system)]
-    return any(
-        np.ptp(log.channels[name]) > LARGE
-        for log in version.logs
-        for name in joints
-        if name in log.channels and version.columns[name].unit is None
-    )
-
-
-def _as_read(name: str, found: Match, readings: Found) -> Match:
+def _as_read(
+    name: str,
+    found: Match,
+    readings: Found,
+    options: Mapping[str, Sequence[Reading]],
+    untried: str,
+) -> Match:
     """A channel's column in the reading that was found, with its reason."""
     joint = name.removesuffix(".velocity")
+    if joint not in options:
+        return found
     reading = readings.readings[joint]
-    column = reading.of(readings.version.columns[name], rate=name != joint)
-    if name not in readings.readings:
+    column = reading.of(found.column, rate=name != joint)
+    if name != joint or len(options[name]) == 1:
         return Match(column, found.why)
+    words = _words(reading)
+    if name not in readings.surer:
+        asked = _asked(options[name])
+        return Match(column, f"{found.why}; {asked} not tried: {untried}")
     surer = readings.surer[name]
-    if surer == np.inf:
-        why = "no other reading comes near"
-    elif surer > SURE:
-        why = f"the next is {surer:.0f} nats behind"
+    if surer > SURE:
+        why = "the model predicts the log best so"
     else:
-        why = "the logs hardly tell: look"
-    why = f"{reading_words(reading)} ({why})"
-    return Match(column, f"{found.why}; {why}")
+        rival = readings.rivals[name].items()
+        other = [f"{n} {_words(r)}" for n, r in rival if r != readings.readings[n]]
+        why = f"look: the log hardly tells this from {' and '.join(other)}"
+    return Match(column, f"{found.why}; {words} ({why})")
 
 
-def reading_words(reading: Reading) -> str:
+def _words(reading: Reading) -> str:
     """`as it stands`, or what is done to a column."""
-    words = []
+    words = [f"in {reading.unit}"] if reading.unit else []
     if reading.sign < 0:
         words.append("turned round")
     if reading.offset:
@@ -201,80 +278,11 @@ def reading_words(reading: Reading) -> str:
     return " and ".join(words) or "as it stands"
 
 
-def _text(
-    model: str,
-    files: Sequence[Path],
-    out: Path,
-    system: AbstractSystem,
-    time: Match | None,
-    period: float | None,
-    columns: Mapping[str, Match],
-    found: Found,
-) -> str:
-    folder = out.parent
-    named = _relative(Path(model), folder) if is_model(model) else model
-    listed = [_relative(file, folder) for file in files]
-    rows = [
-        "# A draft by sim2gp init: every guess has its reason beside it. Read them.",
-        f"system = {quoted(named)}",
-        "",
-        *_constants(system, is_model(model)),
-        "",
-        "[[logs]]",
-        f"files = [{', '.join(quoted(file) for file in listed)}]",
-    ]
-    if time is not None:
-        rows.append(f"time = {_value(time.column)}  # {time.why}")
-    elif period is not None:
-        rows.append(f"period = {period!r}")
-    if found.images > 1:
-        rows += [
-            "",
-            f"# {found.images} ways to read these columns, mirror images and the like,",
-            "# are one to the machine: this is the plainest of them.",
-        ]
-    rows.append("[logs.columns]")
-    for name, m in columns.items():
-        rows.append(f"{toml_key(name)} = {_value(m.column)}  # {m.why}")
-    rows += ["", "# Inputs act late on most machines; delay = 0.0 takes that out."]
-    for channel in system.actions:
-        rows.append(f"[actuators.{toml_key(channel.name)}]")
-        rows.append(f"delay = {{low = 0.0, high = {DELAY}}}")
-    return "\n".join(rows) + "\n"
-
-
-def _constants(system: AbstractSystem, file: bool) -> list[str]:
-    """What is open, and how to say more about it."""
-    table = system.parameters.free
-    whose = "within a factor of three of the file's numbers" if file else "as bundled"
-    rows = [f"# {len(table)} constants are open, {whose}:"]
-    nominal = system.parameters.nominal()
-    for p in table[:LISTED]:
-        rows.append(f"#   {p.name} = {nominal[p.name]:.4g} {p.unit}".rstrip())
-    if len(table) > LISTED:
-        rows.append(f"#   and {len(table) - LISTED} more")
-    example = toml_key(table[0].name) if table else "NAME"
-    rows.append(f"# To say what you know: [parameters.{example}] mean = ... sd = ...")
-    return rows
-
-
-def _value(column: Column) -> str:
-    """A column as the file says it."""
-    plain = Column(column.column)
-    if column == plain:
-        return quoted(column.column)
-    words = [f"column = {quoted(column.column)}"]
-    if column.unit is not None:
-        words.append(f"unit = {quoted(column.unit)}")
-    if column.sign != plain.sign:
-        words.append(f"sign = {column.sign}")
-    if column.offset != plain.offset:
-        words.append(f"offset = {column.offset!r}")
-    return "{" + ", ".join(words) + "}"
-
-
-def _relative(file: Path, folder: Path) -> str:
-    return Path(os.path.relpath(file, folder)).as_posix()
+def _asked(options: Sequence[Reading]) -> str:
+    """What the readings of a channel differ in."""
+    parts = [("sign", "sign"), ("zero", "offset"), ("unit", "unit")]
+    differ = [w for w, key in parts if len({getattr(r, key) for r in options}) > 1]
+    return " and ".join(differ)
 
 
 def told(draft: Draft, out: Path) -> dict[str, Any]:
@@ -289,14 +297,21 @@ def told(draft: Draft, out: Path) -> dict[str, Any]:
         }
         for name, m in draft.columns.items()
     }
-    doubts = [name for name, surer in draft.found.surer.items() if surer <= SURE]
+    surer = draft.found.surer
+    doubts = [name for name, z in surer.items() if z <= SURE]
+    untried = [
+        name
+        for name, m in draft.columns.items()
+        if name not in surer and "not tried" in m.why
+    ]
+    warnings = [f"W160 the logs hardly tell how {n} is to be read" for n in doubts]
+    if untried:
+        warnings.append(f"W160 not tried how to read {', '.join(untried)}")
     return {
         "command": "init",
         "headline": f"Wrote {out}: read it, then sim2gp identify {out}",
         "file": str(out),
         "columns": table,
-        "open_constants": len(draft.system.parameters.free),
-        "warnings": [
-            f"W160 the logs hardly tell how {n} is to be read" for n in doubts
-        ],
+        "open_constants": len(open_parameters(draft.system)),
+        "warnings": warnings,
     }

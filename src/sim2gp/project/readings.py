@@ -1,200 +1,276 @@
-"""Signs, zeros and units that no name tells: the reading that the machine explains.
+"""Signs, zeros and units that no name gives: the reading that the machine explains.
 
-Every reading of the columns is tried on the machine itself, twice, on the windows with
-the most motion. Forecasts at constants drawn from the prior leave the few that are near
-the best, by
+The machine predicts short windows of the logs, at the file's own parameters, under each
+reading of a channel. A window's score is the mean over measured channels of
 
-    mean over channels of  1/2 log( error^2 / motion^2 )
+    1/2 log( error^2 / motion^2 )
 
-of the better quarter of the draws; of those the one with the highest evidence is taken,
-with the likelihood of `identify` and its constants fitted. The plainest reading is kept
-unless another one is better by `SURE` nats; what no reading decides is said to be open.
+and one reading beats another where its score is lower in most windows (a sign test).
+All readings are tried where they are few. Otherwise each joint is tried
+with the inputs that act on it, twice around, while the other channels keep the best
+reading so far: first by its own prediction, then by those of all. The plainest reading
+stays unless another beats it; what the time did not suffice for, and what no window
+decides, is reported.
 """
 
 import itertools
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float
 
 from sim2gp.data.logs import Column, Log
 from sim2gp.data.logs.units import factor
 from sim2gp.data.split_log import cut
 from sim2gp.data.windows import Windows
-from sim2gp.errors import NotConverged, NotFinite
-from sim2gp.identification.fit import fit_windows
+from sim2gp.systems import MuJoCo
 from sim2gp.systems.base import AbstractSystem
-from sim2gp.systems.simulate import simulate
-from sim2gp.types import Key, in_float64
+from sim2gp.types import in_float64
 
-SURE = 5.0  # nats of evidence that a reading is better than another by
+SURE = 3.0  # (windows won - windows lost) / sqrt(windows): the sign test's z
 WINDOW = 0.2  # s
-DRAWS, BEST = 16, 4
 WINDOWS = 40  # that are tried
-EXHAUSTIVE = 128  # readings at most; beyond, one channel after the other
-FINAL = 6  # readings that are fitted
-NEAR = 1.5  # of the first score, from the best one
+SECONDS = 120.0  # of the logs, from which those windows are taken
+EXHAUSTIVE = 256  # readings at most; beyond, one joint after the other
+ROWS = 4096  # windows that are simulated together
 _FLOOR, _CAP = 1e-3, 10.0  # of error / motion
+_SAME = 1e-6  # of two scores
+
+Scores = Float[np.ndarray, "K W"]
 
 
 @dataclass(frozen=True)
 class Reading:
-    """How a joint (with its velocity) or an input is read: its sign and its zero."""
+    """How a joint (with its velocity) or an input is read: sign, zero, other unit."""
 
     sign: int = 1
     offset: float = 0.0
+    unit: str | None = None
 
     def of(self, column: Column, rate: bool = False) -> Column:
         """The column read so; a velocity has no zero."""
-        offset = 0.0 if rate else self.offset
-        return replace(column, sign=self.sign * column.sign, offset=offset)
+        unit = self.unit and (f"{self.unit}/s" if rate else self.unit)
+        return replace(
+            column,
+            sign=self.sign * column.sign,
+            offset=0.0 if rate else self.offset,
+            unit=column.unit or unit,
+        )
 
 
 PLAIN = Reading()
 Readings = dict[str, Reading]  # of joints and inputs, by channel
 
 
-class Version(NamedTuple):
-    """The columns in certain units, and the logs as these read them."""
-
-    columns: Mapping[str, Column]
-    logs: Sequence[Log]
-
-
 @dataclass(frozen=True)
-class Found:
-    """The best version, and its best reading of each channel.
+class Question:
+    """The logs of a machine, and how each of its channels may be read.
 
-    ``surer[name]``: by how many nats of evidence this beats the best reading in which
-    the channel has another sign or zero, or unit, of those that were fitted (infinite
-    where there is none). ``images`` readings, this one among them, the machine cannot
-    tell apart: a pendulum and its mirror image.
+    ``logs`` are read in the `finer` unit of each channel's options. ``options`` lists
+    the readings of joints and inputs by name, the plainest first; ``together`` names
+    the channels that are tried in one go.
     """
 
-    version: Version
+    logs: Sequence[Log]
+    options: Mapping[str, Sequence[Reading]]
+    together: Sequence[Sequence[str]]
+
+
+def finer(options: Sequence[Reading]) -> str | None:
+    """The unit in which no number of a channel is too large; None is its own."""
+    return next((reading.unit for reading in options if reading.unit), None)
+
+
+@dataclass
+class Found:
+    """The best reading of each channel, and how sure that is.
+
+    ``surer[name]``: the sign test's z against the best reading in which the channel
+    differs, infinite where it has no other; a channel that was not tried has no entry.
+    ``rivals[name]``: that other reading, of all channels that were tried with it.
+    ``images`` readings, this one among them, the machine cannot tell apart: a pendulum
+    and its mirror image.
+    """
+
     readings: Readings
-    surer: dict[str, float]
-    images: int
+    surer: dict[str, float] = field(default_factory=dict)
+    rivals: dict[str, Readings] = field(default_factory=dict)
+    images: int = 1
 
 
 @in_float64
-def find_readings(
-    system: AbstractSystem, versions: Sequence[Version], *, key: Key
-) -> Found:
+def find_readings(system: AbstractSystem, asked: Question, *, until: float) -> Found:
     """The reading of joints and inputs that explains the logs best.
 
-    Raises `NotConverged` where the constants can be fitted in no reading.
+    ``until`` (of `time.monotonic`, s): what was not tried by then keeps its first
+    option. Raises `InputError` E116 where no window can be cut.
     """
-    trials = [_Trial(system, version, key) for version in versions]
-    tried = sorted(
-        ((score, k, r) for k, t in enumerate(trials) for score, r in t.tried()),
-        key=lambda x: (x[0], x[1], _departs(x[2])),
-    )
-    plainest = {score: (k, r) for score, k, r in reversed(tried)}
-    near = [x for s, x in sorted(plainest.items()) if s < tried[0][0] + NEAR][:FINAL]
-    evidence = [trials[k].evidence(reading) for k, reading in near]
-    top = max(evidence)
-    if not np.isfinite(top):
-        raise NotConverged("E201", "no reading of the columns can be fitted")
-    good = [x for x, e in zip(near, evidence, strict=True) if e >= top - SURE]
-    k, chosen = min(good, key=lambda x: (x[0], _departs(x[1])))
-    surer = {}
-    for name in chosen:
-        other = [
-            e
-            for (j, r), e in zip(near, evidence, strict=True)
-            if r[name] != chosen[name] or j != k
+    found = Found({name: options[0] for name, options in asked.options.items()})
+    groups = _groups(asked)
+    try:
+        trial = _Trial(system, asked, until)
+        for turn in range(1 if len(groups) == 1 else 2):
+            found.images = 1
+            for names in groups:
+                _settle(trial, asked, names, found, alone=turn == 0 < len(groups) - 1)
+    except TimeoutError:
+        pass
+    return found
+
+
+def _groups(asked: Question) -> Sequence[Sequence[str]]:
+    """All channels at once where their readings are few; those with one are known."""
+    open_ = [name for name, options in asked.options.items() if len(options) > 1]
+    if np.prod([len(asked.options[name]) for name in open_]) <= EXHAUSTIVE:
+        return [open_] if open_ else []
+    groups = [[n for n in names if n in open_] for names in asked.together]
+    return [names for names in groups if names]
+
+
+def _settle(
+    trial: "_Trial",
+    asked: Question,
+    names: Sequence[str],
+    found: Found,
+    *,
+    alone: bool,
+) -> None:
+    """Try all readings of some channels; the others keep theirs.
+
+    ``alone``: by the predictions of these channels, while others may be misread.
+    """
+    choices = itertools.product(*(asked.options[name] for name in names))
+    tried = [dict(zip(names, choice, strict=True)) for choice in choices]
+    judged = names if alone else ()
+    scores = trial.scores([found.readings | each for each in tried], judged)
+    plain = {name: asked.options[name][0] for name in names}
+    mean = scores.mean(axis=1).round(6)
+    best = int(np.argmin(mean))
+    good = np.flatnonzero(_surer(scores, best) <= SURE)
+    chosen = min(good.tolist(), key=lambda k: (_departs(tried[k], plain), mean[k]))
+    same = np.abs(scores - scores[chosen]).max(axis=1) <= _SAME
+    surer = _surer(scores, chosen)
+    found.images *= int(same.sum())
+    for name in names:
+        others = [
+            (float(surer[k]), k)
+            for k, each in enumerate(tried)
+            if each[name] != tried[chosen][name] and not same[k]
         ]
-        surer[name] = top - max(other, default=-np.inf)
-    score = next(s for s, j, r in tried if (j, r) == (k, chosen))
-    images = sum((s, j) == (score, k) for s, j, _ in tried)
-    return Found(versions[k], chosen, surer, images)
+        found.surer[name], k = min(others, default=(np.inf, chosen))
+        found.rivals[name] = tried[k]
+    found.readings |= tried[chosen]
 
 
-def _departs(reading: Readings) -> int:
-    return sum(r != PLAIN for r in reading.values())
+def _departs(readings: Readings, plain: Readings) -> tuple[int, int]:
+    """How many channels have another sign or zero than they stand in; another unit."""
+    pairs = [(reading, plain[name]) for name, reading in readings.items()]
+    moved = sum((r.sign, r.offset) != (p.sign, p.offset) for r, p in pairs)
+    return moved, sum(r.unit != p.unit for r, p in pairs)
+
+
+def _surer(scores: Scores, k: int) -> Float[np.ndarray, " K"]:
+    """The sign test's z of one reading against each: windows won less windows lost."""
+    away = scores - scores[k]
+    won, lost = (away > _SAME).sum(axis=1), (away < -_SAME).sum(axis=1)
+    z: Float[np.ndarray, " K"] = (won - lost) / np.sqrt(scores.shape[1])
+    return z
 
 
 class _Trial:
-    """What readings of one version are worth."""
+    """What readings of the windows with the most motion are worth."""
 
-    def __init__(self, system: AbstractSystem, version: Version, key: Key) -> None:
-        self.system, self.version, self.key = system, version, key
-        windows, _ = cut(version.logs, system, window=WINDOW)
-        self.windows = _moving(windows)
-        prior = system.parameters.prior()
-        draws = jax.random.normal(key, (DRAWS - 1, prior.mean.size))
-        z = jnp.concatenate([jnp.zeros((1, prior.mean.size)), draws])
-        self.tt = prior.mean[None] + z @ prior.scale.T
-        self.options = {
-            name: _options(name, system)
-            for name in version.columns
-            if not name.endswith(".velocity")
+    def __init__(self, system: AbstractSystem, asked: Question, until: float) -> None:
+        windows, _ = cut(_beginning(asked.logs), system, window=WINDOW)
+        most = np.argsort(-_motion(windows).mean(axis=1), kind="stable")[:WINDOWS]
+        self.windows = windows.some(np.sort(most))
+        self.inputs = _inputs(self.windows)
+        self.states = [c.name for c in system.physical_states]
+        self.actions = [c.name for c in system.actions]
+        self.units = {
+            c.name: c.unit for c in (*system.physical_states, *system.actions)
         }
+        self.base = {name: finer(options) for name, options in asked.options.items()}
+        self.step, self.until = _step_of(system), until
 
-    def tried(self) -> list[tuple[float, Readings]]:
-        """All readings where they are few, else channel by channel, twice around."""
-        choices = self.options.values()
-        if np.prod([len(readings) for readings in choices]) <= EXHAUSTIVE:
-            every = itertools.product(*choices)
-            readings = [dict(zip(self.options, r, strict=True)) for r in every]
-            return [(self.score(reading), reading) for reading in readings]
-        best = dict.fromkeys(self.options, PLAIN)
-        known: dict[tuple[tuple[str, Reading], ...], float] = {}
-        for name in [*self.options, *self.options]:
-            here = [{**best, name: reading} for reading in self.options[name]]
-            scored = [(self.score(r), _departs(r), i) for i, r in enumerate(here)]
-            known |= {tuple(here[i].items()): s for s, _, i in scored}
-            best = here[min(scored)[2]]
-        return [(score, dict(reading)) for reading, score in known.items()]
+    def scores(self, readings: Sequence[Readings], names: Sequence[str]) -> Scores:
+        """Of each reading and window, by some channels or, where none is measured, all.
 
-    def score(self, readings: Readings) -> float:
-        """Of forecasts at draws of the prior."""
-        windows = _read(self.windows, readings, self.system)
-        motion = np.maximum(_motion(windows).mean(axis=0), 1e-30)
-        share = np.sqrt(np.asarray(_errors(self.system, windows, self.tt)) / motion)
+        Raises `TimeoutError` where time is over.
+        """
+        many = max(1, ROWS // len(self.windows))
+        parts = range(0, len(readings), many)
+        each = np.concatenate([self._shares(readings[i : i + many]) for i in parts])
+        seen = [self.states[i].removesuffix(".velocity") for i in self.windows.outputs]
+        own = [i for i, name in enumerate(seen) if name in names]
+        found: Scores = each[..., own or range(len(seen))].mean(axis=2)
+        return found
+
+    def _shares(self, readings: Sequence[Readings]) -> Float[np.ndarray, "K W c"]:
+        """Log of error over motion, of each reading, window and channel."""
+        w, K = self.windows, len(readings)
+        seen = list(w.outputs)
+        scale, zero = self._read(readings, self.states)
+        y = w.y * scale[:, None, None, seen] + zero[:, None, None, seen]
+        start = w.start * scale[:, None] + zero[:, None]
+        gain, offset = self._read(readings, self.actions)
+        u = self.inputs * gain[:, None, None] + offset[:, None, None]
+        W, L = w.span.shape
+        s = start.reshape(K * W, -1)
+        u = u.reshape(K * W, L, -1)
+        span = np.tile(w.span, (K, 1))
+        error = np.zeros((K, W, len(seen)))
+        for row in range(1, L):
+            if time.monotonic() > self.until:
+                raise TimeoutError
+            s = self.step(s, u[:, row], span[:, row])
+            away = s[:, seen].reshape(K, W, -1) - y[:, :, row]
+            error += np.where(w.mask[:, row], away**2, 0.0)
+        error /= np.maximum(w.mask[:, 1:].sum(axis=1), 1)
+        motion = _motion(w).mean(axis=0) * scale[:, None, seen] ** 2
+        share = np.sqrt(error / np.maximum(motion, 1e-30))
         share = np.where(np.isfinite(share), np.clip(share, _FLOOR, _CAP), _CAP)
-        each = np.sort(np.log(share).mean(axis=1))
-        return round(float(each[:BEST].mean()), 6)
+        return np.asarray(np.log(share))
 
-    def evidence(self, readings: Readings) -> float:
-        """Log evidence of the numbers in the files, in nats, constants fitted."""
-        windows = _read(self.windows, readings, self.system)
-        try:
-            belief = fit_windows(self.system, windows, key=self.key, starts=1)
-        except (NotConverged, NotFinite):
-            return -np.inf
-        units = {c.name: c.unit for c in self.system.physical_states}
-        names = [list(units)[i] for i in windows.outputs]
-        scales = [
-            factor(self.version.columns[name].unit, units[name], name) for name in names
-        ]
-        samples = np.asarray(windows.mask).sum(axis=(0, 1))
-        return float(belief.log_evidence) + float(samples @ np.log(scales))
-
-
-def _options(name: str, system: AbstractSystem) -> list[Reading]:
-    """Both signs; half a turn's zero where a joint turns freely."""
-    turns = any(c.name == name and c.angle for c in system.physical_states)
-    return [Reading(s, z) for z in (0.0, np.pi)[: 1 + turns] for s in (1, -1)]
+    def _read(
+        self, readings: Sequence[Readings], names: Sequence[str]
+    ) -> tuple[Float[np.ndarray, "K n"], Float[np.ndarray, "K n"]]:
+        """Scale and zero of channels, from the unit that the logs were read in."""
+        scale, zero = np.ones((2, len(readings), len(names)))
+        for k, each in enumerate(readings):
+            for i, name in enumerate(names):
+                whole = name.removesuffix(".velocity")
+                reading = each.get(whole, PLAIN)
+                unit = self.units.get(whole, "")
+                own, read = self.base.get(whole), reading.unit
+                ratio = factor(read, unit, name) / factor(own, unit, name)
+                scale[k, i] = reading.sign * ratio
+                zero[k, i] = reading.offset if name == whole else 0.0
+        return scale, zero
 
 
-def _moving(windows: Windows) -> Windows:
-    """Those with the most motion; the noise of starts is that of all."""
-    most = np.argsort(-_motion(windows).mean(axis=1), kind="stable")[:WINDOWS]
-    which: Int[np.ndarray, " K"] = np.sort(most)
-    some = jax.tree.map(
-        lambda x: np.asarray(x)[which], eqx.tree_at(lambda w: w.floor, windows, None)
-    )
-    kept: Windows = eqx.tree_at(
-        lambda w: w.floor, some, windows.floor, is_leaf=lambda x: x is None
-    )
-    return kept
+def _beginning(logs: Sequence[Log]) -> list[Log]:
+    """The first minutes of the logs: the windows are cut from these."""
+    some, left = [], SECONDS
+    for log in logs:
+        rows = slice(0, int(np.searchsorted(log.time - log.time[0], left)))
+        if rows.stop < 2:
+            break
+        left -= float(log.time[rows][-1] - log.time[0])
+        some.append(
+            replace(
+                log,
+                time=log.time[rows],
+                channels={name: x[rows] for name, x in log.channels.items()},
+                inputs={name: x[rows] for name, x in log.inputs.items()},
+                mask={name: x[rows] for name, x in log.mask.items()},
+            )
+        )
+    return some
 
 
 def _motion(windows: Windows) -> Float[np.ndarray, "W c"]:
@@ -204,49 +280,36 @@ def _motion(windows: Windows) -> Float[np.ndarray, "W c"]:
     return np.asarray(away.sum(axis=1) / np.maximum(mask.sum(axis=1), 1))
 
 
-@eqx.filter_jit
-def _errors(
-    system: AbstractSystem, windows: Windows, tt: Float[Array, "K p"]
-) -> Float[Array, "K c"]:
-    """Mean square of forecasts' errors at each vector of constants."""
-
-    def at(tt: Array) -> Array:
-        params = system.record(system.parameters.values(tt))
-
-        def one(window: Windows) -> Array:
-            states = simulate(system, params, window, window.start)
-            away = states[:, np.asarray(window.outputs)] - window.y
-            count = jnp.maximum(window.mask.sum(axis=0, dtype=away.dtype), 1.0)
-            return jnp.where(window.mask, away**2, 0.0).sum(axis=0) / count
-
-        found: Array = windows.each(one)
-        return found.mean(axis=0)
-
-    return jax.vmap(at)(tt)
-
-
-def _read(windows: Windows, readings: Readings, system: AbstractSystem) -> Windows:
-    """The windows in another reading than the plain one that they were cut in."""
-    names = [c.name for c in system.physical_states]
-    of = [readings.get(name.removesuffix(".velocity"), PLAIN) for name in names]
-    sign = np.asarray([float(r.sign) for r in of])
-    zero = np.asarray(
+def _inputs(windows: Windows) -> Float[np.ndarray, "W L m"]:
+    """The mean input over the step that ends at each row."""
+    ends = np.cumsum(windows.span, axis=1)
+    h = np.diff(ends, axis=1, prepend=0.0)[..., None]
+    area = np.asarray(
         [
-            0.0 if n.endswith(".velocity") else r.offset
-            for n, r in zip(names, of, strict=True)
+            [np.interp(end, knots, a) for a in area.T]
+            for end, knots, area in zip(ends, windows.knots, windows.area, strict=True)
         ]
-    )
-    seen = np.asarray(windows.outputs)
-    inputs = np.asarray(
-        [float(readings.get(c.name, PLAIN).sign) for c in system.actions]
-    )
-    found: Windows = eqx.tree_at(
-        lambda w: (w.y, w.start, w.area),
-        windows,
-        (
-            windows.y * sign[seen] + zero[seen],
-            windows.start * sign + zero,
-            windows.area * inputs,
-        ),
-    )
-    return jax.tree.map(jnp.asarray, found)
+    ).transpose(0, 2, 1)
+    moved = np.diff(area, axis=1, prepend=area[:, :1])
+    return np.asarray(np.where(h > 0.0, moved, 0.0) / np.where(h > 0.0, h, 1.0))
+
+
+def _step_of(system: AbstractSystem) -> Callable[..., Float[np.ndarray, "B n"]]:
+    """One step of many rows at the parameters' nominal values.
+
+    MuJoCo's own engine where it is one: nothing is compiled then.
+    """
+    values = system.parameters.nominal()
+    if isinstance(system, MuJoCo):
+        engine = system.engine
+        theta = np.asarray([values[name] for name in system.names], float)
+
+        def on_the_host(s: np.ndarray, u: np.ndarray, h: np.ndarray) -> np.ndarray:
+            rows = np.broadcast_to(theta, (len(s), theta.size))
+            found: np.ndarray = engine.flow(rows, s, u, h)
+            return found
+
+        return on_the_host
+    params = system.record({name: jnp.asarray(x) for name, x in values.items()})
+    step = jax.jit(jax.vmap(lambda s, u, h: system.flow(params, s, u, h)))
+    return lambda s, u, h: np.asarray(step(s, u, h))

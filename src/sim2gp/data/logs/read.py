@@ -94,9 +94,12 @@ def read_log(
     )  # fmt: skip
     specs = [spec for spec in columns.values() if isinstance(spec, Column)]
     wanted = list(dict.fromkeys(spec.column for spec in specs))
-    found = recordings(
-        path, wanted, time=named, period=period, episode=episode, budget=budget
-    )
+    try:
+        found = recordings(
+            path, wanted, time=named, period=period, episode=episode, budget=budget
+        )
+    except InputError as error:
+        raise _or_constant(error, plan) from error
     about = checks.unused(_left(found[0].tables), shown(path))
     logs = _episodes(found, plan, path, dict(fixed or {}), group, about)
     if not logs:
@@ -240,6 +243,18 @@ def _time(table: Table, plan: _Plan) -> Values:
         return table.clock
     raw = table.columns[plan.clock.column]
     return _converted(raw, plan.clock, "s", table.rows.source)
+
+
+def _or_constant(error: InputError, plan: _Plan) -> InputError:
+    """What is missing may be an input's column: a number can stand for it."""
+    for action in plan.actions:
+        spec = plan.columns[action.name]
+        column = spec.column if isinstance(spec, Column) else None
+        if error.code == "E103" and error.what == f"missing column {column}":
+            fix = f"{error.fix}; if it was held at zero, write {action.name} = 0.0"
+            rest = {key: getattr(error, key) for key in ("where", "got", "expected")}
+            return InputError(error.code, error.what, fix=fix, **rest)
+    return error
 
 
 def _too_short(source: str, rows: int) -> InputError:

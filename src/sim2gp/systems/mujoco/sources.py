@@ -210,13 +210,19 @@ class _Reader:
         anywhere = self.root is None and not odd
         if anywhere or (not odd and all(is_inside(way, root) for way in ways)):
             return
+        file = next(
+            (x for x in map(os.path.realpath, ways) if not is_inside(x, root)), ""
+        )
         raise InputError(
             "E171",
             f"{kind} outside the model's folder",
             where=document.where(element),
-            got=_shown(name),
+            got=_shown(name)
+            if file in ("", name)
+            else f"{_shown(name)}, {_shown(file)}",
             expected=f"a file below {os.path.realpath(root)}",
-            fix="move it there, or give a folder that holds both as root",
+            fix="move it there, or name a folder that holds both: --root DIR of sim2gp "
+            'init, root = "DIR" under [options], MuJoCo(..., root=)',
         )
 
     def _keep_text(

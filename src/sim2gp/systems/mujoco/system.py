@@ -105,6 +105,22 @@ class MuJoCo(AbstractPlant):
     def actions(self) -> tuple[Channel, ...]:
         return self.inputs
 
+    @property
+    def drives(self) -> dict[str, str]:
+        """The joint that each input acts on, by names, for inputs that act on one."""
+        model, found = self.engine.model, {}
+        for i, channel in enumerate(self.inputs):
+            j = driven_joint(model, i)
+            if j is not None:
+                found[channel.name] = name_of(model, "joint", j)
+        return found
+
+    @property
+    def servos(self) -> tuple[str, ...]:
+        """The inputs that are positions of joints, which a servo drives to."""
+        model = self.engine.model
+        return tuple(c.name for i, c in enumerate(self.inputs) if is_servo(model, i))
+
     def by_path(self, values: Mapping[str, float]) -> dict[str, float]:
         """Values by name as those of every constant: what is tied has the same."""
         groups = zip(self.names, self.engine.constants, strict=True)
@@ -315,5 +331,21 @@ def _inputs(model: Any) -> tuple[Channel, ...]:
         name = name_of(model, "actuator", i)
         if name in joints:
             name += ".control"  # a joint has the name already
-        found.append(Channel(name, "1", low=low, high=high))
+        j = driven_joint(model, i)
+        servo = j is not None and is_servo(model, i) and model.actuator_gear[i, 0] == 1
+        unit = ("m" if model.jnt_type[j] == 2 else "rad") if servo else "1"
+        found.append(Channel(name, unit, low=low, high=high))
     return tuple(found)
+
+
+def is_servo(model: Any, i: int) -> bool:
+    """Whether an actuator's input is a position that it drives to: kp is its gain."""
+    gain = float(model.actuator_gainprm[i, 0])
+    affine = model.actuator_biastype[i] == 1
+    return bool(affine and gain != 0.0 and model.actuator_biasprm[i, 1] == -gain)
+
+
+def driven_joint(model: Any, i: int) -> int | None:
+    """The index of the joint that an actuator acts on, if that is what it acts on."""
+    on_joint = model.actuator_trntype[i] in (0, 1)  # in the joint's or parent's frame
+    return int(model.actuator_trnid[i, 0]) if on_joint else None

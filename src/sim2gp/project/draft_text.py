@@ -1,0 +1,175 @@
+"""The words of a first project file: what was found, and the reason of each guess."""
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from sim2gp.data.logs import Column
+from sim2gp.inference.parameters import Parameter
+from sim2gp.project.columns import Match
+from sim2gp.project.project import is_model
+from sim2gp.project.replace import key as toml_key
+from sim2gp.project.replace import quoted
+from sim2gp.systems import MuJoCo
+from sim2gp.systems.base import AbstractSystem
+
+DELAY = 0.04  # s, the longest that a draft lets an input be late
+WINDOW = 1.0  # s, of windows of an arm with servos
+LISTED = 40  # constants that are named in the file
+_GAINS = ("kp", "kv")
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What a draft says; ``longest`` is the duration of the longest log in s."""
+
+    model: str
+    files: Sequence[Path]
+    out: Path
+    system: AbstractSystem
+    root: Path | None = None
+    time: Match | None = None
+    period: float | None = None
+    columns: Mapping[str, Match] = field(default_factory=dict)
+    constant: Mapping[str, float] = field(default_factory=dict)
+    images: int = 1
+    longest: float = 0.0
+
+
+def draft_text(c: Contents) -> str:
+    """The project file as TOML."""
+    folder, file = c.out.parent, is_model(c.model)
+    named = _relative(Path(c.model), folder) if file else c.model
+    rows = [
+        "# A draft by sim2gp init: every guess has its reason beside it. Read them.",
+        f"system = {quoted(named)}",
+        "",
+    ]
+    if c.root is not None:
+        rows += ["[options]", f"root = {quoted(_relative(c.root, folder))}", ""]
+    rows += _constants(c.system, file)
+    rows += ["", *(_logs(c) if c.files else _wanted(c.system))]
+    if isinstance(c.system, MuJoCo) and c.system.servos:
+        rows += ["", *_window(c.longest if c.files else WINDOW)]
+    rows += ["", "# Inputs act late on most machines; delay = 0.0 takes that out."]
+    for channel in c.system.actions:
+        rows.append(f"[actuators.{toml_key(channel.name)}]")
+        rows.append(f"delay = {{low = 0.0, high = {DELAY}}}")
+    return "\n".join(rows) + "\n"
+
+
+def open_parameters(system: AbstractSystem) -> list[Parameter]:
+    """What the draft leaves open: all usual parameters but the gains of servos."""
+    return [p for p in system.parameters.free if not _is_gain(p.name)]
+
+
+def _is_gain(name: str) -> bool:
+    return name.startswith("actuator/") and name.rsplit("/", 1)[-1] in _GAINS
+
+
+def _constants(system: AbstractSystem, file: bool) -> list[str]:
+    """What is open, and how to say more about it."""
+    table, nominal = open_parameters(system), system.parameters.nominal()
+    whose = "within a factor of three of the file's numbers" if file else "as bundled"
+    rows = [f"# {len(table)} constants are open, {whose}:"]
+    held = [p.name for p in system.parameters.free if _is_gain(p.name)]
+    if held and table:
+        rows += [
+            "# {} says nothing more; {mean = ..., sd = ...} says what you know.",
+            "[parameters]",
+            *(
+                f"{toml_key(p.name)} = {{}}  # {nominal[p.name]:.4g} {p.unit}".rstrip()
+                for p in table
+            ),
+            "# Not open, as the model has them: the gains of the servos, kp and kv.",
+            "# Masses, friction and these gains share a factor that logs of positions",
+            "# and targets do not tell. Name one here if you know the masses.",
+        ]
+        return rows
+    for p in table[:LISTED]:
+        rows.append(f"#   {p.name} = {nominal[p.name]:.4g} {p.unit}".rstrip())
+    if len(table) > LISTED:
+        rows.append(f"#   and {len(table) - LISTED} more")
+    example = toml_key(table[0].name) if table else "NAME"
+    rows.append(f"# To say what you know: [parameters.{example}] mean = ... sd = ...")
+    return rows
+
+
+def _logs(c: Contents) -> list[str]:
+    """The recordings, and the column of each channel."""
+    listed = [quoted(_relative(file, c.out.parent)) for file in c.files]
+    rows = ["[[logs]]", f"files = [{', '.join(listed)}]"]
+    if c.time is not None:
+        rows.append(f"time = {_value(c.time.column)}  # {c.time.why}")
+    elif c.period is not None:
+        rows.append(f"period = {c.period!r}")
+    if c.images > 1:
+        rows += [
+            "",
+            f"# {c.images} ways to read these columns, mirror images and the like,",
+            "# are one to the machine: this is the plainest of them.",
+        ]
+    rows.append("[logs.columns]")
+    for name, m in c.columns.items():
+        rows.append(f"{toml_key(name)} = {_value(m.column)}  # {m.why}")
+    for name, value in c.constant.items():
+        rows.append(f"{toml_key(name)} = {value!r}  # constant, as --constant says")
+    return rows
+
+
+def _wanted(system: AbstractSystem) -> list[str]:
+    """Without a log: the columns that one needs, and how it is named here."""
+    states = [c for c in system.physical_states if not c.name.endswith(".activation")]
+    joints = [c for c in states if not c.name.endswith(".velocity")]
+    rates = [c for c in states if c.name.endswith(".velocity")]
+    rows = ["# There is no log yet. One needs a row for each sample, with the columns"]
+    rows.append("#   time in s")
+    rows += [f"#   {c.name} in {_unit(c.unit)}, measured" for c in joints]
+    rows += [f"#   {c.name} in {_unit(c.unit)}, as commanded" for c in system.actions]
+    if rates:
+        rows.append("# and, where they are measured, the velocities")
+        rows += [f"#   {c.name} in {c.unit}" for c in rates]
+    rows += [
+        "# Record the commands that were sent, in the units of the model. Then run",
+        "# sim2gp init MODEL LOG --out FILE for another draft, or add the log here:",
+        "# [[logs]]",
+        '# files = ["run.csv"]',
+        "# [logs.columns]",
+        *(f'# {toml_key(c.name)} = "{c.name}"' for c in (*joints, *system.actions)),
+    ]
+    return rows
+
+
+def _unit(unit: str) -> str:
+    return "the model's unit" if unit == "1" else unit
+
+
+def _window(longest: float) -> list[str]:
+    """A servo hides masses and friction for some tenths of a second."""
+    window = min(WINDOW, int(1e3 * longest) / 1e3)
+    return [
+        "# Servos hide masses and friction in short windows: of a six-axis arm,",
+        "# .2, .5, 1, 2.5 and 5 s left median errors of .14, .089, .023, .027, .029.",
+        "[likelihood]",
+        f"window = {window!r}",
+    ]
+
+
+def _value(column: Column) -> str:
+    """A column as the file says it."""
+    plain = Column(column.column)
+    if column == plain:
+        return quoted(column.column)
+    words = [f"column = {quoted(column.column)}"]
+    if column.unit is not None:
+        words.append(f"unit = {quoted(column.unit)}")
+    if column.sign != plain.sign:
+        words.append(f"sign = {column.sign}")
+    if column.offset != plain.offset:
+        words.append(f"offset = {column.offset!r}")
+    return "{" + ", ".join(words) + "}"
+
+
+def _relative(file: Path, folder: Path) -> str:
+    return Path(os.path.relpath(file, folder)).as_posix()
