@@ -13,7 +13,7 @@ from pathlib import Path
 
 from sim2gp.errors import InputError
 from sim2gp.inference.parameters import Parameter
-from sim2gp.project.build import with_actuators
+from sim2gp.project.actuators import with_actuators
 from sim2gp.project.effects import with_effects
 from sim2gp.project.priors import located, prior
 from sim2gp.project.schema import ParameterSpec, ProjectSpec

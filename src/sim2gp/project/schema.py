@@ -133,11 +133,15 @@ class WeighedSpec(Section):
 
 
 class ActuatorSpec(Section):
-    """Gain, offset, delay of one input: a number fixes, a table or "free" learns."""
+    """Gain, offset, delay of one input: a number fixes, a table or "free" learns.
+
+    ``tie`` makes all inputs of a pattern share each of the three.
+    """
 
     gain: FiniteFloat | Literal["free"] | PriorSpec = 1.0
     offset: FiniteFloat | Literal["free"] | PriorSpec = 0.0
     delay: FiniteFloat | Literal["free"] | PriorSpec = 0.0
+    tie: bool = False
 
 
 class LikelihoodSpec(Section):
