@@ -53,7 +53,8 @@ class PriorSpec(Section):
 class ParameterSpec(PriorSpec):
     """A prior of a constant of the machine, or of all that a pattern names.
 
-    ``tie`` makes all constants of a pattern one number (of a model's file alone).
+    ``tie`` makes the constants of a pattern one number for each quantity (of a model's
+    file alone).
     """
 
     tie: bool = False

@@ -24,8 +24,8 @@
 `body/NAME/inertia/alpha` and so on, are those of `sim2gp.systems.mujoco.inertia`.
 """
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from typing import Any
 
@@ -33,7 +33,7 @@ import numpy as np
 
 from sim2gp.errors import InputError, nearest
 from sim2gp.systems.mujoco.inertia import NAMES as INERTIA
-from sim2gp.systems.mujoco.inertia import BodyInertia, unframe
+from sim2gp.systems.mujoco.inertia import BodyInertia, mirror_sign, unframe
 
 #: Quantities that MuJoCo derives others from when it compiles a model.
 DERIVED = frozenset({"mass", "com_x", "com_y", "com_z", "length", "armature", "gear"})
@@ -87,6 +87,7 @@ class Constant:
     get: Callable[[Any], float]
     put: Callable[[Any, float], None]
     block: BodyInertia | None = None  # sets several of them at once
+    sign: float = 1.0  # of the number that tied constants share
 
     @property
     def kind(self) -> str:
@@ -133,14 +134,40 @@ def matching(known: dict[str, Constant], pattern: str) -> list[Constant]:
     return found
 
 
+def tied(constants: Sequence[Constant], model: Any) -> list[list[Constant]]:
+    """Constants that are one number for each quantity.
+
+    Where two bodies are mirror images in the model they stay so: what a mirror turns
+    round has the other sign.
+    """
+    groups: dict[tuple[str, str], list[Constant]] = {}
+    for c in constants:
+        groups.setdefault((c.kind, c.quantity), []).append(c)
+    return [
+        [replace(c, sign=_sign(group[0], c, model)) for c in group]
+        for group in groups.values()
+    ]
+
+
+def _sign(first: Constant, other: Constant, model: Any) -> float:
+    if first.block is not None and other.block is not None:
+        return mirror_sign(first.block.own, other.block.own, other.quantity)
+    opposite = first.get(model) * other.get(model) < 0.0
+    return -1.0 if opposite and first.quantity in SIGNED else 1.0
+
+
 def set_constants(model: Any, pairs: Iterable[tuple[Constant, float]]) -> None:
-    """Give constants values, as they stand; `mujoco.mj_setConst` derives the rest."""
+    """Give constants values, as they stand; `mujoco.mj_setConst` derives the rest.
+
+    Of tied constants it is the value that they share.
+    """
     blocks: dict[BodyInertia, dict[str, float]] = {}
     for constant, value in pairs:
         if constant.block is None:
-            constant.put(model, value)
+            constant.put(model, constant.sign * value)
         else:
-            blocks.setdefault(constant.block, {})[constant.quantity] = value
+            signed = constant.sign * value
+            blocks.setdefault(constant.block, {})[constant.quantity] = signed
     for block, values in blocks.items():
         block.put(model, values)
 

@@ -30,6 +30,7 @@ from sim2gp.systems.mujoco.constants import (
     constants_of,
     matching,
     name_of,
+    tied,
 )
 from sim2gp.systems.mujoco.engine import Engine
 from sim2gp.systems.mujoco.load import compiled
@@ -52,7 +53,7 @@ class MuJoCo(AbstractPlant):
     Its joints are the states, ``<joint>`` and ``<joint>.velocity``, then activations of
     actuators; its actuators are the inputs. ``constants`` are paths or patterns; where
     it is None, dampings, armatures, dry frictions and masses that are not zero in the
-    model. Those in one inner sequence are tied: one number, under the
+    model. Those in one inner sequence are tied: one number for each quantity, under the
     first one's name. Priors are within a factor of 3 of the model's number; ``priors``
     replaces them by name, or fixes the constant. ``root`` is the folder that the
     model's files must lie in, its own if None; ``source`` the file that a compiled
@@ -110,7 +111,7 @@ class MuJoCo(AbstractPlant):
         """Values by name as those of every constant: what is tied has the same."""
         groups = zip(self.names, self.engine.constants, strict=True)
         known = ((values[n], group) for n, group in groups if n in values)
-        return {c.path: float(value) for value, group in known for c in group}
+        return {c.path: c.sign * float(value) for value, group in known for c in group}
 
     def file(self, *, mjcf: bool = False) -> ModelFile:
         """The model's file, to be written with other constants (``mjcf``: as MJCF).
@@ -180,7 +181,7 @@ def _groups(
     known: dict[str, Constant],
     constants: Sequence[str | Sequence[str]] | None,
 ) -> list[list[Constant]]:
-    """The open constants; each inner list is one number."""
+    """The open constants; each inner list is one number for each quantity."""
     if constants is None:
         # No gain of a motor or a servo: where it is free, so is the scale of all
         # masses and forces.
@@ -196,7 +197,7 @@ def _groups(
         if isinstance(entry, str):
             groups += [[c] for c in matching(known, entry)]
         else:
-            groups.append([c for path in entry for c in matching(known, path)])
+            groups += tied([c for p in entry for c in matching(known, p)], model)
     paths = [c.path for group in groups for c in group]
     for path in paths:
         if paths.count(path) > 1:
