@@ -254,6 +254,11 @@ CHANGES: dict[str, Change] = {
     "actuators.*.gain": ("", "[actuators.voltage]\ngain = 0.9\n", machine),
     "actuators.*.offset": ("", "[actuators.voltage]\noffset = 0.1\n", machine),
     "actuators.*.delay": ("", '[actuators.voltage]\ndelay = "free"\n', machine),
+    "actuators.*.tie": (
+        'system = "two_link"\n[actuators."torque*"]\ndelay = "free"\n',
+        'system = "two_link"\n[actuators."torque*"]\ndelay = "free"\ntie = true\n',
+        machine,
+    ),
     "likelihood.window": with_group("", "[likelihood]\nwindow = 0.1\n", windows),
     "likelihood.start": with_group("", '[likelihood]\nstart = "causal"\n', windows),
     "likelihood.robust": with_group("", "[likelihood]\nrobust = true\n", windows),

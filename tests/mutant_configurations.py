@@ -132,8 +132,8 @@ CONFIGURATIONS = (
     Mutant(
         "weighed: lost when a candidate is tried",
         MACHINES,
-        "table, names = machine.parameters, {part.name for part in parts}",
-        "table, names = machine.plant.parameters, {part.name for part in parts}",
+        "table, places = machine.parameters, {part.place for part in parts}",
+        "table, places = machine.plant.parameters, {part.place for part in parts}",
         (WEIGHED, "candidate"),
     ),
     Mutant(

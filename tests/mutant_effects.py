@@ -94,4 +94,18 @@ EFFECTS = (
         '("s", -2)',
         LAW,
     ),
+    Mutant(
+        "actuator tie: the constant is each input's own",
+        "systems/actuators.py",
+        "{self.tie or self.where}",
+        "{self.where}",
+        ("test_tied_actuators.py", "both_inputs or for_all"),
+    ),
+    Mutant(
+        "actuator tie: a shared delay is proposed again",
+        "systems/effects/registry.py",
+        "if not isinstance(p, AbstractActuator) or p.name in there",
+        "if not isinstance(p, AbstractActuator)",
+        ("test_tied_actuators.py", "proposed_again"),
+    ),
 )

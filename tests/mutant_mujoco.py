@@ -5,6 +5,7 @@ from mutant_list import Mutant
 EXTERNAL, ENGINE = "systems/plants/external.py", "systems/mujoco/engine.py"
 MJCF, FILE = "systems/mujoco/constants.py", "systems/mujoco/model_file.py"
 SAY, SOURCES = "systems/mujoco/write_back.py", "systems/mujoco/sources.py"
+UNSUPPORTED = "systems/mujoco/unsupported.py"
 
 ON_THE_HOST = (
     Mutant(
@@ -101,8 +102,8 @@ ON_THE_HOST = (
     Mutant(
         "mjcf: a servo's gain without its bias",
         MJCF,
-        "model.actuator_biasprm[i, column] = -value",
-        "pass",
+        'cell["put"](model, value)\n        if follows:',
+        "if follows:",
         ("test_mujoco_system.py", "step_is or batch"),
     ),
     Mutant(
@@ -324,9 +325,65 @@ ON_THE_HOST = (
     ),
     Mutant(
         "mujoco: delays are left to the engine",
-        "systems/mujoco/system.py",
-        "    _check_delays(found)\n",
-        "",
+        UNSUPPORTED,
+        ", _delays, _state",
+        ", _state",
         ("test_mujoco_file.py", "own_delay"),
+    ),
+    Mutant(
+        "mujoco: what MuJoCo keeps beyond the state is lost",
+        UNSUPPORTED,
+        "    if more:",
+        "    if more < 0:",
+        ("test_mujoco_unsupported.py", "no_check_knows"),
+    ),
+    Mutant(
+        "mujoco: a kind of actuator that is not known",
+        UNSUPPORTED,
+        "if word not in known:",
+        'if word == "USER":',
+        ("test_mujoco_unsupported.py", "refused_by_name"),
+    ),
+    Mutant(
+        "mjcf: the gain goes with any equal term of a bias",
+        MJCF,
+        "for c in columns[:1] if gain",
+        "for c in columns if gain",
+        ("test_mujoco_text.py", "changes_alone"),
+    ),
+    Mutant(
+        "external: a system without inputs has no rows",
+        EXTERNAL,
+        "count = math.prod(lead)",
+        "count = -1",
+        ("test_mujoco_unsupported.py", "steps_as_c"),
+    ),
+    Mutant(
+        "mjcf say: friction of a pair along one tangent",
+        SAY,
+        "[constant.index, :2].tolist()",
+        "[constant.index, :1].tolist()",
+        ("test_mujoco_text.py", "changes_alone"),
+    ),
+    Mutant(
+        "mujoco tie: a mirror image turns the same way",
+        "systems/mujoco/inertia.py",
+        "return float(M[i] * M[j])",
+        "return 1.0",
+        ("test_mujoco_ties.py", "mirror_images"),
+    ),
+    Mutant(
+        "mujoco tie: a pattern is one number",
+        MJCF,
+        "groups.setdefault((c.kind, c.quantity), [])",
+        'groups.setdefault(("", ""), [])',
+        ("test_mujoco_ties.py", "each_quantity"),
+    ),
+    Mutant(
+        "mujoco tie: the file has the first one's sign",
+        "systems/mujoco/system.py",
+        "c.path: c.sign * float(value)",
+        "c.path: float(value)",
+        ("test_mujoco_ties.py", "each_quantity or mirror"),
     ),
 )

@@ -329,3 +329,32 @@ def test_what_rests_is_dead_and_not_identified(tmp_path):
     )
     words = {name: entry["verdict"] for name, entry in found["parameters"].items()}
     assert words == {"joint/x/damping": "identified"} | dict.fromkeys(dead, "dead")
+
+
+SERVO = """<mujoco><option gravity="0 0 0"/><worldbody><body>
+<joint name="q" axis="0 1 0" damping=".05" frictionloss=".02" armature=".01"/>
+<geom type="capsule" fromto="0 0 0 0 0 -.3" size=".02" mass=".4"/></body></worldbody>
+<actuator><position name="servo" joint="q" kp="3" kv=".1"/></actuator></mujoco>"""
+
+
+@in_float64
+def test_gains_of_servos_are_held_as_they_share_a_factor_with_all_else(tmp_path):
+    """Twice the mass, friction and gains move alike; without the gains they do not."""
+    path = written(tmp_path, SERVO)
+    held = sy.MuJoCo(path).parameters.names
+    assert {name.split("/")[-1] for name in held} == {
+        *("damping", "frictionloss", "armature", "mass"),
+    }
+    gains = ("actuator/servo/kp", "actuator/servo/kv")
+    system = sy.MuJoCo(path, [*held, *gains])
+    own = system.parameters.nominal()
+    doubled = {k: 2.0 * v for k, v in own.items()}
+
+    def after(values):
+        params = system.record({k: jnp.asarray(v) for k, v in values.items()})
+        s, a = jnp.asarray([0.2, -1.0]), jnp.asarray([0.5])
+        return np.asarray(system.flow(params, s, a, 0.1))
+
+    np.testing.assert_allclose(after(doubled), after(own), rtol=1e-6)
+    apart = after(doubled | {k: own[k] for k in gains}) - after(own)
+    assert np.abs(apart).max() > 1e-2

@@ -29,7 +29,7 @@ ARM = """<?xml version="1.0"?>
       <joint   name = 'swing'
                axis="0 1 0"/>
       <geom type="capsule" fromto="0 0 0 0 0 -.4" size=".02" mass='.5'/>
-      <geom type="sphere" size=".04" mass=".25"/>
+      <geom name="hub" type="sphere" size=".04" mass=".25"/>
       <frame pos="0 0 -.4">
         <body name="lower" childclass="stiff">
           <joint axis="0 1 0"/>
@@ -46,7 +46,15 @@ ARM = """<?xml version="1.0"?>
     <motor name="push" joint="swing" gear="2" ctrllimited="true" ctrlrange="-1 1"/>
     <position joint="swing" kp="3"/>
     <general joint="swing" gainprm="5" biastype="affine" biasprm="0 -5 -.1"/>
+    <damper joint="swing" kv=".4" ctrlrange="0 1"/>
+    <general joint="swing" gainprm="3" biastype="affine" biasprm=".1 -2 -.2"/>
+    <position joint="swing" kp="1" kv="1"/>
   </actuator>
+  <contact>
+    <pair geom1="rod" geom2="hub"/>
+    <pair name="soft" geom1="rod" geom2="hub" friction=".6 .3" solref=".03 .9"/>
+    <pair name="hard" geom1="hub" geom2="rod" solref="-900 -40"/>
+  </contact>
 </mujoco>
 """
 HAND = """<mujocoinclude>
@@ -71,6 +79,17 @@ CHANGES = {
     "actuator/actuator1/kp": 4.0,
     "actuator/actuator2/kp": 6.0,
     "actuator/actuator2/kv": 0.2,
+    "actuator/actuator3/kv": 0.7,  # a damper's is a gain
+    "actuator/actuator4/gain": 4.0,  # no servo's, that is its kp
+    "actuator/actuator4/kp": 2.5,
+    "actuator/actuator5/kp": 2.0,  # the gain goes with it
+    "actuator/actuator5/kv": 0.5,  # and does not go with this
+    "pair/soft/friction": 0.9,
+    "pair/soft/timeconst": 0.04,
+    "pair/soft/dampratio": 1.1,
+    "pair/hard/friction": 0.4,  # of its geoms, until it is stated
+    "pair/hard/stiffness": 1000.0,
+    "pair/hard/damping": 50.0,
     "option/gravity": 9.7,
 }
 

@@ -45,7 +45,8 @@ def _mean_inputs(grid: Grid, row: int) -> Float[np.ndarray, "W row m"]:
         [np.diff(np.interp(edges, knots, column)) for column in np.asarray(area).T]
         for knots, area in zip(w.knots, w.area, strict=True)
     ]
-    return np.asarray(means).transpose(0, 2, 1) / PERIOD
+    found = np.asarray(means).reshape(len(means), w.area.shape[2], row)
+    return found.transpose(0, 2, 1) / PERIOD
 
 
 def _features(

@@ -47,8 +47,8 @@ def jacobian_by_columns(
         values, slopes = jax.jvp(f, (x,), (v,))
         return slopes[0], values
 
-    together = x.size if at_once else None
-    J, values = jax.lax.map(column, jnp.eye(x.size, dtype=x.dtype), batch_size=together)
+    columns = jnp.eye(x.size, dtype=x.dtype)
+    J, values = jax.vmap(column)(columns) if at_once else jax.lax.map(column, columns)
     return jnp.moveaxis(J, 0, -1), jax.tree.map(lambda a: a[0], values)
 
 

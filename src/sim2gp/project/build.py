@@ -13,6 +13,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from sim2gp.errors import InputError
 from sim2gp.inference.parameters import Parameter, Parameters, unknown_parameter
 from sim2gp.project import slips
+from sim2gp.project.actuators import with_actuators
 from sim2gp.project.effects import with_effects
 from sim2gp.project.priors import located, prior
 from sim2gp.project.schema import (
@@ -23,9 +24,8 @@ from sim2gp.project.schema import (
 )
 from sim2gp.project.source import Source
 from sim2gp.project.validate import unknown, words, wrong_value
-from sim2gp.systems import AbstractPlant, AbstractSystem, with_parts
-from sim2gp.systems.actuators import neutral_actuators
-from sim2gp.systems.machine import as_machine, plant_of
+from sim2gp.systems import AbstractPlant, AbstractSystem
+from sim2gp.systems.machine import as_machine
 from sim2gp.systems.variants import AT
 
 
@@ -117,44 +117,6 @@ def _table(
             raise located(unknown_parameter(name, known), where)
         changes[name] = prior(stated, base, where, fixed.get(name))
     return table.replace(**changes)
-
-
-def with_actuators(
-    system: AbstractSystem, spec: ProjectSpec, source: Source
-) -> AbstractSystem:
-    """The machine with its actuators; what the file does not name is neutral."""
-    if not spec.actuators:
-        return system
-    plant, inputs = plant_of(system), [channel.name for channel in system.actions]
-    stated: dict[str, Parameter | float] = {}
-    for name in spec.actuators:
-        if name not in inputs:
-            raise unknown("input", name, inputs, source.where("actuators", name))
-    parts = neutral_actuators(system.actions)
-    for part in parts:
-        if part.where not in spec.actuators:
-            continue
-        said = getattr(spec.actuators[part.where], part.what)
-        where = source.where("actuators", part.where, part.what)
-        base = part.parameter(plant)
-        own = None if part.what == "delay" else part.magnitude
-        chosen = base if said == "free" else prior(said, base, where, own)
-        _check_delay(part.what, chosen, where)
-        stated[part.name] = chosen
-    return with_parts(system, parts, stated)
-
-
-def _check_delay(part: str, stated: Parameter | float, where: str) -> None:
-    low = stated.low if isinstance(stated, Parameter) else stated
-    if part == "delay" and low < 0:
-        raise InputError(
-            "E141",
-            "negative delay",
-            where=where,
-            got=f"{low:g} s",
-            expected="a delay of at least 0 s",
-            fix="state low and high, with low >= 0",
-        )
 
 
 def check_names(spec: ProjectSpec, source: Source, system: AbstractSystem) -> None:

@@ -13,14 +13,20 @@ from pathlib import Path
 
 from sim2gp.errors import InputError
 from sim2gp.inference.parameters import Parameter
-from sim2gp.project.build import with_actuators
+from sim2gp.project.actuators import with_actuators
 from sim2gp.project.effects import with_effects
 from sim2gp.project.priors import located, prior
 from sim2gp.project.schema import ParameterSpec, ProjectSpec
 from sim2gp.project.source import Source
 from sim2gp.project.validate import unknown
 from sim2gp.systems import AbstractSystem, MuJoCo
-from sim2gp.systems.mujoco.constants import SIGNED, Constant, constants_of, matching
+from sim2gp.systems.mujoco.constants import (
+    SIGNED,
+    Constant,
+    constants_of,
+    matching,
+    tied,
+)
 from sim2gp.systems.mujoco.system import default_prior, loaded
 from sim2gp.systems.variants import AT
 
@@ -60,8 +66,8 @@ def build_model(
                 expected="a constant that no other table names",
                 fix="remove the pattern, or one of the other tables",
             )
-        tied = isinstance(stated, ParameterSpec) and stated.tie
-        for group in [found] if tied else [[c] for c in found]:
+        shared = isinstance(stated, ParameterSpec) and stated.tie
+        for group in tied(found, model) if shared else [[c] for c in found]:
             groups.append([c.path for c in group])
             priors[group[0].path] = _prior(stated, group[0], model, where)
     try:

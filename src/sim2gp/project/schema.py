@@ -53,7 +53,8 @@ class PriorSpec(Section):
 class ParameterSpec(PriorSpec):
     """A prior of a constant of the machine, or of all that a pattern names.
 
-    ``tie`` makes all constants of a pattern one number (of a model's file alone).
+    ``tie`` makes the constants of a pattern one number for each quantity (of a model's
+    file alone).
     """
 
     tie: bool = False
@@ -133,11 +134,15 @@ class WeighedSpec(Section):
 
 
 class ActuatorSpec(Section):
-    """Gain, offset, delay of one input: a number fixes, a table or "free" learns."""
+    """Gain, offset, delay of one input: a number fixes, a table or "free" learns.
+
+    ``tie`` makes all inputs of a pattern share each of the three.
+    """
 
     gain: FiniteFloat | Literal["free"] | PriorSpec = 1.0
     offset: FiniteFloat | Literal["free"] | PriorSpec = 0.0
     delay: FiniteFloat | Literal["free"] | PriorSpec = 0.0
+    tie: bool = False
 
 
 class LikelihoodSpec(Section):

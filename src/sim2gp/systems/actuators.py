@@ -4,10 +4,10 @@
 
 Each is one part of a machine, with one constant, ``<input>.gain``, ``<input>.offset``
 (in the input's unit), ``<input>.delay`` and ``<input>.lag`` (in seconds): free with a
-prior, or fixed. Gain and offset act inside `flow`. A delay acts on the held input: a
-substep of length ``h`` sees its mean, ``(U(t + h - tau) - U(t - tau)) / h`` with ``U``
-the integral of the held input; so the delay ``tau`` has a gradient, which a shift by
-whole samples has not.
+prior, or fixed. Inputs that are driven alike may share one constant. Gain and offset
+act inside `flow`. A delay acts on the held input: a substep of length ``h`` sees its
+mean, ``(U(t + h - tau) - U(t - tau)) / h`` with ``U`` the integral of the held input;
+so the delay ``tau`` has a gradient, which a shift by whole samples has not.
 
 A lag ``T`` is a first-order low pass, ``T du_f/dt = u - u_f``. Held inputs ``a_k`` make
 the filtered input a sum of responses to steps, so its integral over any interval is in
@@ -20,11 +20,12 @@ where input ``k`` is held from ``t_k`` on for one period.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+from equinox import AbstractVar
 from jaxtyping import Array, Float
 
 from sim2gp import checks
@@ -39,7 +40,13 @@ FADED = 5.0  # time constants after which a past input counts for less than 1 %
 
 
 class AbstractActuator(AbstractPart):
-    """A part on one input."""
+    """A part on one input; ``tie`` names the input whose constant it shares."""
+
+    tie: AbstractVar[str]
+
+    @property
+    def name(self) -> str:
+        return f"{self.tie or self.where}.{self.what}"
 
 
 class Gain(AbstractActuator):
@@ -47,6 +54,7 @@ class Gain(AbstractActuator):
 
     where: str = eqx.field(static=True)
     magnitude: float = eqx.field(static=True, default=1.0)
+    tie: str = eqx.field(static=True, default="")
     what: ClassVar[str] = "gain"
     meaning: ClassVar[str] = "gain of the input"
 
@@ -64,6 +72,7 @@ class Offset(AbstractActuator):
 
     where: str = eqx.field(static=True)
     magnitude: float = eqx.field(static=True, default=0.0)
+    tie: str = eqx.field(static=True, default="")
     what: ClassVar[str] = "offset"
     meaning: ClassVar[str] = "offset of the input"
 
@@ -86,6 +95,7 @@ class Delay(AbstractActuator):
 
     where: str = eqx.field(static=True)
     magnitude: float = eqx.field(static=True, default=0.0)
+    tie: str = eqx.field(static=True, default="")
     what: ClassVar[str] = "delay"
     meaning: ClassVar[str] = "delay of the input"
 
@@ -108,6 +118,7 @@ class Lag(AbstractActuator):
 
     where: str = eqx.field(static=True)
     magnitude: float = eqx.field(static=True)
+    tie: str = eqx.field(static=True, default="")
     what: ClassVar[str] = "lag"
     meaning: ClassVar[str] = "first-order lag of the input"
 
@@ -120,9 +131,19 @@ class Lag(AbstractActuator):
         return Parameter(self.name, "s", self.meaning, "log_bounded", *box)
 
 
-def neutral_actuators(channels: Sequence[Channel]) -> tuple[AbstractActuator, ...]:
-    """Gain, offset and delay of each input, as if there were none."""
-    return tuple(kind(c.name) for c in channels for kind in (Gain, Offset, Delay))
+def neutral_actuators(
+    channels: Sequence[Channel], ties: Mapping[str, str] | None = None
+) -> tuple[AbstractActuator, ...]:
+    """Gain, offset and delay of each input, as if there were none.
+
+    ``ties`` are inputs that share the constants of another one, by name.
+    """
+    tie = dict(ties or {})
+    return tuple(
+        kind(c.name, tie=tie.get(c.name, ""))
+        for c in channels
+        for kind in (Gain, Offset, Delay)
+    )
 
 
 def delayed_means(

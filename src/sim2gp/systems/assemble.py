@@ -36,13 +36,13 @@ def with_parts(
     if not parts:
         return system
     machine, given = as_machine(system), dict(parameters or {})
-    table, names = machine.parameters, {part.name for part in parts}
-    for part in parts:
+    table, places = machine.parameters, {part.place for part in parts}
+    for part in (p for p in parts if p.name == p.place):
         value = given.get(part.name, part.magnitude)
         if part.name not in names_of(table):
             table = table.merge(Parameters((), ((part.name, part.magnitude),)))
         table = table.replace(**{part.name: value})
-    every = [*(p for p in machine.parts if p.name not in names), *parts]
+    every = [*(p for p in machine.parts if p.place not in places), *parts]
     return Machine(
         machine.plant,
         [p for p in every if isinstance(p, AbstractEffect)],

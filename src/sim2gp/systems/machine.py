@@ -72,7 +72,8 @@ class Machine(AbstractSystem):
     likelihood over windows).
 
     Raises `InputError` E103 for an unknown channel, E145 for an unknown name, for two
-    parts of one name and for a part that the plant cannot have, E141 for a delay or a
+    parts of one name, for a tie to a part that is not there and for a part that the
+    plant cannot have, E141 for a delay or a
     lag out of its range, E148 for a period that is not positive, E140, E123 or E173 for
     an effect whose functions have another shape, are no real numbers, or raise.
     """
@@ -103,12 +104,7 @@ class Machine(AbstractSystem):
             checks.positive("Machine", period=period)
         for part in self.parts:
             part.unit(plant)  # raises for a channel that is not there
-        fixed = Parameters((), tuple((p.name, p.magnitude) for p in self.parts))
-        own = plant.parameters.merge(fixed)
-        names = names_of(own)
-        for part in self.parts:
-            if names.count(part.name) > 1:
-                raise InputError("E145", "two parts of one name", got=part.name)
+        own = plant.parameters.merge(self._magnitudes())
         if isinstance(parameters, Parameters):
             self.parameters = _completed(own, parameters, self.variants)
         else:
@@ -121,9 +117,27 @@ class Machine(AbstractSystem):
         for effect in self.effects:
             check_effect(self.plant, effect)
 
+    def _magnitudes(self) -> Parameters:
+        """The constants of the parts, fixed; a shared one is that of its own input."""
+        names = [*names_of(self.plant.parameters), *(p.place for p in self.parts)]
+        for part in self.parts:
+            if names.count(part.place) > 1:
+                raise InputError("E145", "two parts of one name", got=part.place)
+        own = {p.name: p.magnitude for p in self.parts if p.name == p.place}
+        for part in self.parts:
+            if part.name not in own:
+                raise InputError(
+                    "E145",
+                    f"{part.place} shares a constant that is not there",
+                    got=part.name,
+                    expected=", ".join(own),
+                    fix="tie it to an input with a part of its own",
+                )
+        return Parameters((), tuple(own.items()))
+
     def _check_inputs(self) -> None:
         """Delays and lags that can be followed (E141, E145, E148)."""
-        late = {p.where for p in self.actuators if isinstance(p, Delay)}
+        late = {p.where: p.name for p in self.actuators if isinstance(p, Delay)}
         for part in self.actuators:
             low, high = self._range(part.name)
             if isinstance(part, Delay) and (low < 0.0 or high == math.inf):
@@ -137,7 +151,7 @@ class Machine(AbstractSystem):
             if not isinstance(part, Lag):
                 continue
             checks.positive("Machine with a lag", period=self.period or 0.0)
-            if part.where in late and self._range(f"{part.where}.delay")[1] > 0.0:
+            if part.where in late and self._range(late[part.where])[1] > 0.0:
                 raise InputError(
                     "E145", "lag of an input that is delayed", where=part.where
                 )

@@ -1,7 +1,8 @@
 """A part of a machine: one scalar more than its plant has, with its name and prior.
 
 Effects, sensors and actuators are parts. A machine holds them in tuples
-(`sim2gp.systems.machine`); the constant of each is named ``<where>.<what>``.
+(`sim2gp.systems.machine`); the constant of each is named ``<where>.<what>``, but for
+actuators that share the one of another input.
 """
 
 import abc
@@ -34,9 +35,14 @@ class AbstractPart(eqx.Module):
         """What kind of part this is, in one word."""
 
     @property
-    def name(self) -> str:
-        """Name of the constant: ``<where>.<what>``."""
+    def place(self) -> str:
+        """Where the part is: ``<where>.<what>``; a machine has one part there."""
         return f"{self.where}.{self.what}"
+
+    @property
+    def name(self) -> str:
+        """Name of the constant, which is that of the place unless it is shared."""
+        return self.place
 
     @abc.abstractmethod
     def unit(self, plant: AbstractPlant) -> str:

@@ -99,4 +99,5 @@ class Log:
 
     def commanded(self, names: Sequence[str]) -> Float[np.ndarray, "N m"]:
         """The inputs side by side in the given order; each is held to the next row."""
-        return np.stack([self.inputs[name] for name in names], axis=1)
+        columns = [self.inputs[name] for name in names]
+        return np.asarray(columns, float).reshape(len(names), len(self.time)).T

@@ -60,7 +60,7 @@ def misfit_of_windows(likelihood: WindowsLikelihood, fitted: Estimate) -> Misfit
     """
     system, cut = likelihood.system, likelihood.windows
     found = linearise(likelihood, fitted, fitted.posterior.mean)
-    r, J, s, a = (np.asarray(x).reshape(-1, *x.shape[2:]) for x in found)
+    r, J, s, a = (np.concatenate(np.asarray(x)) for x in found)
     weight = np.sqrt(np.repeat(np.asarray(fitted.noise.weights), cut.mask.shape[1]))
     scale = weight[:, None] / np.asarray(fitted.noise.sd)
     mask = np.asarray(cut.mask).reshape(r.shape)

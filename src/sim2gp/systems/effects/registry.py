@@ -191,7 +191,11 @@ def _new(found: Sequence[Candidate], system: AbstractSystem) -> tuple[Candidate,
     table = system.parameters
     there = {*table.names, *(name for name, value in table.fixed if value != 0.0)}
     parts = system.parts if isinstance(system, Machine) else ()
-    held = {(type(p), p.where) for p in parts if not isinstance(p, AbstractActuator)}
+    held = {
+        (type(p), p.where)
+        for p in parts
+        if not isinstance(p, AbstractActuator) or p.name in there
+    }
     return tuple(
         c
         for c in found

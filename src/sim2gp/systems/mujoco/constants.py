@@ -11,17 +11,21 @@
 | `body/NAME/inertia`       | 1, m         | all of it: ten numbers, zero in the file |
 | `body/NAME/length`        | m            | distance from the parent's frame         |
 | `actuator/NAME/gain`      | its own      | force for an input of one, of a motor    |
-| `actuator/NAME/kp`, `kv`  | its own      | gains of a servo                         |
+| `actuator/NAME/kp`, `kv`  | its own      | gains of a servo, `kv` of a damper       |
 | `actuator/NAME/gear`      | 1            | gear ratio                               |
 | `geom/NAME/friction`      | 1            | sliding friction of a contact            |
+| `pair/NAME/friction`      | 1            | the same, of a contact pair with a name  |
+| `pair/NAME/timeconst`     | s            | `solref` of the pair, and `dampratio`    |
+| `pair/NAME/stiffness`     | 1/s^2        | where `solref` is negative: its two      |
+| `pair/NAME/damping`       | 1/s          | numbers, positive                        |
 | `option/gravity`          | m/s^2        | strength, in the model's direction       |
 
 `NAME` may be a pattern (`joint/*/damping`). The ten numbers of `body/NAME/inertia`,
 `body/NAME/inertia/alpha` and so on, are those of `sim2gp.systems.mujoco.inertia`.
 """
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from typing import Any
 
@@ -29,7 +33,7 @@ import numpy as np
 
 from sim2gp.errors import InputError, nearest
 from sim2gp.systems.mujoco.inertia import NAMES as INERTIA
-from sim2gp.systems.mujoco.inertia import BodyInertia, unframe
+from sim2gp.systems.mujoco.inertia import BodyInertia, mirror_sign, unframe
 
 #: Quantities that MuJoCo derives others from when it compiles a model.
 DERIVED = frozenset({"mass", "com_x", "com_y", "com_z", "length", "armature", "gear"})
@@ -61,6 +65,8 @@ _MEANING = {
     "kv": "velocity gain of {}",
     "gear": "gear ratio of {}",
     "friction": "sliding friction of {}",
+    "timeconst": "time constant of contact {}",
+    "dampratio": "damping ratio of contact {}",
 }
 #: Quantities that may be negative.
 SIGNED = frozenset({"com_x", "com_y", "com_z"})
@@ -81,6 +87,7 @@ class Constant:
     get: Callable[[Any], float]
     put: Callable[[Any, float], None]
     block: BodyInertia | None = None  # sets several of them at once
+    sign: float = 1.0  # of the number that tied constants share
 
     @property
     def kind(self) -> str:
@@ -101,6 +108,7 @@ def constants_of(model: Any) -> dict[str, Constant]:
         *_bodies(model),
         *_actuators(model),
         *_geoms(model),
+        *_pairs(model),
         *([_gravity(model)] if np.any(model.opt.gravity) else []),
     ]
     return {c.path: c for c in found}
@@ -126,14 +134,40 @@ def matching(known: dict[str, Constant], pattern: str) -> list[Constant]:
     return found
 
 
+def tied(constants: Sequence[Constant], model: Any) -> list[list[Constant]]:
+    """Constants that are one number for each quantity.
+
+    Where two bodies are mirror images in the model they stay so: what a mirror turns
+    round has the other sign.
+    """
+    groups: dict[tuple[str, str], list[Constant]] = {}
+    for c in constants:
+        groups.setdefault((c.kind, c.quantity), []).append(c)
+    return [
+        [replace(c, sign=_sign(group[0], c, model)) for c in group]
+        for group in groups.values()
+    ]
+
+
+def _sign(first: Constant, other: Constant, model: Any) -> float:
+    if first.block is not None and other.block is not None:
+        return mirror_sign(first.block.own, other.block.own, other.quantity)
+    opposite = first.get(model) * other.get(model) < 0.0
+    return -1.0 if opposite and first.quantity in SIGNED else 1.0
+
+
 def set_constants(model: Any, pairs: Iterable[tuple[Constant, float]]) -> None:
-    """Give constants values, as they stand; `mujoco.mj_setConst` derives the rest."""
+    """Give constants values, as they stand; `mujoco.mj_setConst` derives the rest.
+
+    Of tied constants it is the value that they share.
+    """
     blocks: dict[BodyInertia, dict[str, float]] = {}
     for constant, value in pairs:
         if constant.block is None:
-            constant.put(model, value)
+            constant.put(model, constant.sign * value)
         else:
-            blocks.setdefault(constant.block, {})[constant.quantity] = value
+            signed = constant.sign * value
+            blocks.setdefault(constant.block, {})[constant.quantity] = signed
     for block, values in blocks.items():
         block.put(model, values)
 
@@ -156,14 +190,14 @@ def _constant(
     return Constant(f"{kind}/{name}/{quantity}", i, unit, meaning, **how)
 
 
-def _cell(field: str, *index: int) -> dict[str, Callable[..., Any]]:
+def _cell(field: str, *index: int, sign: float = 1.0) -> dict[str, Callable[..., Any]]:
     """Reading and setting of one number in an array of the model."""
 
     def get(model: Any) -> float:
-        return float(getattr(model, field)[index])
+        return sign * float(getattr(model, field)[index])
 
     def put(model: Any, value: float) -> None:
-        getattr(model, field)[index] = value
+        getattr(model, field)[index] = sign * value
 
     return {"get": get, "put": put}
 
@@ -196,15 +230,24 @@ def _bodies(model: Any) -> list[Constant]:
 
 
 def _actuators(model: Any) -> list[Constant]:
+    """Of what is fixed or affine; a muscle's numbers have other meanings."""
     found = []
     for i in range(model.nu):
-        affine = model.actuator_biastype[i] != 0
-        how = [
-            (quantity, _servo(model, i, column))
-            for quantity, column in (("kp", 1), ("kv", 2))
-            if affine and model.actuator_biasprm[i, column] != 0.0
+        how = []
+        columns = [
+            column
+            for column in (1, 2)
+            if model.actuator_biastype[i] == 1 and model.actuator_biasprm[i, column]
         ]
-        how = how or [("gain", _cell("actuator_gainprm", i, 0))]
+        # The gain of a servo is that of its first term.
+        gain = model.actuator_gainprm[i, 0]
+        follows = [c for c in columns[:1] if gain == -model.actuator_biasprm[i, c]]
+        if model.actuator_gaintype[i] == 0 and not follows:
+            how.append(("gain", _cell("actuator_gainprm", i, 0)))
+        if model.actuator_gaintype[i] == 1 and model.actuator_gainprm[i, 2]:
+            how.append(("kv", _cell("actuator_gainprm", i, 2, sign=-1.0)))
+        for column in columns:
+            how.append((("kp", "kv")[column - 1], _servo(i, column, column in follows)))
         how.append(("gear", _cell("actuator_gear", i, 0)))
         found += [_constant(model, "actuator", i, q, "1", access) for q, access in how]
     return found
@@ -216,6 +259,23 @@ def _geoms(model: Any) -> list[Constant]:
         _constant(model, "geom", g, "friction", "1", _cell("geom_friction", g, 0))
         for g in touching.tolist()
     ]
+
+
+def _pairs(model: Any) -> list[Constant]:
+    """Contact pairs that have a name: of the others nobody says which is which."""
+    found = []
+    for i in range(model.npair):
+        if not model.pair(i).name:
+            continue
+        direct = bool(model.pair_solref[i, 0] < 0.0)
+        names = (("timeconst", "s"), ("dampratio", "1"))
+        if direct:  # minus stiffness and damping
+            names = (("stiffness", "1/s^2"), ("damping", "1/s"))
+        found.append(_constant(model, "pair", i, "friction", "1", _sliding(model, i)))
+        for place, (quantity, unit) in enumerate(names):
+            how = _cell("pair_solref", i, place, sign=-1.0 if direct else 1.0)
+            found.append(_constant(model, "pair", i, quantity, unit, how))
+    return found
 
 
 def _gravity(model: Any) -> Constant:
@@ -290,17 +350,26 @@ def _length(model: Any, b: int) -> dict[str, Callable[..., Any]]:
     return {"get": get, "put": put}
 
 
-def _servo(model: Any, i: int, column: int) -> dict[str, Callable[..., Any]]:
-    """``force = gain u + bias . (1, length, velocity)``, a bias being ``-gain``."""
-    gain, bias = model.actuator_gainprm[i, 0], model.actuator_biasprm[i, column]
-    follows = bool(gain == -bias)
+def _sliding(model: Any, i: int) -> dict[str, Callable[..., Any]]:
+    """Friction of a pair along both tangents, in proportion."""
+    own = model.pair_friction[i, :2].copy()
 
     def get(model: Any) -> float:
-        return -float(model.actuator_biasprm[i, column])
+        return float(model.pair_friction[i, 0])
 
     def put(model: Any, value: float) -> None:
-        model.actuator_biasprm[i, column] = -value
+        model.pair_friction[i, :2] = own * (value / own[0])
+
+    return {"get": get, "put": put}
+
+
+def _servo(i: int, column: int, follows: bool) -> dict[str, Callable[..., Any]]:
+    """``force = gain u + bias . (1, length, velocity)``; the gain may be ``-bias``."""
+    cell = _cell("actuator_biasprm", i, column, sign=-1.0)
+
+    def put(model: Any, value: float) -> None:
+        cell["put"](model, value)
         if follows:
             model.actuator_gainprm[i, 0] = value
 
-    return {"get": get, "put": put}
+    return {"get": cell["get"], "put": put}

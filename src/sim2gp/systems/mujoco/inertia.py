@@ -19,6 +19,7 @@ origin of its frame, ``t`` moves it (m).
 """
 
 from collections.abc import Mapping
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ from jaxtyping import Float
 
 Four = Float[np.ndarray, "4 4"]
 NAMES = ("alpha", "d1", "d2", "d3", "s12", "s23", "s13", "t1", "t2", "t3")
+ALIKE = 1e-3  # as far as files round the two sides of a robot
 _PLACES = (
     (3, 3),
     (0, 0),
@@ -80,6 +82,22 @@ def upper_factor(P: Four) -> Four:
     """Upper triangular ``V`` with a positive diagonal and ``V V^T = P``."""
     turned = np.linalg.cholesky(P[::-1, ::-1])
     return np.asarray(turned[::-1, ::-1])
+
+
+def mirror_sign(one: Four, other: Four, name: str) -> float:
+    """Sign of a number of ``other``, the mirror image of a body, beside ``one``'s.
+
+    With ``M`` a diagonal of signs and ``other = M one M``, the deformation that keeps
+    them images of each other is ``M U M``. The fewest mirrors that do are taken; bodies
+    that are no images have equal numbers.
+    """
+    size = np.sqrt(np.outer(np.diag(one), np.diag(one)))
+    i, j = _PLACES[NAMES.index(name)]
+    for signs in sorted(product((1.0, -1.0), repeat=3), key=sum, reverse=True):
+        M = np.asarray([*signs, 1.0])
+        if np.all(np.abs(np.outer(M, M) * one - other) <= ALIKE * size):
+            return float(M[i] * M[j])
+    return 1.0
 
 
 class BodyInertia:

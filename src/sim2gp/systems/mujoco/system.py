@@ -30,11 +30,13 @@ from sim2gp.systems.mujoco.constants import (
     constants_of,
     matching,
     name_of,
+    tied,
 )
 from sim2gp.systems.mujoco.engine import Engine
 from sim2gp.systems.mujoco.load import compiled
 from sim2gp.systems.mujoco.mjx import MJXEngine, mjx_flow
 from sim2gp.systems.mujoco.model_file import ModelFile
+from sim2gp.systems.mujoco.unsupported import check_supported
 from sim2gp.systems.plants.external import flow
 from sim2gp.types import Action, Scalar, State
 
@@ -50,8 +52,8 @@ class MuJoCo(AbstractPlant):
 
     Its joints are the states, ``<joint>`` and ``<joint>.velocity``, then activations of
     actuators; its actuators are the inputs. ``constants`` are paths or patterns; where
-    it is None, dampings, armatures, dry frictions, masses and gains of servos that are
-    not zero in the model. Those in one inner sequence are tied: one number, under the
+    it is None, dampings, armatures, dry frictions and masses that are not zero in the
+    model. Those in one inner sequence are tied: one number for each quantity, under the
     first one's name. Priors are within a factor of 3 of the model's number; ``priors``
     replaces them by name, or fixes the constant. ``root`` is the folder that the
     model's files must lie in, its own if None; ``source`` the file that a compiled
@@ -59,7 +61,7 @@ class MuJoCo(AbstractPlant):
 
     Raises `InputError` E130, E170 and E171 for a file that is no model, E170 for what
     the model does not have, E142 for a constant that is zero in the model and has no
-    prior, E172 for joints with quaternions.
+    prior, E172 for what is not supported (`sim2gp.systems.mujoco.unsupported`).
     """
 
     engine: Engine = eqx.field(static=True)
@@ -125,7 +127,7 @@ class MuJoCo(AbstractPlant):
         """Values by name as those of every constant: what is tied has the same."""
         groups = zip(self.names, self.engine.constants, strict=True)
         known = ((values[n], group) for n, group in groups if n in values)
-        return {c.path: float(value) for value, group in known for c in group}
+        return {c.path: c.sign * float(value) for value, group in known for c in group}
 
     def file(self, *, mjcf: bool = False) -> ModelFile:
         """The model's file, to be written with other constants (``mjcf``: as MJCF).
@@ -164,22 +166,13 @@ class MuJoCo(AbstractPlant):
 def loaded(model: Any, root: Path | None = None) -> Any:
     """A compiled model, of a file or of one that is compiled already.
 
-    Raises `InputError` as `compiled` does, E170 where a number is not finite, E172
-    where a joint has a quaternion, or an actuator or a sensor a delay of its own.
+    Raises `InputError` as `compiled` does, E170 where a number is not finite, E172 for
+    what is not supported (`sim2gp.systems.mujoco.unsupported`).
     """
     is_file = isinstance(model, str | os.PathLike)
     found = compiled(Path(model), root) if is_file else copy.copy(model)
     _check_finite(found)
-    _check_delays(found)
-    for j in range(found.njnt):
-        if found.jnt_type[j] not in (2, 3):
-            raise InputError(
-                "E172",
-                "joint with a quaternion",
-                got=name_of(found, "joint", j),
-                expected="hinges and slides",
-                fix="fix the base, or replace a free joint by slides and hinges",
-            )
+    check_supported(found)
     return found
 
 
@@ -199,41 +192,28 @@ def _check_finite(model: Any) -> None:
                 )
 
 
-def _check_delays(model: Any) -> None:
-    """Past inputs and readings would be part of the state (MuJoCo 3.5 or newer)."""
-    for kind, fix in (
-        ("actuator", "delete the two; in a project [actuators.NAME] has a delay"),
-        ("sensor", "delete the two; a sensor's delay moves nothing"),
-    ):
-        samples = getattr(model, f"{kind}_history", None)
-        for i in np.flatnonzero(() if samples is None else np.any(samples, axis=-1)):
-            name = name_of(model, kind, int(i))
-            raise InputError(
-                "E172",
-                f"{kind} with a delay of its own",
-                got=f"delay or nsample of {name}",
-                expected="a state of joints and activations",
-                fix=fix.replace("NAME", f'"{name}"'),
-            )
-
-
 def _groups(
     model: Any,
     known: dict[str, Constant],
     constants: Sequence[str | Sequence[str]] | None,
 ) -> list[list[Constant]]:
-    """The open constants; each inner list is one number."""
+    """The open constants; each inner list is one number for each quantity."""
     if constants is None:
-        # No motor's gain: where it is free, so is the scale of all masses and forces.
-        usual = ("damping", "armature", "frictionloss", "mass", "kp", "kv")
-        found = [c for c in known.values() if c.quantity in usual]
+        # No gain of a motor or a servo: where it is free, so is the scale of all
+        # masses and forces.
+        usual = ("damping", "armature", "frictionloss", "mass")
+        found = [
+            c
+            for c in known.values()
+            if c.quantity in usual and c.kind in ("joint", "body")
+        ]
         return [[c] for c in found if c.get(model) != 0.0]
     groups: list[list[Constant]] = []
     for entry in constants:
         if isinstance(entry, str):
             groups += [[c] for c in matching(known, entry)]
         else:
-            groups.append([c for path in entry for c in matching(known, path)])
+            groups += tied([c for p in entry for c in matching(known, p)], model)
     paths = [c.path for group in groups for c in group]
     for path in paths:
         if paths.count(path) > 1:

@@ -21,7 +21,7 @@ _AXES = ("com_x", "com_y", "com_z")
 _ORIENTATIONS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
 #: Attribute of a shortcut that states a servo's constant.
 _SERVO = {("position", "kp"), ("position", "kv"), ("velocity", "kv")}
-_SERVO |= {("intvelocity", "kp"), ("intvelocity", "kv")}
+_SERVO |= {("intvelocity", "kp"), ("intvelocity", "kv"), ("damper", "kv")}
 
 
 @dataclass(eq=False)
@@ -43,6 +43,8 @@ class MJCF:
             self._walk(world, self.bodies[0])
         sections = root.all("actuator")
         self.actuators = [child for part in sections for child in part.children]
+        contacts = [child for part in root.all("contact") for child in part.children]
+        self.pairs = [child for child in contacts if child.tag == "pair"]
 
     def _walk(self, element: Element, owner: Body) -> None:
         for child in element.children:
@@ -64,13 +66,15 @@ class MJCF:
         return next(b for b in bodies if b.elements[0] is found)
 
     def element(self, kind: str, index: int) -> Element:
-        """A joint, geom or actuator by its number in the model (E170)."""
+        """A joint, geom, pair or actuator by its number in the model (E170)."""
         every = {
             "joint": [j for b in self.bodies for j in b.joints],
             "geom": [g for b in self.bodies for g in b.geoms],
             "actuator": self.actuators,
+            "pair": self.pairs,
         }[kind]
-        count = {"joint": "njnt", "geom": "ngeom", "actuator": "nu"}[kind]
+        counts = {"joint": "njnt", "geom": "ngeom", "actuator": "nu", "pair": "npair"}
+        count = counts[kind]
         total = int(getattr(self.model, count))
         return _located(every, kind, index, self.model, total)
 
@@ -90,6 +94,8 @@ class MJCF:
                 masses.setdefault(i, set()).add(quantity)
             elif kind == "actuator":
                 self._actuator(edits, wanted, constant)
+            elif kind == "pair":
+                self._pair(edits, wanted, constant)
             else:
                 element = self.element(kind, i)
                 edits.set_numbers(element, quantity, {0: constant.get(wanted)})
@@ -126,6 +132,13 @@ class MJCF:
                     edits.set_numbers(element, name, changed, rest)
         else:
             raise unsayable(constant.path, element, f"a {element.tag}", "a general")
+
+    def _pair(self, edits: Edits, wanted: Any, constant: Constant) -> None:
+        """Sliding friction along both tangents, or both numbers of `solref`."""
+        name = "friction" if constant.quantity == "friction" else "solref"
+        numbers = getattr(wanted, f"pair_{name}")[constant.index, :2].tolist()
+        element = self.element("pair", constant.index)
+        edits.set_numbers(element, name, dict(enumerate(numbers)))
 
     def _mass(self, edits: Edits, wanted: Any, b: int, quantities: set[str]) -> None:
         """Mass, centre and inertia of a body, in the file's own words where it can."""

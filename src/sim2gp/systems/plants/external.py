@@ -13,6 +13,7 @@ again (`sim2gp.types.in_float64`).
 """
 
 import abc
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -271,7 +272,10 @@ def _asked(
     def host(*words: Array) -> list[np.ndarray]:
         found = [_numbers_of(np.asarray(w), dtype) for w in words]
         lead = found[0].shape[: found[0].ndim - ranks[0]]
-        rows = [x.astype(np.float64).reshape(-1, *x.shape[len(lead) :]) for x in found]
+        count = math.prod(lead)  # a system without inputs has rows of no numbers
+        rows = [
+            x.astype(np.float64).reshape(count, *x.shape[len(lead) :]) for x in found
+        ]
         out = f(*rows)
         return [_words_of(x.astype(dtype).reshape(*lead, *x.shape[1:])) for x in out]
 

@@ -1,0 +1,125 @@
+"""Gain, offset and delay of a machine's inputs, as a project file states them.
+
+    [actuators."joint*.control"]
+    delay = {low = 0.0, high = 0.02}
+    tie = true
+
+A table names one input, or several by a pattern; tied inputs share their constants,
+under the first one's name.
+"""
+
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+from fnmatch import fnmatchcase
+
+from sim2gp.errors import InputError
+from sim2gp.inference.parameters import Parameter
+from sim2gp.project.priors import prior
+from sim2gp.project.schema import ProjectSpec
+from sim2gp.project.source import Source
+from sim2gp.project.validate import unknown
+from sim2gp.systems import AbstractSystem, with_parts
+from sim2gp.systems.actuators import neutral_actuators
+from sim2gp.systems.machine import plant_of
+
+
+def with_actuators(
+    system: AbstractSystem, spec: ProjectSpec, source: Source
+) -> AbstractSystem:
+    """The machine with its actuators; what the file does not name is neutral.
+
+    Raises `InputError` E141, E145 and E160 for what the file cannot mean.
+    """
+    if not spec.actuators:
+        return system
+    inputs = [channel.name for channel in system.actions]
+    tables = _tables(spec, source, inputs)
+    ties = {
+        name: found[0]
+        for pattern, found in tables.items()
+        if spec.actuators[pattern].tie
+        for name in found[1:]
+    }
+    pattern_of = {name: pattern for pattern, found in tables.items() for name in found}
+    stated: dict[str, Parameter | float] = {}
+    parts = neutral_actuators(system.actions, ties)
+    for part in parts:
+        if part.where not in pattern_of or part.tie:
+            continue
+        pattern = pattern_of[part.where]
+        said = getattr(spec.actuators[pattern], part.what)
+        where = source.where("actuators", pattern, part.what)
+        base = part.parameter(plant_of(system))
+        if part.where in ties.values():
+            base = replace(base, meaning=f"{part.what} of {pattern}")
+        own = None if part.what == "delay" else part.magnitude
+        chosen = base if said == "free" else prior(said, base, where, own)
+        _check_delay(part.what, chosen, where)
+        stated[part.name] = chosen
+    return with_parts(system, parts, stated)
+
+
+def _tables(
+    spec: ProjectSpec, source: Source, inputs: Sequence[str]
+) -> dict[str, list[str]]:
+    """The inputs of each table; no input has two (E145), one alone no tie (E160)."""
+    tables: dict[str, list[str]] = {}
+    for pattern, table in spec.actuators.items():
+        where = source.where("actuators", pattern)
+        found = _matching(pattern, inputs, spec.actuators, where)
+        twice = [name for other in tables.values() for name in other if name in found]
+        if twice:
+            raise InputError(
+                "E145",
+                "an input named twice",
+                where=where,
+                got=twice[0],
+                expected="one table for each input",
+                fix="let one pattern name it, or give it a table of its own",
+            )
+        if table.tie and len(found) == 1:
+            raise InputError(
+                "E160",
+                "a tie of one input",
+                where=source.where("actuators", pattern, "tie"),
+                got=found[0],
+                expected="a pattern that names several inputs",
+                fix="remove tie, or write a pattern",
+            )
+        tables[pattern] = found
+    return tables
+
+
+def _matching(
+    pattern: str, inputs: Sequence[str], stated: Collection[str], where: str
+) -> list[str]:
+    """What a pattern names; an input with a table of its own is the exception to it."""
+    if pattern in inputs:
+        return [pattern]
+    found = [name for name in inputs if fnmatchcase(name, pattern)]
+    if not found:
+        raise unknown("input", pattern, inputs, where)
+    own = [name for name in found if name not in stated]
+    if not own:
+        raise InputError(
+            "E145",
+            "pattern without inputs of its own",
+            where=where,
+            got=pattern,
+            expected="an input that no other table names",
+            fix="remove the pattern, or one of the other tables",
+        )
+    return own
+
+
+def _check_delay(part: str, stated: Parameter | float, where: str) -> None:
+    low = stated.low if isinstance(stated, Parameter) else stated
+    if part == "delay" and low < 0:
+        raise InputError(
+            "E141",
+            "negative delay",
+            where=where,
+            got=f"{low:g} s",
+            expected="a delay of at least 0 s",
+            fix="state low and high, with low >= 0",
+        )
