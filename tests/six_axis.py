@@ -4,6 +4,7 @@ Masses, lengths and gains are those of a common arm of 0.9 m reach. Damping and 
 both open in no project: a servo's rate gain and its joint's damping act alike.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -56,15 +57,21 @@ def model_text(timestep: float = 0.005) -> str:
     )
 
 
-def project_text(logs: list[str], *, constants: str, delay: bool = True) -> str:
-    """A project of the arm for these logs."""
+def project_text(
+    logs: Sequence[str], *, constants: Sequence[str], delay: bool = True
+) -> str:
+    """A project of the arm for these logs; one delay of all drives is open."""
     names = "\n".join(f'{n} = "{n}"' for n in NAMES)
     drives = "\n".join(f'servo{k} = "u{k}"' for k in range(1, 7))
-    late = '[actuators."servo*"]\ndelay = [0.0, 0.03]\ntie = true\n' if delay else ""
+    late = (
+        '[actuators."servo*"]\ndelay = {low = 0.0, high = 0.03}\ntie = true\n'
+        if delay
+        else ""
+    )
+    opened = "".join(f'[parameters."{path}"]\n' for path in constants)
     return (
-        f'system = "arm.xml"\nlogs = {logs}\n[model]\nconstants = {constants}\n'
-        f'[likelihood]\nwindow = 1.0\n[columns]\ntime = "time"\n{names}\n{drives}\n'
-        f"{late}"
+        f'system = "arm.xml"\n{opened}[likelihood]\nwindow = 1.0\n{late}[[logs]]\n'
+        f'files = {list(logs)}\ntime = "time"\n[logs.columns]\n{names}\n{drives}\n'
     )
 
 

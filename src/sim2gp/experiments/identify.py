@@ -125,9 +125,9 @@ def run(
 def _sizes(project: Project, windows: Windows) -> str:
     """What a fit is about, before it begins."""
     parameters, columns = len(project.system.parameters), len(windows.outputs)
-    seconds = float(np.asarray(windows.span).sum(axis=1).max())
+    length = project.spec.likelihood.window
     return (
-        f"{parameters} parameters, {len(windows)} windows of {seconds:.3g} s, "
+        f"{parameters} parameters, {len(windows)} windows of {length:g} s, "
         f"{columns} measured columns"
     )
 

@@ -21,6 +21,7 @@ variance is raised by (m + 1) / (m - 1).
 import dataclasses
 from dataclasses import dataclass
 from statistics import NormalDist
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -30,11 +31,15 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp.compilation import compile_async
 from sim2gp.data.grid import PERIOD, Grid
+from sim2gp.data.window_slopes import (
+    AbstractAsked,
+    slopes_on_host,
+    states_and_slopes,
+)
 from sim2gp.data.windows import Windows
 from sim2gp.inference.gaussian import LOG_2PI, Gaussian
-from sim2gp.inference.linearized import value_and_jacobian
 from sim2gp.systems.base import AbstractSystem
-from sim2gp.systems.simulate import simulate
+from sim2gp.systems.plants.external import AbstractSimulator, simulator_of
 from sim2gp.types import in_float64
 
 _BATCH = 64  # windows at a time: bounds the memory of sensitivities
@@ -87,7 +92,11 @@ def forecast(
     parts = []
     for first in range(0, W, _BATCH):
         which = np.minimum(np.arange(first, first + _BATCH), W - 1)
-        found = _forecast(system, posterior, _some(grid, which, passed))
+        some = _some(grid, which, passed)
+        if (simulator := simulator_of(system)) is not None:
+            found = _forecast_on_host(simulator, system, posterior, some)
+        else:
+            found = _forecast(system, posterior, some)
         parts.append([np.asarray(x)[: W - first, places] for x in found])
     mean, by_start, by_input, by_constants = map(
         np.concatenate, zip(*parts, strict=True)
@@ -103,6 +112,8 @@ def compile_forecast(system: AbstractSystem, grid: Grid) -> None:
 
     It serves where the samples asked for are such as every simulation passes.
     """
+    if simulator_of(system) is not None:
+        return  # its programs are small
     first = _some(grid, np.zeros(_BATCH, int), _passed(grid))
     _forecast.compile_for(system, system.parameters.prior(), first)
 
@@ -112,24 +123,62 @@ def _forecast(
     system: AbstractSystem, posterior: Gaussian, windows: Windows
 ) -> tuple[Array, Array, Array, Array]:
     """Outputs at all rows, their slopes in start and input, variance by constants."""
-    n, m = windows.start.shape[1], windows.area.shape[2]
-    k = posterior.scale.shape[1]
+    asked, k = _From(system, posterior), _directions(posterior, windows)
 
-    def predict(window: Windows, x: Array) -> Array:
-        tt = posterior.mean + posterior.scale @ x[n + m :]
-        params = system.record(system.values(tt, window.configuration))
+    def one(window: Windows, e: Array) -> tuple[Array, Array, Array, Array]:
+        return _parts(window, *states_and_slopes(asked, window, e, k))
+
+    found: tuple[Array, Array, Array, Array] = windows.each(one, windows.start)
+    return found
+
+
+def _forecast_on_host(
+    simulator: AbstractSimulator,
+    system: AbstractSystem,
+    posterior: Gaussian,
+    windows: Windows,
+) -> tuple[Array, Array, Array, Array]:
+    asked, k = _From(system, posterior), _directions(posterior, windows)
+    args = simulator, asked, windows, windows.start, k
+    return _all_parts(windows, *slopes_on_host(*args))
+
+
+class _From(AbstractAsked):
+    """A window from its start, moved by ``x``: start, inputs, constants in their sd."""
+
+    system: AbstractSystem
+    posterior: Gaussian
+
+    def __call__(self, window: Windows, e: Array, x: Array) -> tuple[Any, Windows, Any]:
+        n, m = window.start.size, window.area.shape[1]
+        tt = self.posterior.mean + self.posterior.scale @ x[n + m :]
+        params = self.system.record(self.system.values(tt, window.configuration))
         more = window.knots[:, None] * x[n : n + m][None]
         moved = eqx.tree_at(lambda w: w.area, window, window.area + more)
-        states = simulate(system, params, moved, window.start + x[:n])
-        return states[:, np.asarray(windows.outputs)]
+        return params, moved, e + x[:n]
 
-    def one(window: Windows) -> tuple[Array, Array, Array, Array]:
-        zero = jnp.zeros(n + m + k)
-        mean, J = value_and_jacobian(lambda x: predict(window, x), zero)
-        rest = jnp.sum(J[..., n + m :] ** 2, axis=-1)
-        return mean, J[..., :n], J[..., n : n + m], rest
 
-    found: tuple[Array, Array, Array, Array] = windows.each(one)
+def _directions(posterior: Gaussian, windows: Windows) -> int:
+    n, m = windows.start.shape[1], windows.area.shape[2]
+    return n + m + int(posterior.scale.shape[1])
+
+
+def _parts(
+    window: Windows, states: Float[Array, "L n"], slopes: Float[Array, "L n k"]
+) -> tuple[Array, Array, Array, Array]:
+    """Outputs, their slopes in start and input, and their variance by constants."""
+    outputs = np.asarray(window.outputs)
+    n, J = states.shape[1], slopes[:, outputs]
+    inputs = n + window.area.shape[1]
+    rest = jnp.sum(J[..., inputs:] ** 2, axis=-1)
+    return states[:, outputs], J[..., :n], J[..., n:inputs], rest
+
+
+@eqx.filter_jit
+def _all_parts(
+    windows: Windows, states: Array, slopes: Array
+) -> tuple[Array, Array, Array, Array]:
+    found: tuple[Array, Array, Array, Array] = windows.each(_parts, states, slopes)
     return found
 
 

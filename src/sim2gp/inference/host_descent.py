@@ -71,7 +71,7 @@ def descend(
     update: Update | None,
     *,
     until: float = SMALL,
-    most: int = MOST_STEPS,
+    most: int | None = None,
     damping: float = FIRST_DAMPING,
 ) -> Iterator[Progress]:
     """Each step that is kept, from ``start`` to where the next is no longer ``until``.
@@ -85,7 +85,7 @@ def descend(
     kept, change = jnp.asarray(damping), np.inf if update else 0.0
     sd, refused = float(step_sd(here, noise)), 0
     yield Progress(here, noise, 1, sd, damping, sd)
-    for count in range(2, most + 1):
+    for count in range(2, (most or MOST_STEPS) + 1):
         if not np.isfinite(float(here.cost)) or float(kept) >= MOST_DAMPING:
             return
         z, e, predicted, size = _proposed(prior, here, noise, kept)
