@@ -145,7 +145,7 @@ def assemble(
     floor = np.asarray([resolution(logs, name) for name in measured])
     outputs = tuple(names.index(name) for name in measured)
     # Slopes over twice the time differ by about what either is wrong by.
-    doubt = 1.5 * np.median(np.abs(x0 - wider), axis=0)
+    doubt = np.sqrt(np.mean((x0 - wider) ** 2, axis=0))
     spread = FAR * np.minimum(np.sqrt(np.mean(x0**2, axis=0)), doubt)
     for index, quantum in zip(outputs, floor, strict=True):
         spread[index] = 100.0 * quantum
