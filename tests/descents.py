@@ -8,13 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sim2gp.inference.arrowhead import Blocks, Noise
-from sim2gp.inference.estimate import (
-    CONVERGED,
-    Convergence,
-    Estimate,
-    Laplace,
-    laplace,
-)
+from sim2gp.inference.convergence import Convergence, converged
+from sim2gp.inference.estimate import Estimate, Laplace, laplace
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.least_squares import factor, prior_rows
 from sim2gp.inference.levenberg_marquardt import multi_start
@@ -149,7 +144,7 @@ def estimate_of(
     log_evidence: float = 0.0,
 ) -> Estimate:
     """What a fit would have found, without data."""
-    p, zero = prior.mean.size, jnp.zeros(())
+    p = prior.mean.size
     return Estimate(
         prior,
         posterior,
@@ -157,6 +152,6 @@ def estimate_of(
         nuisances,
         jnp.zeros((p, p)),
         jnp.zeros((len(nuisances), p)),
-        zero + log_evidence,
-        Convergence(jnp.asarray(CONVERGED), zero, zero, jnp.zeros((), int)),
+        jnp.asarray(log_evidence),
+        converged(p),
     )

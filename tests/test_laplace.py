@@ -11,8 +11,8 @@ from descents import Curves, curves, some_noise, whitened
 from sim2gp.errors import DeadParameters, NotConverged, NotFinite
 from sim2gp.inference import estimate as estimates
 from sim2gp.inference.arrowhead import Noise
-from sim2gp.inference.convergence import NEAR
-from sim2gp.inference.estimate import CONVERGED, NOT_FINITE, expected_noise
+from sim2gp.inference.convergence import CONVERGED, NEAR, NOT_FINITE
+from sim2gp.inference.estimate import expected_noise
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.levenberg_marquardt import GRADIENT_TOLERANCE
 

@@ -12,7 +12,7 @@ import machines
 from sim2gp.data.one_step import OneStepLikelihood
 from sim2gp.data.transitions import Transitions
 from sim2gp.inference import arrowhead, linearized
-from sim2gp.inference.estimate import CONVERGED
+from sim2gp.inference.convergence import CONVERGED
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.least_squares import RANK_TOLERANCE
 from sim2gp.inference.prior import ParameterPrior

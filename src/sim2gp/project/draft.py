@@ -17,7 +17,7 @@ from sim2gp.data.logs import Budget, Column, Log, read_log
 from sim2gp.data.logs.formats import recordings
 from sim2gp.data.logs.units import UNITS
 from sim2gp.project.columns import Match, match, time_column
-from sim2gp.project.draft_text import Contents, draft_text, open_parameters
+from sim2gp.project.draft_text import Contents, draft_text
 from sim2gp.project.project import (
     SYSTEMS,
     is_model,
@@ -312,6 +312,6 @@ def told(draft: Draft, out: Path) -> dict[str, Any]:
         "headline": f"Wrote {out}: read it, then sim2gp identify {out}",
         "file": str(out),
         "columns": table,
-        "open_constants": len(open_parameters(draft.system)),
+        "open_constants": len(draft.system.parameters),
         "warnings": warnings,
     }

@@ -6,13 +6,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from sim2gp.data.logs import Column
-from sim2gp.inference.parameters import Parameter
 from sim2gp.project.columns import Match
 from sim2gp.project.project import is_model
 from sim2gp.project.replace import key as toml_key
 from sim2gp.project.replace import quoted
 from sim2gp.systems import MuJoCo
 from sim2gp.systems.base import AbstractSystem
+from sim2gp.systems.mujoco.constants import constants_of
 
 DELAY = 0.04  # s, the longest that a draft lets an input be late
 WINDOW = 1.0  # s, of windows of an arm with servos
@@ -53,47 +53,41 @@ def draft_text(c: Contents) -> str:
     if isinstance(c.system, MuJoCo) and c.system.servos:
         rows += ["", *_window(c.longest if c.files else WINDOW)]
     rows += ["", "# Inputs act late on most machines; delay = 0.0 takes that out."]
+    delay = f"delay = {{low = 0.0, high = {DELAY}}}"
+    if isinstance(c.system, MuJoCo) and len(c.system.actions) > 1:
+        rows.append("# One delay for all drives: without tie each has its own.")
+        rows += ['[actuators."*"]', delay, "tie = true"]
+        return "\n".join(rows) + "\n"
     for channel in c.system.actions:
-        rows.append(f"[actuators.{toml_key(channel.name)}]")
-        rows.append(f"delay = {{low = 0.0, high = {DELAY}}}")
+        rows += [f"[actuators.{toml_key(channel.name)}]", delay]
     return "\n".join(rows) + "\n"
-
-
-def open_parameters(system: AbstractSystem) -> list[Parameter]:
-    """What the draft leaves open: all usual parameters but the gains of servos."""
-    return [p for p in system.parameters.free if not _is_gain(p.name)]
-
-
-def _is_gain(name: str) -> bool:
-    return name.startswith("actuator/") and name.rsplit("/", 1)[-1] in _GAINS
 
 
 def _constants(system: AbstractSystem, file: bool) -> list[str]:
     """What is open, and how to say more about it."""
-    table, nominal = open_parameters(system), system.parameters.nominal()
+    table, nominal = system.parameters.free, system.parameters.nominal()
     whose = "within a factor of three of the file's numbers" if file else "as bundled"
     rows = [f"# {len(table)} constants are open, {whose}:"]
-    held = [p.name for p in system.parameters.free if _is_gain(p.name)]
-    if held and table:
-        rows += [
-            "# {} says nothing more; {mean = ..., sd = ...} says what you know.",
-            "[parameters]",
-            *(
-                f"{toml_key(p.name)} = {{}}  # {nominal[p.name]:.4g} {p.unit}".rstrip()
-                for p in table
-            ),
-            "# Not open, as the model has them: the gains of the servos, kp and kv.",
-            "# Masses, friction and these gains share a factor that logs of positions",
-            "# and targets do not tell. Name one here if you know the masses.",
-        ]
-        return rows
     for p in table[:LISTED]:
         rows.append(f"#   {p.name} = {nominal[p.name]:.4g} {p.unit}".rstrip())
     if len(table) > LISTED:
         rows.append(f"#   and {len(table) - LISTED} more")
     example = toml_key(table[0].name) if table else "NAME"
     rows.append(f"# To say what you know: [parameters.{example}] mean = ... sd = ...")
+    if _has_servos(system):
+        rows += [
+            "# Not open, as the model has them: the gains of the servos, kp and kv.",
+            "# Masses, friction and these gains share a factor that logs of positions",
+            "# and targets do not tell. Open one if you know the masses.",
+        ]
     return rows
+
+
+def _has_servos(system: AbstractSystem) -> bool:
+    if not isinstance(system, MuJoCo):
+        return False
+    known = constants_of(system.engine.model).values()
+    return any(c.kind == "actuator" and c.quantity in _GAINS for c in known)
 
 
 def _logs(c: Contents) -> list[str]:

@@ -28,6 +28,8 @@ from sim2gp.systems.plants.external import (
 
 #: Fewer steps than these are not worth waking other threads for.
 FEW = 256
+#: Copies of the model at a time: one of a humanoid with its meshes has 70 MiB.
+COPIES = 16
 #: Linearised models that are kept: variants of one fit, at a few lengths of steps.
 KEPT = 32
 
@@ -85,14 +87,19 @@ class Engine(AbstractSimulator):
         out, good = untouched(theta, s, a, h)
         values, which = np.unique(theta[good], axis=0, return_inverse=True)
         index = np.flatnonzero(good)
+        which = which.reshape(-1)
         with self._lock:
-            models = self._models(values)
-            for span in np.unique(h[good]):
-                mine = h[index] == span
-                if span > 0.0:
-                    at = index[mine]
-                    chosen = [models[k] for k in which.reshape(-1)[mine]]
-                    out[at] = self._rolled(chosen, models, s[at], a[at], float(span))
+            for first in range(0, len(values), COPIES):
+                models = self._models(values[first : first + COPIES])
+                here = (which >= first) & (which < first + COPIES)
+                for span in np.unique(h[index[here]]):
+                    mine = here & (h[index] == span)
+                    if span > 0.0:
+                        at = index[mine]
+                        chosen = [models[k - first] for k in which[mine]]
+                        out[at] = self._rolled(
+                            chosen, models, s[at], a[at], float(span)
+                        )
         return out
 
     def substeps(self, span: Float[np.ndarray, "*r"]) -> Int[np.ndarray, "*r"]:
