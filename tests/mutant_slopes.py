@@ -20,7 +20,7 @@ SLOPES_OF_STEPS = (
         "slopes: velocities before a joint are those after it",
         BODY,
         "v_before[j], a_before[j] = now_v, now_a",
-        "v_before[j], a_before[j] = now_v, now_a + S[j]",
+        "v_before[j], a_before[j] = now_v + S[j], now_a",
         DIFFERENCES,
     ),
     Mutant(

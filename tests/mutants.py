@@ -31,6 +31,7 @@ from mutant_misfit import MISFIT
 from mutant_mujoco import ON_THE_HOST
 from mutant_networks import NETWORKS
 from mutant_sac import OFF_POLICY
+from mutant_slopes import SLOPES_OF_STEPS
 from mutant_studies import STUDIES
 
 MUTANTS = (
@@ -45,6 +46,7 @@ MUTANTS = (
     *EFFECTS,
     *OFF_POLICY,
     *ON_THE_HOST,
+    *SLOPES_OF_STEPS,
     *LOGS,
     *INPUTS,
     *INTEROP,

@@ -76,6 +76,7 @@ def test_before_any_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert ">limit<" in page
 
 
+@pytest.mark.nightly
 def test_after_a_fit(run: Path, tmp_path: Path, capsys) -> None:
     out = tmp_path / "next"
     words = ["design", str(run), "--out", str(out), "--seconds", "0.4", *LIMITS]

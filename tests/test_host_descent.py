@@ -168,6 +168,7 @@ def identified(folder: Path) -> tuple[int, Path]:
     return main(["identify", project, "--quick", "--out", str(run)]), run
 
 
+@pytest.mark.nightly
 def test_the_first_answer_is_replaced_by_the_run(tmp_path, capsys, monkeypatch):
     replaced, seen = FirstAnswer.replaced, []
 

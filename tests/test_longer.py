@@ -80,6 +80,7 @@ def test_how_much_more_they_tell(tmp_path: Path) -> None:
     assert "likelihood.window = 2.5 makes" in found.words(WINDOW)
 
 
+@pytest.mark.nightly
 def test_physics_too_slow_for_short_ones_refuses_long_ones(
     tmp_path: Path,
 ) -> None:

@@ -24,6 +24,7 @@ columns = {q = "angle"}
 TRUE, SD = 0.02, 1e-3  # N m s/rad, rad
 
 
+@pytest.mark.nightly
 def test_a_swing_is_identified_without_an_input(tmp_path: Path, capsys) -> None:
     (tmp_path / "swing.xml").write_text(SWING.format(0.012))
     (tmp_path / "swing.toml").write_text(PROJECT)
