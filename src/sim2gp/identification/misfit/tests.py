@@ -184,13 +184,13 @@ class Projected:
         """F ratio, degrees of freedom, p value of further columns; NaN if too many."""
         flat = self.without(columns).reshape(-1, columns.shape[2])
         size = float(np.sqrt(np.max(np.sum(columns**2, axis=(0, 1)), initial=0.0)))
-        U, _ = _basis(flat, FEATURE_TOLERANCE, size)
-        q = U.shape[1]
+        e = self.e.reshape(-1)
+        gains = _gains(flat, e, FEATURE_TOLERANCE * size)
+        q = gains.size
         rest = self.freedom - q
         if q == 0 or rest < SPARE * q:
             return np.nan, q, np.nan
-        e = self.e.reshape(-1)
-        gained = float(np.sum((U.T @ e) ** 2))
+        gained = float(np.sum(gains**2))
         # The floor holds where all residuals are below QUIET, or all are explained.
         noise = max((float(e @ e) - gained) / rest, 0.25)
         ratio = gained / q / noise
@@ -349,16 +349,28 @@ def _standardised(
 
 
 def _basis(
-    A: Float[np.ndarray, "M c"], tolerance: float, size: float | None = None
+    A: Float[np.ndarray, "M c"], tolerance: float
 ) -> tuple[Float[np.ndarray, "M q"], Float[np.ndarray, " q"]]:
     """Orthonormal columns that span ``A``'s, and their singular values.
 
-    Those below ``tolerance`` of ``size`` (of the largest, if not given) are left out.
+    Those below ``tolerance`` of the largest are left out.
     """
     U, s, _ = np.linalg.svd(A, full_matrices=False)
-    limit = tolerance * (np.max(s, initial=0.0) if size is None else size)
-    kept = s > limit
+    kept = s > tolerance * np.max(s, initial=0.0)
     return U[:, kept], s[kept]
+
+
+def _gains(
+    A: Float[np.ndarray, "M c"], e: Float[np.ndarray, " M"], limit: float
+) -> Float[np.ndarray, " q"]:
+    """``U^T e``, of the left singular vectors of ``A`` with a value above ``limit``.
+
+    From the triangle of ``A``: its vectors, as long as the data, are not formed.
+    """
+    R = np.linalg.qr(np.column_stack([A, e]), mode="r")
+    c = A.shape[1]
+    U, s, _ = np.linalg.svd(R[:c, :c], full_matrices=False)
+    return np.asarray((U.T @ R[:c, c])[s > limit])
 
 
 def _grouped_basis(own: Columns, run: Int[np.ndarray, " N"]) -> tuple[Columns, int]:
