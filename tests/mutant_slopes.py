@@ -42,7 +42,7 @@ SLOPES_OF_STEPS = (
         ACTS,
         "out[j] -= at.free[i] * (has.gear[i] ** 2 * change + twice)",
         "out[j] -= at.free[i] * twice",
-        ("test_slopes.py", "as_its_differences and implicitfast"),
+        DIFFERENCES,
     ),
     Mutant(
         "slopes: whatever acts is taken for known",
