@@ -117,6 +117,7 @@ def cable(folder: Path) -> Path:
     return compared(folder, "cable")
 
 
+@pytest.mark.nightly
 def test_a_missing_term_calls_for_a_residual(cable: Path) -> None:
     summary = load_run(cable).summary
     assert summary["best"] == "RES-FS"
@@ -133,6 +134,7 @@ def test_a_missing_term_calls_for_a_residual(cable: Path) -> None:
     assert names == [*SOME, "holding still", "regression"]
 
 
+@pytest.mark.nightly
 def test_a_simulator_without_fault_is_kept(folder: Path, cable: Path) -> None:
     del cable  # its compiled functions serve here too
     summary = load_run(compared(folder, "whole")).summary
@@ -143,6 +145,7 @@ def test_a_simulator_without_fault_is_kept(folder: Path, cable: Path) -> None:
     assert max(summary["models"]["SIM2GP"]["heldout_rmse"].values()) < 0.01
 
 
+@pytest.mark.nightly
 def test_what_a_comparison_stores(cable: Path) -> None:
     run = load_run(cable)
     summary = run.summary

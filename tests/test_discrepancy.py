@@ -207,6 +207,7 @@ def test_friction_that_the_simulator_lacks_is_in_the_intervals(
     assert away(Plain(found.posterior).mean, again.posterior).max() < 0.1
 
 
+@pytest.mark.nightly
 def test_a_sound_simulator_is_believed(arms: ModuleType) -> None:
     truth, belief, likelihood = fitted(arms, "white", 0)
     one = np.zeros(len(likelihood.windows), int)

@@ -56,6 +56,7 @@ def prior_draw(system, rng):
     return prior.mean + prior.scale @ rng.standard_normal(prior.mean.size)
 
 
+@pytest.mark.nightly
 def test_a_linearised_draw_is_its_formula():
     """One jvp is f(x, tt*) + J(x) (tt_s - tt*), to 1e-8 (in float64)."""
     system = Furuta()

@@ -73,6 +73,7 @@ def rows_of(part: AbstractLikelihood) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(A, float).reshape(*y.shape, -1), y
 
 
+@pytest.mark.nightly
 def test_linear_likelihoods_have_the_posterior_of_both_data_sets() -> None:
     """Mean, covariance and evidence in closed form; the order changes nothing."""
     system, one_step, windows = linear_data()

@@ -230,6 +230,7 @@ def test_draws_spread_by_function_start_and_noise() -> None:
     np.testing.assert_allclose(found.draws[:, 0, 1, 2], 4.0 * off, rtol=1e-5)
 
 
+@pytest.mark.nightly
 def test_given_constants_are_not_learned_twice() -> None:
     """The noise alone is fitted: about the residuals' rms, whatever the prior's sd."""
     system = pendulum()

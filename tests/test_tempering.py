@@ -154,6 +154,7 @@ def test_an_interval_holds_what_the_parts_scatter_about():
     assert plain < 0.6
 
 
+@pytest.mark.nightly
 def test_never_narrower_than_the_posterior():
     belief, r, J = fit(*rows(100), capacity=256)
     wide, kappa = tempered(belief, 0.0 * r, J)

@@ -44,6 +44,7 @@ def after_two_periods(system: sy.AbstractSystem, values: dict[str, float]):
     return of(x), jax.jacobian(of)(x)
 
 
+@pytest.mark.nightly
 @in_float64
 def test_a_shared_constant_is_both_inputs_own() -> None:
     """The flow is that of two equal constants, its slope the sum of their two."""

@@ -17,7 +17,6 @@ BY_DAY = (
     "transition/zeroed",
     "density/arm",
     "one_step/arm",
-    "logs/robust",
 )
 #: Relative to the largest number of an array: of what is computed in one sweep, of
 #: what a descent finds, of what float32 training finds.
