@@ -15,6 +15,7 @@ from sim2gp.data.logs import Log
 from sim2gp.data.split_log import cut
 from sim2gp.errors import NotConverged
 from sim2gp.experiments.first_answer import FirstAnswer
+from sim2gp.identification import fit
 from sim2gp.identification.fit import fit_windows
 from sim2gp.inference.convergence import NEAR
 from sim2gp.inference.parameters import Parameter
@@ -87,7 +88,8 @@ def test_the_posterior_is_that_of_one_compiled_program():
 
 
 @in_float64
-def test_starts_are_compared_on_some_windows_and_each_step_is_reported():
+def test_starts_are_compared_on_some_windows_and_each_step_is_reported(monkeypatch):
+    monkeypatch.setattr(fit, "MANY", 0)
     windows, _ = cut([log(12.0)], BOX, window=0.5)
     said: list[tuple[int, int]] = []
     answers = []

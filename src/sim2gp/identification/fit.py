@@ -20,8 +20,9 @@ from sim2gp.types import Key, in_float64
 
 NOISE_ROUNDS = 8  # fewer leave noise and starts of real logs short of a fixed point
 WARM_ROUNDS = 3  # of a fit that begins with the noise of another one
-#: Share of the windows that a fit on the host begins with, and how few they may be.
-SHARE, LEAST = 0.2, 4
+#: Share of the windows that a fit on the host begins with, how few they may be, and of
+#: how many rows: of fewer, all windows are faster than another compilation.
+SHARE, LEAST, MANY = 0.2, 4, 20_000
 FREEDOM = 4.0  # degrees of freedom of the Student-t weight
 
 
@@ -88,6 +89,7 @@ def _some(likelihood: WindowsLikelihood) -> Int[np.ndarray, " w"] | None:
     """Windows that a fit on the host begins with, spread over all; None for all."""
     W = len(likelihood.counts)
     count = max(LEAST, round(SHARE * W))
-    if not likelihood.on_host or 2 * count > W:
+    few = likelihood.windows.span.size < MANY
+    if not likelihood.on_host or few or 2 * count > W:
         return None
     return np.linspace(0, W - 1, count).round().astype(int)

@@ -44,6 +44,7 @@ from sim2gp.inference.least_squares import (
     stack,
 )
 from sim2gp.inference.levenberg_marquardt import (
+    AGAIN_DAMPING,
     GRADIENT_TOLERANCE,
     Point,
     evaluate,
@@ -232,7 +233,8 @@ def _estimate_on_host(
         counted = jnp.asarray(found.steps), jnp.asarray(found.away)
         return _about(found.at, found.noise, prior.gaussian, counts, *counted)
 
-    for found in descend(likelihood, prior, *begin, damping=best.damping):
+    damping = min(best.damping, AGAIN_DAMPING)
+    for found in descend(likelihood, prior, *begin, damping=damping):
         if report is not None:
             report(found, partial(about, found))
     return about(found)

@@ -367,7 +367,7 @@ def _gains(
 
     From the triangle of ``A``: its vectors, as long as the data, are not formed.
     """
-    R = np.linalg.qr(np.column_stack([A, e]), mode="r")
+    R = np.asarray(np.linalg.qr(np.column_stack([A, e]), mode="r"))
     c = A.shape[1]
     U, s, _ = np.linalg.svd(R[:c, :c], full_matrices=False)
     return np.asarray((U.T @ R[:c, c])[s > limit])
