@@ -191,6 +191,7 @@ def test_the_first_answer_is_replaced_by_the_run(tmp_path, capsys, monkeypatch):
     assert (first["converged"], final["converged"]) == (False, True)
     was, now = (x["parameters"]["joint/q/damping"] for x in (first, final))
     assert was["mean"] == pytest.approx(now["mean"], abs=4.0 * was["sd"])
+    assert was["sd"] < 0.2 * was["prior_sd"]  # not the prior under the first noise
     assert final["convergence"]["newton_step_sd"] <= NEAR
 
 

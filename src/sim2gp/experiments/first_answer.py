@@ -1,7 +1,7 @@
 """The first answer of a fit that takes its time, and what a failed one knows.
 
-A fit on a simulator of the host reports every step. As soon as Newton's step is a
-fraction of a posterior sd, its posterior is written as the run ``NAME-first``: plain
+A fit on a simulator of the host reports every step. As soon as Newton's step is no
+longer than a posterior sd, its posterior is written as the run ``NAME-first``: plain
 intervals, without forecasts. The whole run replaces it; where the fit fails, the folder
 stays, says so, and names the parameters along which it does not converge.
 """
@@ -17,12 +17,13 @@ from sim2gp.data.logs import Log, note_lines
 from sim2gp.errors import NotConverged
 from sim2gp.identification import diagnose
 from sim2gp.inference.estimate import Estimate
-from sim2gp.inference.host_descent import ROUGH
 from sim2gp.inference.host_descent import Progress as Descent
 from sim2gp.project import Project
 from sim2gp.runs import new_run
 from sim2gp.runs.progress import Task
 from sim2gp.runs.store import check_target
+
+SOON = 1.0  # posterior sd that a first answer may be from its MAP
 
 
 class FirstAnswer:
@@ -42,7 +43,8 @@ class FirstAnswer:
         cost = float(at.at.cost)
         note = f"posterior, step {at.steps}: cost {cost:.6g}, {left}, {seconds:.0f} s"
         self.task.advance(note, 0)
-        if not self._written and at.step_sd <= ROUGH:
+        # At its first step the noise is as large as the data: no answer yet.
+        if not self._written and at.steps > 1 and at.step_sd <= SOON:
             self.write(estimate())
             self.task.advance(f"first answer in {self.folder}", 0)
 
