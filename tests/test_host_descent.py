@@ -19,7 +19,7 @@ from sim2gp.identification import fit
 from sim2gp.identification.fit import fit_windows
 from sim2gp.inference.convergence import NEAR
 from sim2gp.inference.parameters import Parameter
-from sim2gp.systems import ODE, BlackBox, Channel
+from sim2gp.systems import ODE, BlackBox, Channel, EncoderOffset, free_parts
 from sim2gp.types import in_float64
 
 mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is not installed")
@@ -107,6 +107,20 @@ def test_starts_are_compared_on_some_windows_and_each_step_is_reported(monkeypat
     away = np.asarray(first.posterior.mean) - np.asarray(found.posterior.mean)
     assert np.all(np.abs(away) < 4.0 * np.asarray(first.posterior.sd()))
     assert np.all(np.asarray(first.posterior.sd()) > np.asarray(found.posterior.sd()))
+
+
+@in_float64
+def test_an_encoders_offset_is_learned_on_the_host_as_by_jax():
+    """What a machine adds around its plant is differentiated beside the simulator."""
+    found = []
+    for system in (EXACT, BOX):
+        machine = free_parts(system, [EncoderOffset("q", 0.0)])
+        windows, _ = cut([log(6.0)], machine, window=0.5)
+        found.append(fit_windows(machine, windows, key=KEY, starts=1))
+    exact, box = (np.asarray(fitted.posterior.mean) for fitted in found)
+    sd = np.asarray(found[0].posterior.sd())
+    assert np.abs((box - exact) / sd).max() < 0.03
+    np.testing.assert_allclose(found[1].posterior.sd(), sd, rtol=0.01)
 
 
 def kinked() -> BlackBox:

@@ -238,7 +238,7 @@ class Machine(AbstractSystem):
     ) -> Float[Array, "L n"]:
         if not self.sensors:
             return states
-        return states - self._offset(params).astype(states.dtype)
+        return states - self._offset(params).astype(states.dtype)[None]
 
     def _through(self, params: MachineParams, a: Action) -> Action:
         """The input behind the actuators' gains, offsets and effects."""
