@@ -52,12 +52,15 @@ def test_a_project_is_identified_as_before(name: str, tmp_path: Path) -> None:
     out = tmp_path / "run"
     main(["identify", str(tmp_path / f"{name}.toml"), "--out", str(out)])
     was, now = (sg.load_run(run) for run in (GOLDEN / "runs" / name, out))
-    check_same(figures(was), figures(now))
-    before, after = (
+    before, after = figures(was), figures(now)
+    # The starts' rates have another prior since (docs/decisions.md, Windows).
+    assert after["log_evidence"] > before["log_evidence"]
+    check_same(before | {"log_evidence": after["log_evidence"]}, after)
+    was_said, now_said = (
         {key: entry["verdict"] for key, entry in run.summary["parameters"].items()}
         for run in (was, now)
     )
-    assert before == after
+    assert was_said == now_said
 
 
 def test_the_golden_summaries_are_json() -> None:
