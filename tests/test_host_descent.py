@@ -21,6 +21,7 @@ from sim2gp.inference.convergence import NEAR
 from sim2gp.inference.parameters import Parameter
 from sim2gp.systems import ODE, BlackBox, Channel, EncoderOffset, free_parts
 from sim2gp.types import in_float64
+from test_passive_model import PROJECT, SWING
 
 mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is not installed")
 
@@ -153,19 +154,6 @@ def test_a_failed_fit_names_its_parameters_and_keeps_what_it_knows(monkeypatch):
     assert np.isfinite(np.asarray(known.posterior.mean)).all()
     worst = TABLE[int(np.argmax(known.convergence.away))].name
     assert f"farthest off: {worst}" in str(e.value)
-
-
-SWING = """<mujoco model="swing"><option timestep=".005"/><worldbody><body name="arm">
-<joint name="q" axis="0 1 0" damping="{}"/>
-<geom type="capsule" fromto="0 0 0 0 0 -.4" size=".02" mass=".5"/></body></worldbody>
-</mujoco>"""
-PROJECT = """system = "swing.xml"
-[parameters."joint/q/damping"]
-[[logs]]
-files = ["*.csv"]
-time = "t"
-columns = {q = "angle"}
-"""
 
 
 def identified(folder: Path) -> tuple[int, Path]:

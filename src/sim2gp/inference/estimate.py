@@ -205,12 +205,11 @@ def estimate(
         nuisances = jnp.zeros(shape)
     if noise is None:
         noise = likelihood.first_noise()
+    start = starts, nuisances, noise
     if likelihood.on_host:
-        start = starts, nuisances, noise
         freedom = jnp.asarray(freedom)
         return _estimate_on_host(likelihood, prior, start, freedom, report)
-    begin = starts, nuisances, noise
-    return _estimate(likelihood, prior, *begin, freedom, needed, rounds)
+    return _estimate(likelihood, prior, *start, freedom, needed, rounds)
 
 
 def _estimate_on_host(

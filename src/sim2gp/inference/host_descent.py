@@ -2,8 +2,8 @@
 
 The steps are those of `sim2gp.inference.levenberg_marquardt`, taken one at a time by a
 loop of the host, for a linearisation is what costs. So there are as few as can be:
-starts are compared on some of the windows, the noise is learned anew after every step
-that is kept (generalised EM: Dempster, Laird and Rubin 1977, section 3), and the
+starts are compared where they are roughly finished, the noise is updated after every
+step that is kept (generalised EM: Dempster, Laird and Rubin 1977, section 3), and the
 descent ends where Newton's step is a hundredth of a posterior sd and the noise rests.
 """
 
