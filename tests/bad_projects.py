@@ -22,8 +22,8 @@ from bad_inputs import (
     stored,
 )
 from sim2gp.inference.arrowhead import Elimination
-from sim2gp.inference.estimate import Laplace
 from sim2gp.inference.gaussian import from_covariance
+from sim2gp.inference.laplace import Laplace
 from sim2gp.inference.least_squares import prior_rows
 from sim2gp.inference.levenberg_marquardt import Point
 from sim2gp.types import in_float64

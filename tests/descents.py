@@ -9,8 +9,9 @@ from jaxtyping import Array, Float
 
 from sim2gp.inference.arrowhead import Blocks, Noise
 from sim2gp.inference.convergence import Convergence, converged
-from sim2gp.inference.estimate import Estimate, Laplace, laplace
+from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.laplace import Laplace, laplace
 from sim2gp.inference.least_squares import factor, prior_rows
 from sim2gp.inference.levenberg_marquardt import multi_start
 from sim2gp.inference.likelihood import AbstractLikelihood

@@ -6,7 +6,7 @@ import pytest
 import scipy.optimize
 
 from sim2gp.inference.arrowhead import Noise
-from sim2gp.inference.estimate import expected_noise
+from sim2gp.inference.laplace import expected_noise
 
 
 @pytest.mark.nightly

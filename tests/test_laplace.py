@@ -12,8 +12,8 @@ from sim2gp.errors import DeadParameters, NotConverged, NotFinite
 from sim2gp.inference import estimate as estimates
 from sim2gp.inference.arrowhead import Noise
 from sim2gp.inference.convergence import CONVERGED, NEAR, NOT_FINITE
-from sim2gp.inference.estimate import expected_noise
 from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.laplace import expected_noise
 from sim2gp.inference.levenberg_marquardt import GRADIENT_TOLERANCE
 
 pytestmark = pytest.mark.usefixtures("float64")

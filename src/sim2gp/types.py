@@ -26,8 +26,10 @@ Key = PRNGKeyArray
 if TYPE_CHECKING:
     #: Data that are numpy's on the host and JAX's inside compiled functions.
     AnyArray = Any
+    AnyScalar = Any
 else:
     AnyArray = Array | np.ndarray
+    AnyScalar = Float[AnyArray, ""] | np.floating | float
 
 #: ``s' = f(s, a)``: one step of the world, for one point; always a pytree.
 Dynamics = Callable[[Array, Array], Array]

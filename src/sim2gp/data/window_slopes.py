@@ -2,9 +2,9 @@
 
 What a caller asks of each window is an `AbstractAsked`: constants, inputs and start, as
 functions of a vector ``x``. JAX simulates and differentiates that in one program. A
-simulator on the host is asked between two programs, once for all windows: the first
-finds its arguments and their derivatives, the second what the machine says of its
-states. Neither holds a callback, so that JAX keeps both in its cache.
+simulator on the host is asked once for all windows, after a program that finds its
+arguments and their derivatives and holds no callback, so that JAX keeps it in its
+cache.
 """
 
 from abc import abstractmethod
@@ -47,6 +47,36 @@ def states_and_slopes(
     return value_and_jacobian(states, jnp.zeros(k))
 
 
+class HostRun:
+    """All windows simulated on the host, and their derivatives when they are asked for.
+
+    ``states`` are those of the system. Make it in float64.
+    """
+
+    states: Float[np.ndarray, "W L n"]
+
+    def __init__(
+        self,
+        simulator: AbstractSimulator,
+        asked: AbstractAsked,
+        windows: Windows,
+        e: Float[Array, "W n"],
+        k: int,
+    ) -> None:
+        found = _arguments(asked, windows, e, k)
+        # Of the host's own kind, in its order: it works along the rows.
+        found = jax.tree.map(np.asarray, found)
+        (at, origin), (self._along, self._origin_by) = found
+        self._simulator, self._run = simulator, simulator.rolled(at)
+        self.states = self._run.at_rows + origin
+
+    def slopes(self) -> Float[np.ndarray, "W L n k"]:
+        """Derivatives of the states in ``x``."""
+        found = self._simulator.linearised(self._run, self._along)
+        found += self._origin_by
+        return found
+
+
 def slopes_on_host(
     simulator: AbstractSimulator,
     asked: AbstractAsked,
@@ -55,48 +85,24 @@ def slopes_on_host(
     k: int,
 ) -> tuple[Float[Array, "W L n"], Float[Array, "W L n k"]]:
     """The same of all windows, by a simulator on the host. Call it in float64."""
-    at, along = _arguments(asked, windows, e, k)
-    # Of the host's own kind, in its order: it works along the rows.
-    at, along = (Arguments(*map(np.asarray, x)) for x in (at, along))
-    states, slopes = simulator.linearised_rollout(at, along)
-    return _seen(asked, windows, e, jnp.asarray(states), jnp.asarray(slopes))
+    run = HostRun(simulator, asked, windows, e, k)
+    return jnp.asarray(run.states), jnp.asarray(run.slopes())
 
 
 @eqx.filter_jit
-def _arguments(
-    asked: AbstractAsked, windows: Windows, e: Array, k: int
-) -> tuple[Arguments, Arguments]:
-    def one(window: Windows, e: Array) -> tuple[Arguments, Arguments]:
-        def arguments(x: Array) -> Arguments:
+def _arguments(asked: AbstractAsked, windows: Windows, e: Array, k: int) -> Any:
+    """What the plant is given and what its states are offset by; both by ``x``."""
+
+    def one(window: Windows, e: Array) -> Any:
+        def arguments(x: Array) -> Any:
             params, held, x0 = asked(window, e, x)
+            # `leave` adds to a state what does not depend on it.
+            origin = asked.system.leave(params, jnp.zeros((1, x0.size)))
             inputs = arriving(asked.system, params, held)
             theta, x0, u = asked.system.enter(params, x0, inputs)
-            return Arguments(theta, x0, u, held.span)
+            return Arguments(theta, x0, u, held.span), origin
 
-        zero = jnp.zeros(k)
-        return arguments(zero), jax.jacfwd(arguments)(zero)
+        along, at = value_and_jacobian(arguments, jnp.zeros(k))[::-1]
+        return at, along
 
-    found: tuple[Arguments, Arguments] = windows.each(one, e)
-    return found
-
-
-@eqx.filter_jit
-def _seen(
-    asked: AbstractAsked,
-    windows: Windows,
-    e: Array,
-    states: Float[Array, "W L n"],
-    slopes: Float[Array, "W L n k"],
-) -> tuple[Float[Array, "W L n"], Float[Array, "W L n k"]]:
-    """What the machine says of the simulator's states."""
-    k = slopes.shape[-1]
-
-    def one(window: Windows, e: Array, at: Array, by: Array) -> tuple[Array, Array]:
-        def states(x: Array) -> Array:
-            params, _, _ = asked(window, e, x)
-            return asked.system.leave(params, at + by @ x)
-
-        return value_and_jacobian(states, jnp.zeros(k))
-
-    found: tuple[Array, Array] = windows.each(one, e, states, slopes)
-    return found
+    return windows.each(one, e)

@@ -23,12 +23,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sim2gp.compilation import compile_async
-from sim2gp.data.window_slopes import AbstractAsked, slopes_on_host
+from sim2gp.data.window_slopes import AbstractAsked, HostRun, slopes_on_host
 from sim2gp.data.windows import Windows
 from sim2gp.inference.arrowhead import Blocks, Noise, eliminate
 from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.least_squares import factor
-from sim2gp.inference.likelihood import AbstractLikelihood
+from sim2gp.inference.likelihood import AbstractLikelihood, Trial
 from sim2gp.inference.linearized import jacobian_by_columns, value_and_jacobian
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.plants.external import (
@@ -87,12 +87,10 @@ class WindowsLikelihood(AbstractLikelihood):
         scale: Float[Array, "p p"],
     ) -> Blocks:
         n, p = e.shape[1], scale.shape[1]
-        simulator = None if isinstance(tt, jax.core.Tracer) else self._simulator
-        if simulator is not None:  # else its steps are called from compiled code
-            asked = _About(self.system, tt, scale)
-            args = simulator, asked, self.windows, e, n + p
-            states, slopes = slopes_on_host(*args)
-            return _factors(self.windows, states, slopes)
+        if self.on_host and not isinstance(tt, jax.core.Tracer):
+            # Within compiled code the simulator's steps are called from there.
+            trial = self.trial(*map(np.asarray, (tt, e, scale)))
+            return jnp.asarray(trial.blocks())
 
         def one(window: Windows, e: Array) -> Array:
             def residual(x: Array) -> Array:
@@ -103,6 +101,33 @@ class WindowsLikelihood(AbstractLikelihood):
 
         found: Array = self.windows.each(one, e)
         return found
+
+    def trial(
+        self,
+        tt: Float[np.ndarray, " p"],
+        e: Float[np.ndarray, "W n"],
+        scale: Float[np.ndarray, "p p"],
+    ) -> Trial:
+        simulator = self._simulator
+        if simulator is None:
+            return super().trial(tt, e, scale)
+        asked = _About(self.system, *map(jnp.asarray, (tt, scale)))
+        k = e.shape[1] + scale.shape[1]
+        run = HostRun(simulator, asked, self.windows, jnp.asarray(e), k)
+        windows = jax.tree.map(np.asarray, self.windows)
+        outputs = list(windows.outputs)
+        r = np.where(windows.mask, run.states[..., outputs] - windows.y, 0.0)
+
+        def blocks() -> Float[np.ndarray, "W c k k"]:
+            J = np.where(windows.mask[..., None], run.slopes()[:, :, outputs], 0.0)
+            return np.stack(
+                [
+                    [factor(J[w, :, c], r[w, :, c]) for c in range(len(outputs))]
+                    for w in range(len(r))
+                ]
+            )
+
+        return Trial(np.sum(r**2, axis=1), blocks)
 
     @eqx.filter_jit
     def first_noise(self) -> Noise:
@@ -133,19 +158,6 @@ class _About(AbstractAsked):
 def _residual(window: Windows, states: Float[Array, "L n"]) -> Float[Array, "L c"]:
     r = states[:, np.asarray(window.outputs)] - window.y
     return jnp.where(window.mask, r, 0.0)
-
-
-@eqx.filter_jit
-def _factors(windows: Windows, states: Array, slopes: Array) -> Blocks:
-    """Factors of ``[J r]`` of each window and channel."""
-
-    def one(window: Windows, states: Array, slopes: Array) -> Array:
-        J = slopes[:, np.asarray(window.outputs)]
-        J = jnp.where(window.mask[..., None], J, 0.0)
-        return jax.vmap(factor, in_axes=1)(J, _residual(window, states))
-
-    found: Array = windows.each(one, states, slopes)
-    return found
 
 
 def start_states(windows: Windows, fitted: Estimate) -> Float[np.ndarray, "W n"]:

@@ -190,7 +190,8 @@ def _passed(grid: Grid) -> Int[np.ndarray, " L"]:
 def _some(grid: Grid, which: np.ndarray, rows: np.ndarray) -> Windows:
     """Some of the windows, as JAX arrays, in steps from one of ``rows`` to the next."""
     chosen = jax.tree.map(jnp.asarray, grid.windows.some(which))
-    span = jnp.tile(PERIOD * np.diff(rows, prepend=0), (len(which), 1))
+    new = np.diff(which, prepend=-1) > 0  # what fills a batch up does not move
+    span = jnp.asarray(new[:, None] * PERIOD * np.diff(rows, prepend=0))
     thin: Windows = eqx.tree_at(
         lambda w: (w.span, w.y, w.mask),
         chosen,

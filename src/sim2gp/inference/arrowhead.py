@@ -14,29 +14,27 @@ Schur complement, without forming it.
 """
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from sim2gp.inference.least_squares import Factor
-from sim2gp.inference.linalg import solve_triangular, triangular
-from sim2gp.types import Scalar
+from sim2gp.inference.linalg import each_window, library, solve_triangular, triangular
+from sim2gp.types import AnyArray, AnyScalar
 
 #: Triangular factors of ``[J_e J_z r]`` per window and channel; k = n + p + 1.
-Blocks = Float[Array, "W c k k"]
+Blocks = Float[AnyArray, "W c k k"]
 
 
 class Noise(eqx.Module):
     """What a descent holds fixed: each channel's sd, and each window's weight."""
 
-    sd: Float[Array, " c"]
-    weights: Float[Array, " W"]
+    sd: Float[AnyArray, " c"]
+    weights: Float[AnyArray, " W"]
 
     def scale(self, blocks: Blocks) -> Blocks:
         """The blocks of whitened residuals."""
         return (
             blocks
-            * jnp.sqrt(self.weights)[:, None, None, None]
+            * library(self.weights).sqrt(self.weights)[:, None, None, None]
             / self.sd[None, :, None, None]
         )
 
@@ -45,26 +43,28 @@ class Elimination(eqx.Module):
     """What remains without the nuisances; ``slope`` is ``R11^-1 [R12 c1]``."""
 
     data: Factor
-    R11: Float[Array, "W n n"]
-    slope: Float[Array, "W n p1"]
+    R11: Float[AnyArray, "W n n"]
+    slope: Float[AnyArray, "W n p1"]
 
 
 def eliminate(
     blocks: Blocks,
-    e: Float[Array, "W n"],
+    e: Float[AnyArray, "W n"],
     noise: Noise,
-    damping: float | Scalar = 0.0,
+    damping: AnyScalar = 0.0,
 ) -> Elimination:
     """The QR of the module's equation in every window; all ``R22`` stacked."""
     (W, n), k = e.shape, blocks.shape[-1]
 
-    def one(block: Array, e: Array) -> Array:
-        identity = jnp.eye(n, k, dtype=block.dtype)
-        prior = identity.at[:, -1].set(e)
-        damped = jnp.sqrt(damping) * identity
-        return triangular(jnp.concatenate([block.reshape(-1, k), prior, damped]))
+    xp = library(blocks, e)
 
-    R = jax.vmap(one)(noise.scale(blocks), e)
+    def one(block: AnyArray, e: AnyArray) -> AnyArray:
+        identity = xp.eye(n, k, dtype=block.dtype)
+        prior = xp.concatenate([identity[:, :-1], e[:, None]], axis=1)
+        damped = xp.sqrt(damping) * identity
+        return triangular(xp.concatenate([block.reshape(-1, k), prior, damped]))
+
+    R = each_window(one, noise.scale(blocks), e)
     R11 = R[:, :n, :n]
     data = triangular(R[:, n:, n:].reshape(W * (k - n), k - n))
-    return Elimination(data, R11, jax.vmap(solve_triangular)(R11, R[:, :n, n:]))
+    return Elimination(data, R11, each_window(solve_triangular, R11, R[:, :n, n:]))

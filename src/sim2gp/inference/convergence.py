@@ -5,10 +5,10 @@ import math
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from sim2gp.errors import DeadParameters, NotConverged, NotFinite
-from sim2gp.types import Scalar
+from sim2gp.types import AnyArray, AnyScalar
 
 CONVERGED, STALLED, NOT_FINITE, DEAD = 0, 1, 2, 3
 #: A MAP that is no farther than this, in posterior sd, is an answer.
@@ -18,11 +18,11 @@ NEAR = 0.03
 class Convergence(eqx.Module):
     """How a descent ended; ``newton_step_sd`` is the undamped step that remains."""
 
-    status: Int[Array, ""]
-    gradient: Scalar  # ``||g||_inf / (1 + cost)``
-    newton_step_sd: Scalar  # its largest entry, in posterior sd
-    steps: Int[Array, ""]
-    away: Float[Array, " p"]  # that step, of each parameter in its posterior sd
+    status: Int[AnyArray, ""]
+    gradient: AnyScalar  # ``||g||_inf / (1 + cost)``
+    newton_step_sd: AnyScalar  # its largest entry, in posterior sd
+    steps: int | Int[AnyArray, ""]
+    away: Float[AnyArray, " p"]  # that step, of each parameter in its posterior sd
 
     def as_dict(self) -> dict[str, float | int]:
         """For summary.json: steps, and how far the MAP may be in posterior sd."""

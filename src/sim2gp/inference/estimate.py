@@ -3,16 +3,7 @@
 A likelihood (`AbstractLikelihood`) and a prior (`AbstractPrior`) are least squares in
 whitened parameters ``z`` and nuisances ``e``. `estimate` descends to the MAP from
 several starts, learns the noise in turns with it, and returns the Gaussian about the
-MAP with the log evidence:
-
-    sig_c^2 = (2 floor_c^2 + sum_w w_w E||r_wc||^2 / mean(w)) / (2 + count_c)
-    w_w     = (1 + count_w / freedom) / (1 + ||r_w||^2 / freedom)
-
-The prior on the noise counts as two samples at the floor. Weights are Student-t's; an
-infinite number of degrees of ``freedom`` makes them 1. Their mean, over windows with
-data, is 1 where the update rests. Without it (EM proper) weights take back what the
-noise gains, and hundreds of rounds are needed where a window has many samples:
-parameter expansion, Liu, Rubin and Wu 1998, Biometrika 85.
+MAP with the log evidence (`sim2gp.inference.laplace`).
 """
 
 import dataclasses
@@ -22,114 +13,31 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sim2gp.inference.arrowhead import Elimination, Noise, eliminate
-from sim2gp.inference.convergence import (
-    CONVERGED,
-    DEAD,
-    NEAR,
-    NOT_FINITE,
-    STALLED,
-    Convergence,
-    converged,
-)
-from sim2gp.inference.gaussian import LOG_2PI, Gaussian
+from sim2gp.inference.arrowhead import Noise, eliminate
+from sim2gp.inference.convergence import Convergence, converged
+from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.host_descent import Progress, best_start, descend
-from sim2gp.inference.least_squares import (
-    Factor,
-    gauss_newton_step,
-    log_joint,
-    posterior,
-    stack,
-)
+from sim2gp.inference.laplace import Laplace, expected_noise, laplace, log_normaliser
+from sim2gp.inference.least_squares import posterior
 from sim2gp.inference.levenberg_marquardt import (
     AGAIN_DAMPING,
-    GRADIENT_TOLERANCE,
     Point,
     evaluate,
     multi_start,
 )
 from sim2gp.inference.likelihood import AbstractLikelihood
-from sim2gp.inference.linalg import solve_triangular
 from sim2gp.inference.parameters import Parameters
 from sim2gp.inference.prior import AbstractPrior, ParameterPrior
-from sim2gp.types import Key, Scalar, in_float64
+from sim2gp.types import AnyArray, AnyScalar, Key, Scalar, in_float64
 
 SPREAD = 0.7  # prior sd, of starts that are drawn
 
 
 #: Told of each step that a fit on the host keeps, and how to have its posterior.
 Report = Callable[[Progress, Callable[[], "Estimate"]], None]
-
-
-class Laplace(eqx.Module):
-    """The Gaussian about a point, in whitened coordinates, from its factors."""
-
-    at: Point
-    arrow: Elimination
-    full: Factor  # of data and prior
-
-    @property
-    def R(self) -> Float[Array, "p p"]:
-        """Factor of the posterior precision: ``R^T R = Sigma_z^-1``."""
-        return self.full[:-1, :-1]
-
-    def scale(self) -> Float[Array, "p p"]:
-        """Square root of ``Sigma_z``: ``R^-1``."""
-        return solve_triangular(self.R, jnp.eye(len(self.R), dtype=self.R.dtype))
-
-    def log_joint(self) -> Scalar:
-        """``-L - 1/2 logdet(S0 Sq^-1)``, nats, over ``z`` and the nuisances.
-
-        The Laplace evidence, but for the normalisation of the noise.
-        """
-        pivots = jnp.diagonal(self.arrow.R11, axis1=1, axis2=2)
-        return log_joint(self.full) - jnp.sum(jnp.log(pivots))
-
-    def squares(self) -> tuple[Float[Array, "W c"], Float[Array, "W c"]]:
-        """Squared residuals, and squares that the posterior's own spread adds."""
-        n = self.at.e.shape[1]
-        own, rest = self.at.blocks[..., :n], self.at.blocks[..., n:]
-        # Rows of (z, r) with the nuisances at their best.
-        reduced = rest - own @ self.arrow.slope[:, None]
-        eye = jnp.eye(n)
-        root = jax.vmap(lambda R11: solve_triangular(R11, eye))(self.arrow.R11)
-        spread = jnp.sum((reduced[..., :-1] @ self.scale()) ** 2, axis=(2, 3))
-        spread = spread + jnp.sum((own @ root[:, None]) ** 2, axis=(2, 3))
-        return jnp.sum(reduced[..., -1] ** 2, axis=2), spread
-
-    def newton_step_sd(self) -> Scalar:
-        """The largest entry of the undamped step, each in its own posterior sd."""
-        dz = gauss_newton_step(self.full)  # R dz = -c
-        de = self.arrow.slope[..., -1] + self.arrow.slope[..., :-1] @ dz
-        own = jnp.einsum("wij,wj->wi", self.arrow.R11, de)
-        entries = self.full[:-1, -1], own
-        largest = (jnp.max(jnp.abs(x), initial=0.0) for x in entries)
-        return jnp.maximum(*largest)
-
-    def convergence(
-        self, steps: Int[Array, ""], away: float | Scalar = jnp.inf
-    ) -> Convergence:
-        """Whether a descent of so many steps has ended at a MAP, or near enough."""
-        gradient = self.at.gradient
-        step_sd = jnp.minimum(self.newton_step_sd(), away)
-        there = (gradient <= GRADIENT_TOLERANCE) | (step_sd <= NEAR)
-        status = jnp.where(there, CONVERGED, STALLED)
-        data = self.arrow.data
-        dead = jnp.all(data[:, :-1] == 0.0) & jnp.any(data[:, -1] != 0.0)
-        status = jnp.where(dead, DEAD, status)
-        finite = jnp.isfinite(self.at.cost) & jnp.all(jnp.isfinite(self.full))
-        status = jnp.where(finite, status, NOT_FINITE)
-        dz = gauss_newton_step(self.full)
-        away_each = jnp.abs(dz) / jnp.linalg.norm(self.scale(), axis=1)
-        return Convergence(status, gradient, step_sd, steps, away_each)
-
-
-def laplace(at: Point, noise: Noise) -> Laplace:
-    """The Gaussian about a point, given the noise."""
-    arrow = eliminate(at.blocks, at.e, noise)
-    return Laplace(at, arrow, stack(arrow.data, at.prior))
 
 
 class Estimate(eqx.Module):
@@ -146,10 +54,10 @@ class Estimate(eqx.Module):
     prior: Gaussian
     posterior: Gaussian
     noise: Noise
-    nuisances: Float[Array, "W n"]
-    information: Float[Array, "p p"]
-    scores: Float[Array, "W p"]
-    log_evidence: Scalar
+    nuisances: Float[AnyArray, "W n"]
+    information: Float[AnyArray, "p p"]
+    scores: Float[AnyArray, "W p"]
+    log_evidence: AnyScalar
     convergence: Convergence
 
     def z(self) -> Float[Array, " p"]:
@@ -207,7 +115,6 @@ def estimate(
         noise = likelihood.first_noise()
     start = starts, nuisances, noise
     if likelihood.on_host:
-        freedom = jnp.asarray(freedom)
         return _estimate_on_host(likelihood, prior, start, freedom, report)
     return _estimate(likelihood, prior, *start, freedom, needed, rounds)
 
@@ -216,63 +123,50 @@ def _estimate_on_host(
     likelihood: AbstractLikelihood,
     prior: AbstractPrior,
     start: tuple[Float[Array, "starts p"], Float[Array, "W n"], Noise],
-    freedom: Scalar,
+    freedom: float | Scalar,
     report: Report | None,
 ) -> Estimate:
-    starts, e, noise = start
-    counts, floor = likelihood.counts, likelihood.floor
+    """The same in NumPy: tracing and compiling would take longer than the descent."""
+    of_numpy = (likelihood.counts, likelihood.floor, freedom, start, prior)
+    of_numpy = jax.tree.map(np.asarray, of_numpy)
+    counts, floor, freedom, (starts, e, noise), of_prior = of_numpy
 
-    def update(at: Point, noise: Noise) -> Noise:
-        return _updated(at, noise, counts, floor, freedom)
+    def update(found: Laplace, noise: Noise) -> Noise:
+        return expected_noise(noise, *found.squares(), counts, floor, freedom)
 
-    best = best_start(likelihood, prior, starts, e, noise, _newton_step_sd)
-    begin = (best.at.z, best.at.e), noise, _newton_step_sd, update
+    best = best_start(likelihood, of_prior, starts, e, noise)
 
     def about(found: Progress) -> Estimate:
-        counted = jnp.asarray(found.steps), jnp.asarray(found.away)
-        return _about(found.at, found.noise, prior.gaussian, counts, *counted)
+        args = found.noise, of_prior.gaussian, counts, found.steps, found.away
+        return jax.tree.map(jnp.asarray, _about(found.found, *args))
 
     damping = min(best.damping, AGAIN_DAMPING)
-    for found in descend(likelihood, prior, *begin, damping=damping):
+    begin = (best.at.z, best.at.e), noise, update
+    for found in descend(likelihood, of_prior, *begin, damping=damping):
         if report is not None:
             report(found, partial(about, found))
     return about(found)
 
 
-@eqx.filter_jit
-def _updated(
-    at: Point, noise: Noise, counts: Array, floor: Array, freedom: Scalar
-) -> Noise:
-    squares, spread = laplace(at, noise).squares()
-    return expected_noise(noise, squares, spread, counts, floor, freedom)
-
-
-@eqx.filter_jit
-def _newton_step_sd(at: Point, noise: Noise) -> Scalar:
-    return laplace(at, noise).newton_step_sd()
-
-
-@eqx.filter_jit
 def _about(
-    at: Point,
+    found: Laplace,
     noise: Noise,
     prior: Gaussian,
-    counts: Float[Array, "W c"],
-    steps: Int[Array, ""],
+    counts: Float[AnyArray, "W c"],
+    steps: int | Int[AnyArray, ""],
     away: float | Scalar = jnp.inf,
 ) -> Estimate:
     """Laplace's posterior about the point where a descent has ended.
 
     ``away`` is how far the MAP may be, in posterior sd, where the descent knows.
     """
-    found = laplace(at, noise)
     return Estimate(
         prior,
-        posterior(found.full, at.z, prior),
+        posterior(found.full, found.at.z, prior),
         noise,
-        at.e,
+        found.at.e,
         found.arrow.data[:-1, :-1],
-        at.scores,
+        found.at.scores,
         found.log_joint() + log_normaliser(noise, counts),
         found.convergence(steps, away),
     )
@@ -306,7 +200,7 @@ def _estimate(
         rounds=rounds,
         needed=needed,
     )
-    return _about(at, noise, prior.gaussian, counts, steps)
+    return _about(laplace(at, noise), noise, prior.gaussian, counts, steps)
 
 
 @eqx.filter_jit
@@ -335,28 +229,3 @@ def estimate_noise(likelihood: AbstractLikelihood, prior: AbstractPrior) -> Esti
         -0.5 * misfit + log_normaliser(noise, counts),
         converged(p),
     )
-
-
-def expected_noise(
-    noise: Noise,
-    squares: Float[Array, "W c"],
-    spread: Float[Array, "W c"],
-    counts: Float[Array, "W c"],
-    floor: Float[Array, " c"],
-    freedom: float | Scalar = jnp.inf,
-) -> Noise:
-    """EM's update of noise and weights, from squares expected under the posterior."""
-    with_data = jnp.sum(counts, axis=1) > 0
-    mean = jnp.mean(noise.weights, where=with_data)
-    expected = noise.weights @ (squares + spread) / jnp.where(mean > 0, mean, 1.0)
-    sd = jnp.sqrt((2.0 * floor**2 + expected) / (2.0 + jnp.sum(counts, axis=0)))
-    misfit = jnp.sum(squares / sd[None] ** 2, axis=1)
-    weights = (1.0 + jnp.sum(counts, axis=1) / freedom) / (1.0 + misfit / freedom)
-    return Noise(sd, weights)
-
-
-def log_normaliser(noise: Noise, counts: Float[Array, "W c"]) -> Scalar:
-    """``-sum_wc count_wc [log sig_c + 1/2 log(2 pi) - 1/2 log w_w]``, nats."""
-    N = jnp.sum(counts, axis=0)
-    of_noise = jnp.sum(N * (jnp.log(noise.sd) + 0.5 * LOG_2PI))
-    return 0.5 * jnp.sum(jnp.sum(counts, axis=1) * jnp.log(noise.weights)) - of_noise

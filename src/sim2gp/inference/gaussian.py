@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from sim2gp.errors import InputError
 from sim2gp.inference.linalg import solve_triangular, triangular
-from sim2gp.types import Key, Scalar
+from sim2gp.types import AnyArray, Key, Scalar
 
 LOG_2PI = 1.8378770664093453
 
@@ -23,10 +23,10 @@ LOG_2PI = 1.8378770664093453
 class Gaussian(eqx.Module):
     """``N(mean, scale scale^T)`` over ``R^n``."""
 
-    mean: Float[Array, " n"]
-    scale: Float[Array, "n k"]
+    mean: Float[AnyArray, " n"]
+    scale: Float[AnyArray, "n k"]
 
-    def at(self, eps: Float[Array, " k"]) -> Float[Array, " n"]:
+    def at(self, eps: Float[AnyArray, " k"]) -> Float[AnyArray, " n"]:
         """The point at standard normal coordinates ``eps``."""
         return self.mean + self.scale @ eps
 

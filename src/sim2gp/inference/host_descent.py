@@ -1,35 +1,35 @@
 """The descent to a MAP where each linearisation asks a simulator on the host.
 
-The steps are those of `sim2gp.inference.levenberg_marquardt`, taken one at a time by a
-loop of the host, for a linearisation is what costs. So there are as few as can be:
-starts are compared where they are roughly finished, the noise is updated after every
-step that is kept (generalised EM: Dempster, Laird and Rubin 1977, section 3), and the
-descent ends where Newton's step is a hundredth of a posterior sd and the noise rests.
+The steps are those of `sim2gp.inference.levenberg_marquardt`, in NumPy, taken one at a
+time by a loop of the host, for a linearisation is what costs. So there are as few as
+can be: a step that does not lower the cost is simulated but not linearised, starts are
+compared where they are roughly finished, the noise is updated after every step that is
+kept (generalised EM: Dempster, Laird and Rubin 1977, section 3), and the descent ends
+where Newton's step is a hundredth of a posterior sd and the noise rests.
 """
 
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from sim2gp.inference.arrowhead import Blocks, Noise, eliminate
+from sim2gp.inference.arrowhead import Noise
 from sim2gp.inference.convergence import NEAR
-from sim2gp.inference.least_squares import stack
+from sim2gp.inference.laplace import Laplace, laplace
 from sim2gp.inference.levenberg_marquardt import (
     FIRST_DAMPING,
     MOST_DAMPING,
     Point,
-    judged,
+    next_damping,
     point,
     step,
 )
-from sim2gp.inference.likelihood import AbstractLikelihood
+from sim2gp.inference.likelihood import AbstractLikelihood, Trial
 from sim2gp.inference.prior import AbstractPrior
-from sim2gp.types import Scalar
+
+Vector = Float[np.ndarray, " p"]
+Starts = Float[np.ndarray, "W n"]
 
 #: Of Newton's step, in posterior sd, and of the noise's relative change: a descent
 #: rests. A start is compared with others already where its step is a rough one.
@@ -41,33 +41,34 @@ NOTHING = 1e-3
 MOST_STEPS, FIRST_STEPS = 100, 30
 NOISE_TURNS = 10  # of EM at one point
 
-#: Noise that a point's residuals are expected to have, given the noise until now.
-Update = Callable[[Point, Noise], Noise]
-#: Newton's step from a point under a noise, its largest entry in posterior sd.
-StepSd = Callable[[Point, Noise], Scalar]
+#: Noise that the residuals about a MAP are expected to have, given the noise until now.
+Update = Callable[[Laplace, Noise], Noise]
 
 
 class Progress(NamedTuple):
     """Where a descent stands after a step that was kept.
 
-    ``step_sd`` is the largest entry of Newton's step, ``away`` of the shortest step
-    that is known to gain nothing, in posterior sd: so far the MAP may be.
+    ``away`` is the largest entry of Newton's step, or of the shortest step that is
+    known to gain nothing, in posterior sd: so far the MAP may be.
     """
 
-    at: Point
+    found: Laplace
     noise: Noise
     steps: int
     step_sd: float
     damping: float
     away: float
 
+    @property
+    def at(self) -> Point:
+        return self.found.at
+
 
 def descend(
     likelihood: AbstractLikelihood,
     prior: AbstractPrior,
-    start: tuple[Float[Array, " p"], Float[Array, "W n"]],
+    start: tuple[Vector, Starts],
     noise: Noise,
-    step_sd: StepSd,
     update: Update | None,
     *,
     until: float = SMALL,
@@ -81,108 +82,103 @@ def descend(
     linearisation goes on to promise more. It ends early at ``most`` steps, and at once
     where the start has no finite cost.
     """
-    here = _linearised(likelihood, prior, *start, noise)
-    kept, change = jnp.asarray(damping), np.inf if update else 0.0
-    sd, refused = float(step_sd(here, noise)), 0
+    here = _linearised(prior, *start, _tried(likelihood, prior, *start), noise)
+    change = np.inf if update else 0.0
+    sd, refused = float(here.newton_step_sd()), 0
     yield Progress(here, noise, 1, sd, damping, sd)
     for count in range(2, (most or MOST_STEPS) + 1):
-        if not np.isfinite(float(here.cost)) or float(kept) >= MOST_DAMPING:
+        cost = float(here.at.cost)
+        if not np.isfinite(cost) or damping >= MOST_DAMPING:
             return
-        z, e, predicted, size = _proposed(prior, here, noise, kept)
-        there = _linearised(likelihood, prior, z, e, noise)
-        keep, kept = _judged(here, there, predicted, kept)
-        refused = 0 if bool(keep) else refused + 1
-        kept = kept * 4.0 ** max(0, refused - 1)  # each refusal raises it by more
-        vain = float(size) <= NEAR and float(here.cost - there.cost) <= NOTHING
-        if bool(keep):
-            here = there
+        z, e, predicted, size = _proposed(prior, here, noise, damping)
+        trial = _tried(likelihood, prior, z, e)
+        gain = cost - _cost(prior, z, e, trial, noise)
+        keep = gain > 1e-12 * (1.0 + cost)
+        refused = 0 if keep else refused + 1
+        damping = float(next_damping(damping, keep, gain / predicted))
+        damping *= 4.0 ** max(0, refused - 1)  # each refusal raises it by more
+        vain = size <= NEAR and gain <= NOTHING
+        if keep:
+            here = _linearised(prior, z, e, trial, noise)
             if update is not None:
-                noise, change = _rested(update, here, noise)
-                here = _again(here, noise)
-            sd = float(step_sd(here, noise))
-        small = sd <= until and change <= STILL
-        if bool(keep) or vain:
-            away = min(sd, float(size)) if vain else sd
-            yield Progress(here, noise, count, sd, float(kept), away)
-        if small or vain:
+                here, noise, change = _rested(update, here, noise)
+            sd = float(here.newton_step_sd())
+        if keep or vain:
+            away = min(sd, size) if vain else sd
+            yield Progress(here, noise, count, sd, damping, away)
+        if vain or (sd <= until and change <= STILL):
             return
 
 
-def _rested(update: Update, here: Point, noise: Noise) -> tuple[Noise, float]:
+def _rested(
+    update: Update, here: Laplace, noise: Noise
+) -> tuple[Laplace, Noise, float]:
     """The noise where it rests at a point, which asks nothing of the simulator."""
-    first = noise
+    first, at = noise, here.at
     for _ in range(NOISE_TURNS):
         noise, before = update(here, noise), noise
+        again = point(at.z, at.e, at.blocks, at.prior, noise)
+        here = laplace(again, noise)
         if _change(noise, before) <= 0.1 * STILL:
             break
-    return noise, _change(noise, first)
+    return here, noise, _change(noise, first)
 
 
 def _change(new: Noise, old: Noise) -> float:
-    return float(np.max(np.abs(np.log(np.asarray(new.sd) / np.asarray(old.sd)))))
+    return float(np.max(np.abs(np.log(new.sd / old.sd))))
 
 
 def best_start(
     likelihood: AbstractLikelihood,
     prior: AbstractPrior,
-    starts: Float[Array, "starts p"],
-    e: Float[Array, "W n"],
+    starts: Float[np.ndarray, "starts p"],
+    e: Starts,
     noise: Noise,
-    step_sd: StepSd,
 ) -> Progress:
     """Of roughly finished descents from each start, the one of least cost."""
     found: list[Progress] = []
     for z in starts:
-        if bool(jnp.isnan(z).any()):
+        if np.isnan(z).any():
             continue
-        args = (z, e), noise, step_sd, None
-        limits = {"until": ROUGH, "most": FIRST_STEPS}
-        *_, last = descend(likelihood, prior, *args, **limits)  # type: ignore[arg-type]
+        begin = likelihood, prior, (z, e), noise, None
+        *_, last = descend(*begin, until=ROUGH, most=FIRST_STEPS)
         found.append(last)
-    finite = [x for x in found if np.isfinite(float(x.at.cost))]
+    finite = [x for x in found if np.isfinite(x.at.cost)]
     return min(finite or found, key=lambda x: float(x.at.cost))
 
 
-def _linearised(
-    likelihood: AbstractLikelihood,
-    prior: AbstractPrior,
-    z: Float[Array, " p"],
-    e: Float[Array, "W n"],
-    noise: Noise,
-) -> Point:
+def _tried(
+    likelihood: AbstractLikelihood, prior: AbstractPrior, z: Vector, e: Starts
+) -> Trial:
     about = prior.gaussian
-    blocks = likelihood.blocks(about.at(z), e, about.scale)
-    return _pointed(prior, z, e, blocks, noise)
+    return likelihood.trial(about.at(z), e, about.scale)
 
 
-@eqx.filter_jit
-def _pointed(
-    prior: AbstractPrior, z: Array, e: Array, blocks: Blocks, noise: Noise
-) -> Point:
-    return point(z, e, blocks, prior.rows(z), noise)
+def _cost(
+    prior: AbstractPrior, z: Vector, e: Starts, trial: Trial, noise: Noise
+) -> float:
+    """The cost that `point` would find; NaN and infinity never win."""
+    data = noise.weights @ trial.squares @ noise.sd**-2
+    offset = prior.rows(z)[:, -1]
+    return float(0.5 * (data + np.sum(e**2) + offset @ offset))
 
 
-@eqx.filter_jit
-def _again(here: Point, noise: Noise) -> Point:
-    """The same linearisation under another noise."""
-    return point(here.z, here.e, here.blocks, here.prior, noise)
+def _linearised(
+    prior: AbstractPrior, z: Vector, e: Starts, trial: Trial, noise: Noise
+) -> Laplace:
+    return laplace(point(z, e, trial.blocks(), prior.rows(z), noise), noise)
 
 
-@eqx.filter_jit
 def _proposed(
-    prior: AbstractPrior, here: Point, noise: Noise, damping: Scalar
-) -> tuple[Array, Array, Scalar, Scalar]:
+    prior: AbstractPrior, here: Laplace, noise: Noise, damping: float
+) -> tuple[Vector, Starts, float, float]:
     """The damped step's end, what it should save, and its size in posterior sd."""
-    dz, de, predicted = step(prior, here, noise, damping)
-    arrow = eliminate(here.blocks, here.e, noise)
-    full = stack(arrow.data, here.prior)[:-1, :-1]
-    own = jnp.einsum("wij,wj->wi", arrow.R11, de + arrow.slope[..., :-1] @ dz)
-    size = jnp.maximum(_largest(full @ dz), _largest(own))
-    return here.z + dz, here.e + de, predicted, size
+    dz, de, predicted = step(prior, here.at, noise, damping)
+    slope = here.arrow.slope[..., :-1]
+    own = np.einsum("wij,wj->wi", here.arrow.R11, de + slope @ dz)
+    size = max(_largest(here.R @ dz), _largest(own))
+    return here.at.z + dz, here.at.e + de, float(predicted), size
 
 
-def _largest(x: Array) -> Scalar:
-    return jnp.max(jnp.abs(x), initial=0.0)
-
-
-_judged = jax.jit(judged)
+def _largest(x: np.ndarray) -> float:
+    return float(np.max(np.abs(x), initial=0.0))

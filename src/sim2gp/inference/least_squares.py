@@ -20,41 +20,42 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sim2gp.inference.gaussian import LOG_2PI, Gaussian, log_det_factor
-from sim2gp.inference.linalg import solve_triangular, triangular
-from sim2gp.types import Scalar
+from sim2gp.inference.linalg import library, solve_triangular, triangular
+from sim2gp.types import AnyArray, AnyScalar, Scalar
 
 #: Triangular factor of ``[J r]``, shape (p + 1, p + 1), diagonal non-negative.
-Factor = Float[Array, "p1 p1"]
+Factor = Float[AnyArray, "p1 p1"]
 
 RANK_TOLERANCE = 1e-8  # singular values below this share of the largest count as zero
 
 
-def factor(J: Float[Array, "N p"], r: Float[Array, " N"]) -> Factor:
+def factor(J: Float[AnyArray, "N p"], r: Float[AnyArray, " N"]) -> Factor:
     """Triangular factor of ``[J r]``: the data's square-root information."""
-    return triangular(jnp.concatenate([J, r[:, None]], axis=1))
+    return triangular(library(J, r).concatenate([J, r[:, None]], axis=1))
 
 
-def stack(*factors: Float[Array, "_ k"]) -> Float[Array, "k k"]:
+def stack(*factors: Float[AnyArray, "_ k"]) -> Float[AnyArray, "k k"]:
     """The factor of several blocks of rows at once."""
-    return triangular(jnp.concatenate(factors))
+    return triangular(library(*factors).concatenate(factors))
 
 
-def prior_rows(z: Float[Array, " p"]) -> Float[Array, "p p1"]:
+def prior_rows(z: Float[AnyArray, " p"]) -> Float[AnyArray, "p p1"]:
     """``[I z]``: the prior of whitened unknowns, as rows."""
-    return jnp.concatenate([jnp.eye(z.size, dtype=z.dtype), z[:, None]], axis=1)
+    xp = library(z)
+    return xp.concatenate([xp.eye(z.size, dtype=z.dtype), z[:, None]], axis=1)
 
 
-def with_prior(data: Factor, z: Float[Array, " p"]) -> Factor:
+def with_prior(data: Factor, z: Float[AnyArray, " p"]) -> Factor:
     """The factor of the data and the prior."""
     return stack(data, prior_rows(z))
 
 
-def gauss_newton_step(full: Factor) -> Float[Array, " p"]:
+def gauss_newton_step(full: Factor) -> Float[AnyArray, " p"]:
     """The undamped step ``-R^-1 c`` towards the linearised MAP."""
     return -solve_triangular(full[:-1, :-1], full[:-1, -1])
 
 
-def posterior(full: Factor, z: Float[Array, " p"], prior: Gaussian) -> Gaussian:
+def posterior(full: Factor, z: Float[AnyArray, " p"], prior: Gaussian) -> Gaussian:
     """``N(tt*, Sigma_q)`` of data and prior, by a triangular solve: scale ``L0 R^-1``.
 
     ``full`` is their factor at ``z``, which must be where its gradient is zero.
@@ -62,7 +63,9 @@ def posterior(full: Factor, z: Float[Array, " p"], prior: Gaussian) -> Gaussian:
     return Gaussian(prior.mean + prior.scale @ z, over(prior.scale, full[:-1, :-1]))
 
 
-def over(A: Float[Array, "q p"], R: Float[Array, "p p"]) -> Float[Array, "q p"]:
+def over(
+    A: Float[AnyArray, "q p"], R: Float[AnyArray, "p p"]
+) -> Float[AnyArray, "q p"]:
     """``A R^-1`` of an upper-triangular ``R``.
 
     With a prior's scale as ``A`` it is the posterior's, whose precision in the prior's
@@ -71,12 +74,13 @@ def over(A: Float[Array, "q p"], R: Float[Array, "p p"]) -> Float[Array, "q p"]:
     return solve_triangular(R, A.T, transposed=True).T
 
 
-def log_joint(full: Factor) -> Scalar:
+def log_joint(full: Factor) -> AnyScalar:
     """``-1/2 ||r||^2 - 1/2 ||z||^2 - 1/2 logdet(S0 Sq^-1)``, nats.
 
     The evidence, but for the normalisation of the noise.
     """
-    log_det = jnp.sum(jnp.log(jnp.diag(full[:-1, :-1])))
+    xp = library(full)
+    log_det = xp.sum(xp.log(xp.diag(full[:-1, :-1])))
     return -0.5 * full[:, -1] @ full[:, -1] - log_det
 
 

@@ -15,7 +15,7 @@ one loop that descends.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -25,9 +25,9 @@ from jaxtyping import Array, Bool, Float, Int
 from sim2gp.inference.arrowhead import Blocks, Noise, eliminate
 from sim2gp.inference.least_squares import stack
 from sim2gp.inference.likelihood import AbstractLikelihood
-from sim2gp.inference.linalg import eigh, solve_triangular
+from sim2gp.inference.linalg import eigh, library, solve_triangular
 from sim2gp.inference.prior import AbstractPrior
-from sim2gp.types import Scalar
+from sim2gp.types import AnyArray, AnyScalar, Scalar
 
 #: Of the gradient over ``1 + cost``, or of a Newton step in posterior sd: rounding
 #: keeps the first one of data without noise above it.
@@ -47,21 +47,22 @@ MOST_DAMPING = 1e14
 class Point(eqx.Module):
     """One linearisation, and how good it is under some noise."""
 
-    z: Float[Array, " p"]
-    e: Float[Array, "W n"]
+    z: Float[AnyArray, " p"]
+    e: Float[AnyArray, "W n"]
     blocks: Blocks
-    prior: Float[Array, "q p1"]  # rows of the prior
-    cost: Scalar
-    by_z: Float[Array, " p"]  # gradient of the cost
-    by_e: Float[Array, "W n"]
-    scores: Float[Array, "W p"]  # what each window's data add to ``by_z``
+    prior: Float[AnyArray, "q p1"]  # rows of the prior
+    cost: AnyScalar
+    by_z: Float[AnyArray, " p"]  # gradient of the cost
+    by_e: Float[AnyArray, "W n"]
+    scores: Float[AnyArray, "W p"]  # what each window's data add to ``by_z``
 
     @property
-    def gradient(self) -> Scalar:
+    def gradient(self) -> AnyScalar:
         """``||g||_inf / (1 + cost)``; zero for a problem without unknowns."""
-        largest = jnp.maximum(
-            jnp.max(jnp.abs(self.by_z), initial=0.0),
-            jnp.max(jnp.abs(self.by_e), initial=0.0),
+        xp = library(self.by_z)
+        largest = xp.maximum(
+            xp.max(xp.abs(self.by_z), initial=0.0),
+            xp.max(xp.abs(self.by_e), initial=0.0),
         )
         return largest / (1.0 + self.cost)
 
@@ -185,7 +186,7 @@ def _descend(
 
 
 def judged(
-    here: Point, there: Point, predicted_reduction: Scalar, damping: Scalar
+    here: Point, there: Point, predicted_reduction: AnyScalar, damping: Scalar
 ) -> tuple[Bool[Array, ""], Scalar]:
     """Whether a step is kept, and the damping of the next one (Nielsen 1999)."""
     actual_reduction = here.cost - there.cost
@@ -196,18 +197,26 @@ def judged(
     keep = (actual_reduction > slack) | lost_in_rounding
     ratio = actual_reduction / predicted_reduction
     ratio = jnp.where(lost_in_rounding, 1.0, ratio)  # rounding has none
-    lowered = damping * jnp.clip(1.0 - (2.0 * ratio - 1.0) ** 3, 0.1, 2.0)
-    raised = 4.0 * jnp.maximum(damping, LEAST_DAMPING)
-    return keep, jnp.where(keep, lowered, raised)
+    return keep, next_damping(damping, keep, ratio)
+
+
+def next_damping(
+    damping: AnyScalar, keep: bool | Bool[Array, ""], ratio: AnyScalar
+) -> Any:
+    """The damping after a step that saved ``ratio`` times what it should."""
+    xp = library(ratio)
+    lowered = damping * xp.clip(1.0 - (2.0 * ratio - 1.0) ** 3, 0.1, 2.0)
+    return xp.where(keep, lowered, 4.0 * xp.maximum(damping, LEAST_DAMPING))
 
 
 def step(
-    prior: AbstractPrior, here: Point, noise: Noise, damping: Scalar
-) -> tuple[Float[Array, " p"], Float[Array, "W n"], Scalar]:
+    prior: AbstractPrior, here: Point, noise: Noise, damping: AnyScalar
+) -> tuple[Float[AnyArray, " p"], Float[AnyArray, "W n"], AnyScalar]:
     """The damped step of the whole problem, and the cost that it should save."""
-    damping = jnp.where(damping < LEAST_DAMPING, 0.0, damping)
+    xp = library(here.z)
+    damping = xp.where(damping < LEAST_DAMPING, 0.0, damping)
     arrow = eliminate(here.blocks, here.e, noise, damping)
-    damped = jnp.sqrt(damping) * jnp.eye(here.z.size, here.z.size + 1)
+    damped = xp.sqrt(damping) * xp.eye(here.z.size, here.z.size + 1)
     full = stack(arrow.data, here.prior, damped)
     # Whitened by R, the maps' curvature is a change of the identity. Only where it is
     # positive: it may shorten the QR's step; longer ones were measured to go astray.
@@ -215,11 +224,11 @@ def step(
     S = prior.curvature(here.z, here.by_z - here.z)
     half = solve_triangular(R, S, transposed=True)
     values, vectors = eigh(solve_triangular(R, half.T, transposed=True))
-    c = vectors @ ((vectors.T @ c) / (1.0 + jnp.maximum(values, 0.0)))
+    c = vectors @ ((vectors.T @ c) / (1.0 + xp.maximum(values, 0.0)))
     dz = -solve_triangular(R, c)
     de = -(arrow.slope[..., -1] + arrow.slope[..., :-1] @ dz)
-    damped_squares = damping * (dz @ dz + jnp.sum(de**2))
-    slope = here.by_z @ dz + jnp.sum(here.by_e * de)
+    damped_squares = damping * (dz @ dz + xp.sum(de**2))
+    slope = here.by_z @ dz + xp.sum(here.by_e * de)
     return dz, de, 0.5 * (damped_squares - slope)
 
 
@@ -237,18 +246,18 @@ def evaluate(
 
 
 def point(
-    z: Float[Array, " p"],
-    e: Float[Array, "W n"],
+    z: Float[AnyArray, " p"],
+    e: Float[AnyArray, "W n"],
     blocks: Blocks,
-    rows: Float[Array, "q p1"],
+    rows: Float[AnyArray, "q p1"],
     noise: Noise,
 ) -> Point:
     """Cost and gradient under a noise, of a linearisation."""
-    white, n = noise.scale(blocks), e.shape[1]
+    xp, white, n = library(z), noise.scale(blocks), e.shape[1]
     r, offset = white[..., -1], rows[:, -1]
-    cost = 0.5 * (jnp.sum(r**2) + jnp.sum(e**2) + offset @ offset)
-    g = jnp.einsum("wckj,wck->wj", white[..., :-1], r)
-    by_z = jnp.sum(g[:, n:], axis=0) + rows[:, :-1].T @ offset
+    cost = 0.5 * (xp.sum(r**2) + xp.sum(e**2) + offset @ offset)
+    g = xp.einsum("wckj,wck->wj", white[..., :-1], r)
+    by_z = xp.sum(g[:, n:], axis=0) + rows[:, :-1].T @ offset
     return Point(z, e, blocks, rows, cost, by_z, g[:, :n] + e, g[:, n:])
 
 

@@ -6,12 +6,27 @@ One-step data (`sim2gp.data.one_step`) and windows of logs
 """
 
 from abc import abstractmethod
+from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
 from equinox import AbstractVar
 from jaxtyping import Array, Float
 
 from sim2gp.inference.arrowhead import Blocks, Noise
+
+
+class Trial(NamedTuple):
+    """Data at a point that a descent on the host tries: what decides, and the rest.
+
+    ``squares`` sum the squared residuals of each window and channel; ``blocks`` asks
+    for the derivatives.
+    """
+
+    squares: Float[np.ndarray, "W c"]
+    blocks: Callable[[], Float[np.ndarray, "W c k k"]]
 
 
 class AbstractLikelihood(eqx.Module):
@@ -50,3 +65,13 @@ class AbstractLikelihood(eqx.Module):
         At virtual parameters ``tt`` and whitened nuisances ``e``; ``J_z`` is the
         derivative along each column of ``scale``.
         """
+
+    def trial(
+        self,
+        tt: Float[np.ndarray, " p"],
+        e: Float[np.ndarray, "W n"],
+        scale: Float[np.ndarray, "p p"],
+    ) -> Trial:
+        """The same in NumPy, with `blocks` asked for later. Call it in float64."""
+        found = np.asarray(self.blocks(*map(jnp.asarray, (tt, e, scale))))
+        return Trial(np.sum(found[..., -1] ** 2, axis=-1), lambda: found)

@@ -1,10 +1,15 @@
-"""Factorisations that wait for no other: under `vmap`, one matrix after the other.
+"""Factorisations of JAX's arrays and of NumPy's, each in its own library.
+
+Of JAX's they wait for no other: under `vmap`, one matrix after the other.
 
 jaxlib cuts a large batch of matrices into tasks for the thread pool that its programs
 themselves run on, and waits for them there. As many such batches at once as the pool
 has threads wait for each other for ever: on two cores no fit of RES-FS came to its end
 (jaxlib 0.10.2, where a batch of less than 2e5 operations is not cut).
 Where processes have a core each, which is how studies run, a loop costs little.
+
+A descent that asks a simulator on the host holds NumPy arrays: nothing is traced or
+compiled, which would take longer than the whole descent.
 """
 
 from collections.abc import Callable
@@ -14,8 +19,24 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
+import numpy as np
 from jax.custom_batching import sequential_vmap
-from jaxtyping import Array, Float
+from jaxtyping import Float
+from scipy.linalg.lapack import dtrtrs
+
+from sim2gp.types import AnyArray
+
+
+def library(*arrays: Any) -> Any:
+    """JAX's NumPy where one of these is its array, else NumPy."""
+    return jnp if any(isinstance(x, jax.Array) for x in arrays) else np
+
+
+def each_window(f: Callable[..., Any], *arrays: AnyArray) -> Any:
+    """``f`` of one row of each array, for all rows."""
+    if library(*arrays) is np:
+        return np.stack([f(*rows) for rows in zip(*arrays, strict=True)])
+    return jax.vmap(f)(*arrays)
 
 
 def one_by_one(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -25,39 +46,51 @@ def one_by_one(function: Callable[..., Any]) -> Callable[..., Any]:
     return looped
 
 
-def qr(A: Float[Array, "N k"]) -> Float[Array, "_ k"]:
+def qr(A: Float[AnyArray, "N k"]) -> Float[AnyArray, "_ k"]:
     """``R`` of the QR decomposition, ``min(N, k)`` rows, signs as LAPACK has them."""
-    return _qr(A)
+    return np.linalg.qr(A, mode="r") if library(A) is np else _qr(A)
 
 
-def triangular(rows: Float[Array, "N k"]) -> Float[Array, "k k"]:
+def triangular(rows: Float[AnyArray, "N k"]) -> Float[AnyArray, "k k"]:
     """``R`` of the QR decomposition, square, with non-negative diagonal."""
-    N, k = rows.shape
+    xp, (N, k) = library(rows), rows.shape
     if N < k:
-        rows = jnp.concatenate([rows, jnp.zeros((k - N, k), rows.dtype)])
+        rows = xp.concatenate([rows, xp.zeros((k - N, k), rows.dtype)])
     R = qr(rows)
-    return jnp.where(jnp.diag(R) < 0.0, -1.0, 1.0)[:, None] * R
+    return xp.where(xp.diag(R) < 0.0, -1.0, 1.0)[:, None] * R
 
 
-def cholesky(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
+def cholesky(A: Float[AnyArray, "n n"]) -> Float[AnyArray, "n n"]:
     """Lower-triangular; NaN where ``A`` is not positive definite."""
     return _cholesky(A)
 
 
-def eigh(A: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
+def eigh(
+    A: Float[AnyArray, "n n"],
+) -> tuple[Float[AnyArray, " n"], Float[AnyArray, "n n"]]:
     """Eigenvalues, ascending, and eigenvectors as columns of a symmetric matrix."""
+    if library(A) is np:
+        if not np.isfinite(A).all():  # NumPy raises where JAX has no number
+            return np.full(len(A), np.nan), np.full(A.shape, np.nan)
+        found = np.linalg.eigh(A)
+        return found.eigenvalues, found.eigenvectors
     values, vectors = _eigh(A)
     return values, vectors
 
 
 def solve_triangular(
-    R: Float[Array, "n n"],
-    B: Float[Array, "n *k"],
+    R: Float[AnyArray, "n n"],
+    B: Float[AnyArray, "n *k"],
     *,
     lower: bool = False,
     transposed: bool = False,
-) -> Float[Array, "n *k"]:
+) -> Float[AnyArray, "n *k"]:
     """``R^-1 B``, or ``R^-T B``; upper-triangular unless ``lower``."""
+    if library(R, B) is np:
+        if not B.size:
+            return np.zeros(B.shape)
+        found, singular = dtrtrs(R, B, lower=lower, trans=int(transposed))
+        return np.full(B.shape, np.nan) if singular else found
     return _SOLVE[lower, transposed](R, B)
 
 

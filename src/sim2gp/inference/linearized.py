@@ -9,6 +9,7 @@ while the nonlinear function at the same ``tt`` leaves the ridge's curve.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,11 +19,14 @@ from sim2gp.inference.gaussian import Gaussian
 
 
 def value_and_jacobian(
-    f: Callable[[Array], Array], tt: Float[Array, " p"]
-) -> tuple[Float[Array, "*d"], Float[Array, "*d p"]]:
-    """``f(tt)`` and its Jacobian, by forward mode (p is small, rollouts are long)."""
+    f: Callable[[Array], Any], tt: Float[Array, " p"]
+) -> tuple[Any, Any]:
+    """``f(tt)`` and its Jacobian, by forward mode (p is small, rollouts are long).
 
-    def twice(tt: Array) -> tuple[Array, Array]:
+    Where ``f`` returns several arrays (*d), the Jacobian has as many, (*d, p).
+    """
+
+    def twice(tt: Array) -> tuple[Any, Any]:
         value = f(tt)
         return value, value
 

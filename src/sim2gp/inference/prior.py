@@ -10,6 +10,8 @@ the posterior is:
 """
 
 from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -25,8 +27,9 @@ from sim2gp.inference.least_squares import (
     prior_rows,
     stack,
 )
+from sim2gp.inference.linalg import library
 from sim2gp.inference.parameters import Parameters
-from sim2gp.types import in_float64
+from sim2gp.types import AnyArray, in_float64
 
 
 class AbstractPrior(eqx.Module):
@@ -35,13 +38,13 @@ class AbstractPrior(eqx.Module):
     gaussian: AbstractVar[Gaussian]
 
     @abstractmethod
-    def rows(self, z: Float[Array, " p"]) -> Float[Array, "q p1"]:
+    def rows(self, z: Float[AnyArray, " p"]) -> Float[AnyArray, "q p1"]:
         """Rows ``[K r]`` whose squares are the prior: ``[I z]``, and others."""
 
     @abstractmethod
     def curvature(
-        self, z: Float[Array, " p"], gradient: Float[Array, " p"]
-    ) -> Float[Array, "p p"]:
+        self, z: Float[AnyArray, " p"], gradient: Float[AnyArray, " p"]
+    ) -> Float[AnyArray, "p p"]:
         """The Hessian that the parameters' maps add, given the data's gradient.
 
         It shapes steps only, never the posterior: where a bound saturates it is several
@@ -55,14 +58,16 @@ class ParameterPrior(AbstractPrior):
     gaussian: Gaussian
     table: Parameters
 
-    def rows(self, z: Float[Array, " p"]) -> Float[Array, "q p1"]:
-        measured = self.table.measurement_rows(self.gaussian, z)
-        return jnp.concatenate([prior_rows(z), measured])
+    def rows(self, z: Float[AnyArray, " p"]) -> Float[AnyArray, "q p1"]:
+        if not self.table.measurements:
+            return prior_rows(z)
+        measured = _like(z, _measured, self.table, self.gaussian, z)
+        return library(z).concatenate([prior_rows(z), measured])
 
     def curvature(
-        self, z: Float[Array, " p"], gradient: Float[Array, " p"]
-    ) -> Float[Array, "p p"]:
-        return self.table.curvature(self.gaussian, z, gradient)
+        self, z: Float[AnyArray, " p"], gradient: Float[AnyArray, " p"]
+    ) -> Float[AnyArray, "p p"]:
+        return _like(z, _curved, self.table, self.gaussian, z, gradient)
 
     @in_float64
     def linearised(self, tt: Float[Array, " p"]) -> Gaussian:
@@ -91,3 +96,16 @@ class ParameterPrior(AbstractPrior):
             gtol=1e-12,
         )
         return self.linearised(self.gaussian.at(jnp.asarray(found.x)))
+
+
+def _like(z: AnyArray, f: Callable[..., Array], *args: Any) -> Any:
+    """What ``f`` finds, as an array of the kind of ``z``; of NumPy's, compiled."""
+    return np.asarray(eqx.filter_jit(f)(*args)) if library(z) is np else f(*args)
+
+
+def _measured(table: Parameters, gaussian: Gaussian, z: Array) -> Array:
+    return table.measurement_rows(gaussian, z)
+
+
+def _curved(table: Parameters, gaussian: Gaussian, z: Array, gradient: Array) -> Array:
+    return table.curvature(gaussian, z, gradient)

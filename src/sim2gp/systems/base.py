@@ -143,7 +143,7 @@ class AbstractSystem(eqx.Module):
 
     @abc.abstractmethod
     def leave(self, params: Any, states: Float[Array, "L n"]) -> Float[Array, "L n"]:
-        """What the system says that the plant's states are."""
+        """The plant's states as the system says them: each with the same added."""
 
     @property
     def physical_states(self) -> tuple[Channel, ...]:

@@ -84,6 +84,21 @@ class Arguments(NamedTuple):
     span: Float[AnyArray, "W L"]
 
 
+class Rolled(NamedTuple):
+    """A rollout in ``most`` steps for each row, some of no length."""
+
+    at: Arguments
+    inputs: Float[np.ndarray, "W F m"]
+    span: Float[np.ndarray, "W F"]
+    states: Float[np.ndarray, "W F n"]
+    most: int
+
+    @property
+    def at_rows(self) -> Float[np.ndarray, "W L n"]:
+        """The states at the rows of the windows."""
+        return self.states[:, self.most - 1 :: self.most]
+
+
 class AbstractSimulator(abc.ABC):
     """A simulator on the host; two are equal only if they are the same object."""
 
@@ -150,21 +165,28 @@ class AbstractSimulator(abc.ABC):
             out[:, k] = x = self.flow(theta, x, u[:, k], span[:, k])
         return out
 
-    def linearised_rollout(
-        self, at: "Arguments", along: "Arguments"
-    ) -> tuple[Float[np.ndarray, "W L n"], Float[np.ndarray, "W L n k"]]:
-        """`rollout`, and its derivatives along ``k`` directions of its arguments.
+    def rolled(self, at: "Arguments") -> "Rolled":
+        """`rollout` in steps that can be linearised."""
+        counts = self.substeps(at.span)
+        most = int(counts.max(initial=1))
+        fine = np.arange(most) < counts[..., None]
+        fine = np.where(fine, (at.span / counts)[..., None], 0.0)
+        fine = fine.reshape(len(fine), -1)
+        inputs = np.repeat(at.u, most, axis=1)
+        return Rolled(
+            at, inputs, fine, self.rollout(at.theta, at.x0, inputs, fine), most
+        )
+
+    def linearised(
+        self, run: "Rolled", along: "Arguments"
+    ) -> Float[np.ndarray, "W L n k"]:
+        """Derivatives of a run's states along ``k`` directions of its arguments.
 
         ``along`` has their directions in a last axis (its spans are not read). Each row
         is one of the linear recursion ``S' = A S + B`` of its own slopes.
         """
-        (theta, x0, u, span), (of_theta, S, of_u, _) = at, along
-        counts = self.substeps(span)
-        most = int(counts.max(initial=1))
-        fine = np.arange(most) < counts[..., None]
-        fine = np.where(fine, (span / counts)[..., None], 0.0).reshape(len(span), -1)
-        inputs = np.repeat(u, most, axis=1)
-        states = self.rollout(theta, x0, inputs, fine)
+        (theta, x0, *_), inputs, fine, states, most = run
+        of_theta, S, of_u, _ = along
         before = np.concatenate([x0[:, None], states[:, :-1]], axis=1)
         W, L, n = states.shape
         p, out = theta.shape[1], np.empty((W, L // most, n, S.shape[-1]))
@@ -178,7 +200,14 @@ class AbstractSimulator(abc.ABC):
             for k in range(rows.start, rows.stop):
                 S = J[:, k - first, :, p : p + n] @ S + C[:, k - first]
                 out[:, k // most] = S
-        return states[:, most - 1 :: most], out
+        return out
+
+    def linearised_rollout(
+        self, at: "Arguments", along: "Arguments"
+    ) -> tuple[Float[np.ndarray, "W L n"], Float[np.ndarray, "W L n k"]]:
+        """`rollout`, and its derivatives along ``k`` directions of its arguments."""
+        run = self.rolled(at)
+        return run.at_rows, self.linearised(run, along)
 
     def _slopes_of(
         self,
