@@ -10,6 +10,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from sim2gp.systems.base import AbstractSystem
@@ -44,15 +45,17 @@ def inputs_of(
     # A row without length has no mean; its input does not matter but must be finite.
     h = jnp.where(window.span > 0.0, window.span, 1.0)
 
-    def channel(area: Array, delay: Array) -> Array:
-        def integral(t: Array) -> Array:
-            if not blur:
-                return jnp.interp(t, window.knots, area)
-            twice = _second_integral(window.knots, area)
-            return (twice(t + 0.5 * blur) - twice(t - 0.5 * blur)) / blur
+    ends = jnp.concatenate([jnp.zeros(1, end.dtype), end])
 
-        before = integral(-delay[None])
-        return jnp.diff(jnp.concatenate([before, integral(end - delay)])) / h
+    def channel(area: Array, delay: Array) -> Array:
+        t = ends - delay
+        if blur:
+            sides = 0.5 * blur * np.asarray([[-1.0], [1.0]], t.dtype)
+            early, late = _second_integral(window.knots, area)(t[None] + sides)
+            integral = (late - early) / blur
+        else:
+            integral = jnp.interp(t, window.knots, area)
+        return jnp.diff(integral) / h
 
     return jax.vmap(channel, in_axes=(1, 0), out_axes=1)(window.area, delays)
 

@@ -185,6 +185,21 @@ class AbstractSimulator(abc.ABC):
         ``along`` has their directions in a last axis (its spans are not read). Each row
         is one of the linear recursion ``S' = A S + B`` of its own slopes.
         """
+        moves = run.span.any(axis=1)
+        if moves.all():
+            return self._recursion(run, along)
+        out = np.repeat(along.x0[:, None], run.at_rows.shape[1], axis=1)
+        if moves.any():
+            some_at, u, span, states = jax.tree.map(lambda x: x[moves], run[:-1])
+            some = jax.tree.map(lambda x: x[moves], along)
+            out[moves] = self._recursion(
+                Rolled(some_at, u, span, states, run.most), some
+            )
+        return out
+
+    def _recursion(
+        self, run: "Rolled", along: "Arguments"
+    ) -> Float[np.ndarray, "W L n k"]:
         (theta, x0, *_), inputs, fine, states, most = run
         of_theta, S, of_u, _ = along
         before = np.concatenate([x0[:, None], states[:, :-1]], axis=1)

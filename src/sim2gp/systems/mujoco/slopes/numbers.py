@@ -75,7 +75,7 @@ def tree_of(model: Any) -> Tree | None:
     above |= same & (np.arange(n)[:, None] < np.arange(n)[None])
     return Tree(
         tuple(parent.tolist()),
-        np.stack([_rotation(quat) for quat in model.body_quat]),
+        _rotation(model.body_quat),
         tuple(tuple(np.flatnonzero(body == b).tolist()) for b in range(model.nbody)),
         tuple(body.tolist()),
         model.jnt_type == 3,
@@ -93,7 +93,9 @@ def numbers_of(model: Any) -> Numbers:
     drag, rate = _dry_friction(model)
     affine = np.asarray([[1.0, 0.0, 0.0], [1.0, 1.0, 1.0]])  # gains: fixed, affine
     return Numbers(
-        np.stack([_inertia(model, b) for b in range(model.nbody)]),
+        _inertia(
+            model.body_mass, model.body_ipos, model.body_iquat, model.body_inertia
+        ),
         model.body_pos.copy(),
         model.opt.gravity.copy(),
         model.dof_armature.copy(),
@@ -140,20 +142,26 @@ def _dry_friction(model: Any) -> tuple[Table, Table]:
     return 1.0 / np.maximum(softness, 1e-15), rate
 
 
-def _inertia(model: Any, b: int) -> Table:
-    mass, centre = model.body_mass[b], model.body_ipos[b]
-    R = _rotation(model.body_iquat[b])
-    h = skew(mass * centre)
-    about = R * model.body_inertia[b] @ R.T - h @ skew(centre)
-    return np.block([[about, h], [h.T, mass * np.eye(3)]])
+def _inertia(mass: Table, centre: Table, quat: Table, diagonal: Table) -> Table:
+    """Of each body, about its frame's origin."""
+    R, h = _rotation(quat), skew(mass[:, None] * centre)
+    out = np.zeros((len(mass), 6, 6))
+    about = (R * diagonal[:, None]) @ R.swapaxes(-1, -2) - h @ skew(centre)
+    out[:, :3, :3], out[:, :3, 3:], out[:, 3:, :3] = about, h, h.swapaxes(-1, -2)
+    out[:, 3:, 3:] = mass[:, None, None] * np.eye(3)
+    return out
 
 
 def skew(x: Table) -> Table:
-    """The matrix of a cross product, ``skew(x) y = x cross y``."""
-    return np.asarray([[0, -x[2], x[1]], [x[2], 0, -x[0]], [-x[1], x[0], 0]])
+    """The matrices of a cross product, ``skew(x) y = x cross y``."""
+    K = np.zeros((*x.shape, 3))
+    K[..., 0, 1], K[..., 0, 2], K[..., 1, 2] = -x[..., 2], x[..., 1], -x[..., 0]
+    K[..., 1, 0], K[..., 2, 0], K[..., 2, 1] = x[..., 2], -x[..., 1], x[..., 0]
+    return K
 
 
 def _rotation(quat: Table) -> Table:
-    w, v = quat[0], quat[1:]
-    K = skew(v)
-    return np.eye(3) + 2.0 * (w * K + K @ K) / (quat @ quat)
+    """The matrices of quaternions of any length."""
+    K = skew(quat[..., 1:])
+    bend = quat[..., :1, None] * K + K @ K
+    return np.eye(3) + 2.0 * bend / np.sum(quat**2, axis=-1)[..., None, None]
