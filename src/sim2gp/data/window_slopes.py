@@ -32,8 +32,8 @@ class AbstractAsked(eqx.Module):
     @abstractmethod
     def __call__(
         self, window: Windows, e: Float[Array, " n"], x: Float[Array, " k"]
-    ) -> tuple[Any, HeldInputs, Float[Array, " n"]]:
-        """Constants of the machine, held inputs, and the start."""
+    ) -> tuple[Any, HeldInputs, Float[Array, " n"], Float[Array, " m"]]:
+        """Constants of the machine, held inputs, start, and what is added to inputs."""
 
 
 def states_and_slopes(
@@ -95,10 +95,10 @@ def _arguments(asked: AbstractAsked, windows: Windows, e: Array, k: int) -> Any:
 
     def one(window: Windows, e: Array) -> Any:
         def arguments(x: Array) -> Any:
-            params, held, x0 = asked(window, e, x)
+            params, held, x0, added = asked(window, e, x)
             # `leave` adds to a state what does not depend on it.
             origin = asked.system.leave(params, jnp.zeros((1, x0.size)))
-            inputs = arriving(asked.system, params, held)
+            inputs = arriving(asked.system, params, held) + added[None]
             theta, x0, u = asked.system.enter(params, x0, inputs)
             return Arguments(theta, x0, u, held.span), origin
 

@@ -148,11 +148,14 @@ class _About(AbstractAsked):
     tt: Float[Array, " p"]
     scale: Float[Array, "p p"]
 
-    def __call__(self, window: Windows, e: Array, x: Array) -> tuple[Any, Windows, Any]:
+    def __call__(
+        self, window: Windows, e: Array, x: Array
+    ) -> tuple[Any, Windows, Any, Any]:
         n = e.size
         tt = self.tt + self.scale @ x[n:]
         params = self.system.record(self.system.values(tt, window.configuration))
-        return params, window, window.start + window.start_sd * (e + x[:n])
+        x0 = window.start + window.start_sd * (e + x[:n])
+        return params, window, x0, jnp.zeros(window.area.shape[1])
 
 
 def _residual(window: Windows, states: Float[Array, "L n"]) -> Float[Array, "L c"]:

@@ -24,7 +24,6 @@ from sim2gp.systems.base import AbstractSystem
 
 TRACE = 0.5  # s, the windows that are drawn
 _FINEST = 5  # grid samples from one point of a curve to the next
-_EVERY = 5  # of the windows, 0.1 s apart, are drawn
 Picture = dict[str, tuple[np.ndarray, ...]]
 
 
@@ -317,10 +316,25 @@ def _pictured(grid: Grid) -> np.ndarray:
     row = steps_of(TRACE)
     chosen = []
     for k in np.unique(grid.log):
-        inside = np.flatnonzero(grid.log == k)[::_EVERY]
+        inside = np.flatnonzero(grid.log == k)
+        inside = inside[:: _apart(grid.since[inside])]
         whole = np.asarray(grid.windows.mask)[inside, row].any(axis=1)
         chosen.append(inside[whole])
     return np.concatenate(chosen)
+
+
+def thinned(grid: Grid) -> Grid:
+    """The windows that start half a second apart."""
+    which = np.zeros(len(grid.log), bool)
+    for k in np.unique(grid.log):
+        inside = np.flatnonzero(grid.log == k)
+        which[inside[:: _apart(grid.since[inside])]] = True
+    return subset(grid, which)
+
+
+def _apart(since: Float[np.ndarray, " w"]) -> int:
+    """How many windows on one starts half a second later."""
+    return max(1, round(TRACE / np.diff(since).min(initial=TRACE)))
 
 
 def subset(grid: Grid, which: np.ndarray) -> Grid:

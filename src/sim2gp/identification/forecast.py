@@ -87,13 +87,15 @@ def forecast(
     compilation, and memory is bounded however long the logs are.
     """
     windows, W = grid.windows, len(grid.windows)
-    passed = np.union1d(_passed(grid), rows)
+    simulator, passed = simulator_of(system), np.union1d(_passed(grid), rows)
+    if simulator is not None:  # no compilation to share: it goes no farther than asked
+        passed = passed[passed <= rows.max(initial=0)]
     places = np.searchsorted(passed, rows)
     parts = []
     for first in range(0, W, _BATCH):
         which = np.minimum(np.arange(first, first + _BATCH), W - 1)
         some = _some(grid, which, passed)
-        if (simulator := simulator_of(system)) is not None:
+        if simulator is not None:
             found = _forecast_on_host(simulator, system, posterior, some)
         else:
             found = _forecast(system, posterior, some)
@@ -149,13 +151,13 @@ class _From(AbstractAsked):
     system: AbstractSystem
     posterior: Gaussian
 
-    def __call__(self, window: Windows, e: Array, x: Array) -> tuple[Any, Windows, Any]:
+    def __call__(
+        self, window: Windows, e: Array, x: Array
+    ) -> tuple[Any, Windows, Any, Any]:
         n, m = window.start.size, window.area.shape[1]
         tt = self.posterior.mean + self.posterior.scale @ x[n + m :]
         params = self.system.record(self.system.values(tt, window.configuration))
-        more = window.knots[:, None] * x[n : n + m][None]
-        moved = eqx.tree_at(lambda w: w.area, window, window.area + more)
-        return params, moved, e + x[:n]
+        return params, window, e + x[:n], x[n : n + m]
 
 
 def _directions(posterior: Gaussian, windows: Windows) -> int:

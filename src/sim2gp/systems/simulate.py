@@ -90,8 +90,12 @@ def simulate(
     params: Any,
     window: HeldInputs,
     x0: Float[Array, " n"],
+    added: Float[Array, " m"] | None = None,
 ) -> Float[Array, "L n"]:
-    """States at the rows of one window, from ``x0`` at its first."""
+    """States at the rows of one window, from ``x0`` at its first.
+
+    ``added`` is a constant that every input has besides.
+    """
 
     def step(x: Array, row: tuple[Array, Array]) -> tuple[Array, Array]:
         h, u = row
@@ -99,6 +103,8 @@ def simulate(
         return x, x
 
     inputs = arriving(system, params, window)
+    if added is not None:
+        inputs = inputs + added[None]
     # A gradient's way back takes each step again: a third of the time that it takes to
     # keep and fetch what every step has seen. What runs forward alone is not touched.
     again = jax.checkpoint(step, prevent_cse=False)

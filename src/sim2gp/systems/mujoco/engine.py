@@ -85,9 +85,8 @@ class Engine(AbstractSimulator):
     ) -> Float[np.ndarray, "B n"]:
         h = np.round(h, 12)  # rows that are equally long differ by rounding
         out, good = untouched(theta, s, a, h)
-        values, which = np.unique(theta[good], axis=0, return_inverse=True)
+        values, which = _distinct(theta[good])
         index = np.flatnonzero(good)
-        which = which.reshape(-1)
         with self._lock:
             for first in range(0, len(values), COPIES):
                 models = self._models(values[first : first + COPIES])
@@ -126,9 +125,9 @@ class Engine(AbstractSimulator):
         inputs = inputs[:, : moving.sum(1).max()]
         control = np.repeat(inputs, count, axis=1)
         with self._lock:
-            values, which = np.unique(theta, axis=0, return_inverse=True)
+            values, which = _distinct(theta)
             models = self._models(values)
-            chosen = [models[k] for k in which.reshape(-1)]
+            chosen = [models[k] for k in which]
             h = float(lengths[0]) / count
             states = self._stepped(chosen, models, x0, control, h)[
                 :, count - 1 :: count
@@ -150,11 +149,9 @@ class Engine(AbstractSimulator):
         out[:, :, p : p + n] = np.eye(n)
         left = h > 0.0
         if self._tree is not None:
-            known, which = np.unique(
-                np.column_stack([theta, np.round(h, 12)]), axis=0, return_inverse=True
-            )
+            known, which = _distinct(np.column_stack([theta, np.round(h, 12)]))
             for k, value in enumerate(known):
-                at = np.flatnonzero((which.reshape(-1) == k) & (h > 0.0))
+                at = np.flatnonzero((which == k) & (h > 0.0))
                 if not at.size:
                     continue
                 span, of = float(value[-1]), self._linearised(value[:-1], value[-1])
@@ -258,6 +255,16 @@ class Engine(AbstractSimulator):
         ahead = np.abs(out[..., 0] - due) < 1e-6 * due
         going = np.logical_and.accumulate(ahead, axis=1)
         return np.where(going[..., None], out[..., 1:], np.nan)
+
+
+def _distinct(
+    rows: Float[np.ndarray, "B k"],
+) -> tuple[Float[np.ndarray, "U k"], Int[np.ndarray, " B"]]:
+    """The different rows, and which of them each is."""
+    if (rows == rows[:1]).all():  # as in most fits; sorting takes longer than to see it
+        return rows[:1], np.zeros(len(rows), int)
+    found, which = np.unique(rows, axis=0, return_inverse=True)
+    return found, which.reshape(-1)
 
 
 def _check_centres(model: Any, constants: Sequence[Sequence[Constant]]) -> None:
