@@ -103,7 +103,7 @@ CONFIGURATIONS = (
     ),
     Mutant(
         "weighed: not in the posterior",
-        "inference/estimate.py",
+        "inference/laplace.py",
         "return Laplace(at, arrow, stack(arrow.data, at.prior))",
         "return Laplace(at, arrow, stack(arrow.data, at.prior[: at.z.size]))",
         ROW,

@@ -2,10 +2,10 @@
 
 from mutant_list import MODEL, Mutant
 
-DESCENDS, ARROWS, ESTIMATE = (
+DESCENDS, ARROWS, LAPLACE = (
     "inference/levenberg_marquardt.py",
     "inference/arrowhead.py",
-    "inference/estimate.py",
+    "inference/laplace.py",
 )
 DESCENT = (
     "test_laplace.py",
@@ -15,7 +15,7 @@ ARROW = ("test_laplace.py", "nuisances or expected or weights")
 
 #: Where each quantity is formed.
 CHANNELS = "/ self.sd[None, :, None, None]"
-NORMALISER = "N * (jnp.log(noise.sd) + 0.5 * LOG_2PI)"
+NORMALISER = "N * (xp.log(noise.sd) + 0.5 * LOG_2PI)"
 EXPECTED = "noise.weights @ (squares + spread)"
 
 DESCENTS = (
@@ -35,35 +35,35 @@ DESCENTS = (
     ),
     Mutant(
         "evidence without the noise's scale",
-        ESTIMATE,
+        LAPLACE,
         NORMALISER,
-        NORMALISER.replace("jnp.log(noise.sd) + ", "0.0 * noise.sd + "),
+        NORMALISER.replace("xp.log(noise.sd) + ", "0.0 * noise.sd + "),
         MODEL,
     ),
     Mutant(
         "evidence without two pi",
-        ESTIMATE,
+        LAPLACE,
         NORMALISER,
         NORMALISER.replace(" + 0.5 * LOG_2PI", ""),
         MODEL,
     ),
     Mutant(
         "EM without the posterior's spread",
-        ESTIMATE,
+        LAPLACE,
         EXPECTED,
         EXPECTED.replace("(squares + spread)", "squares"),
         MODEL,
     ),
     Mutant(
         "EM without its prior",
-        ESTIMATE,
-        "/ (2.0 + jnp.sum(counts, axis=0))",
-        "/ jnp.sum(counts, axis=0)",
+        LAPLACE,
+        "/ (2.0 + xp.sum(counts, axis=0))",
+        "/ xp.sum(counts, axis=0)",
         MODEL,
     ),
     Mutant(
         "noise of the first channel for all",
-        ESTIMATE,
+        LAPLACE,
         EXPECTED,
         EXPECTED.replace("(squares + spread)", "(squares + spread)[:, :1]"),
         MODEL,
@@ -84,9 +84,9 @@ DESCENTS = (
     ),
     Mutant(
         "nothing found counts as converged",
-        ESTIMATE,
-        "jnp.isfinite(self.at.cost) & jnp.all(jnp.isfinite(self.full))",
-        "jnp.ones((), bool)",
+        LAPLACE,
+        "xp.isfinite(self.at.cost) & xp.all(xp.isfinite(self.full))",
+        "xp.ones((), bool)",
         DESCENT,
     ),
     Mutant(
@@ -105,7 +105,7 @@ DESCENTS = (
     ),
     Mutant(
         "arrived by the gradient alone",
-        ESTIMATE,
+        LAPLACE,
         " | (step_sd <= NEAR)",
         "",
         ("test_sim2gp.py", "without_noise"),
@@ -127,8 +127,8 @@ DESCENTS = (
     Mutant(
         "nuisances without their prior",
         ARROWS,
-        "prior = identity.at[:, -1].set(e)",
-        "prior = 1e-9 * identity.at[:, -1].set(e)",
+        "identity[:, :-1], e[:, None]",
+        "1e-9 * identity[:, :-1], 1e-9 * e[:, None]",
         ARROW,
     ),
     Mutant(
@@ -140,44 +140,44 @@ DESCENTS = (
     ),
     Mutant(
         "evidence without the nuisances' determinant",
-        ESTIMATE,
-        "log_joint(self.full) - jnp.sum(jnp.log(pivots))",
-        "log_joint(self.full) - 0.0 * jnp.sum(jnp.log(pivots))",
+        LAPLACE,
+        "log_joint(self.full) - xp.sum(xp.log(pivots))",
+        "log_joint(self.full) - 0.0 * xp.sum(xp.log(pivots))",
         ARROW,
     ),
     Mutant(
         "a window's weight squared",
         ARROWS,
-        "jnp.sqrt(self.weights)[:",
+        "library(self.weights).sqrt(self.weights)[:",
         "self.weights[:",
         ARROW,
     ),
     Mutant(
         "spread without the nuisances' own",
-        ESTIMATE,
+        LAPLACE,
         "(own @ root[:, None]) ** 2",
         "0.0 * (own @ root[:, None]) ** 2",
         ARROW,
     ),
     Mutant(
         "robust weights the wrong way round",
-        ESTIMATE,
+        LAPLACE,
         "/ freedom) / (1.0 + misfit / freedom)",
         "/ freedom) * (1.0 + misfit / freedom)",
         ARROW,
     ),
     Mutant(
         "Student's weights take back what the noise gains",
-        ESTIMATE,
-        "jnp.where(mean > 0, mean, 1.0)",
-        "jnp.where(mean > 0, 1.0, 1.0)",
+        LAPLACE,
+        "xp.where(mean > 0, mean, 1.0)",
+        "xp.where(mean > 0, 1.0, 1.0)",
         ("test_em.py", "student"),
     ),
     Mutant(
         "windows without data have a say in the noise",
-        ESTIMATE,
-        "jnp.mean(noise.weights, where=with_data)",
-        "jnp.mean(noise.weights)",
+        LAPLACE,
+        "xp.mean(noise.weights, where=with_data)",
+        "xp.mean(noise.weights)",
         ("test_em.py", "student"),
     ),
     Mutant(

@@ -53,7 +53,7 @@ TABLE, GAUSS, MAPS = (
 )
 
 #: Where each quantity is formed.
-ROWS = "return jnp.concatenate([jnp.eye(z.size"
+ROWS = "return xp.concatenate([xp.eye(z.size"
 WHITEN = "solve_triangular(noise_scale, block, lower=True)"
 EVIDENCE = "return -0.5 * full[:, -1] @ full[:, -1] - log_det"
 RESIDUAL = "jnp.where(valid, value - s2[:d], 0.0)"
