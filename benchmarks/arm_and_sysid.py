@@ -7,7 +7,8 @@ For each seed the arm's dampings, armatures, dry frictions and four masses are d
 within a factor of about two of its file, a log is recorded by C MuJoCo (200 Hz,
 encoders of 1e-3 rad), and both identify these 22 constants from it, each as a whole
 command on one core. This program learns one delay of all drives as well, mujoco.sysid
-is told it. Needs `mujoco[sysid]`. Cold: without anything compiled before.
+is told it; ``told`` is this program where it is told it, too. Needs `mujoco[sysid]`.
+Cold: without anything compiled before.
 """
 
 import argparse
@@ -117,6 +118,8 @@ def write(folder: Path, seconds: float, seed: int, delay: float) -> None:
     )
     project = six_axis.project_text(["log.csv"], constants=OPEN)
     (folder / "arm.toml").write_text(project)
+    told = project.replace("{low = 0.0, high = 0.03}\ntie = true", f"{delay}")
+    (folder / "told.toml").write_text(told)
 
 
 def cell(seconds: float, seed: int, delay: float, *, cold: bool) -> dict[str, Any]:
@@ -125,17 +128,9 @@ def cell(seconds: float, seed: int, delay: float, *, cold: bool) -> dict[str, An
         folder, cache = Path(name), None if cold else _cache()
         write(folder, seconds, seed, delay)
         out: dict[str, Any] = {"seconds": seconds, "seed": seed, "cold": cold}
-        start = "from sim2gp.cli import main; main()"
-        run = ["-c", start, "identify", "arm.toml", "--quick", "--out", "run"]
-        out["ours"] = _timed(folder, run, cache)
-        summary = json.loads((folder / "run" / "summary.json").read_text())
-        ours = {
-            path: (entry["mean"], entry["q025"], entry["q975"])
-            for path, entry in summary["parameters"].items()
-            if path in OPEN
-        }
-        out["ours"] |= _judged(seed, ours)
-        out["ours"]["steps"] = summary["convergence"]["steps"]
+        out["ours"] = _ours(folder, "arm", seed, cache)
+        if not cold:
+            out["told"] = _ours(folder, "told", seed, cache)
         sysid = [str(Path(__file__)), "--sysid", str(folder), "--delay", str(delay)]
         out["sysid"] = _timed(folder, sysid, None)
         theirs = json.loads((folder / "sysid.json").read_text())
@@ -143,6 +138,20 @@ def cell(seconds: float, seed: int, delay: float, *, cold: bool) -> dict[str, An
             seed, {path: (x, x - h, x + h) for path, (x, h) in theirs.items()}
         )
         return out
+
+
+def _ours(folder: Path, name: str, seed: int, cache: str | None) -> dict[str, Any]:
+    start = "from sim2gp.cli import main; main()"
+    run = ["-c", start, "identify", f"{name}.toml", "--quick", "--out", name]
+    out: dict[str, Any] = dict(_timed(folder, run, cache))
+    summary = json.loads((folder / name / "summary.json").read_text())
+    found = {
+        path: (entry["mean"], entry["q025"], entry["q975"])
+        for path, entry in summary["parameters"].items()
+        if path in OPEN
+    }
+    steps = summary["convergence"]["steps"]
+    return out | _judged(seed, found) | {"steps": steps}
 
 
 def _judged(seed: int, found: dict[str, tuple[float, float, float]]) -> dict[str, Any]:

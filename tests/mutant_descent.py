@@ -209,6 +209,20 @@ DESCENTS = (
         ("test_laplace.py", "rounding_hides"),
     ),
     Mutant(
+        "the host keeps every step",
+        "inference/host_descent.py",
+        "keep = gain > 1e-12 * (1.0 + cost)",
+        "keep = bool(np.isfinite(gain))",
+        ("test_descent_in_numpy.py", "refused"),
+    ),
+    Mutant(
+        "curvature of the bounds is forgotten in NumPy",
+        "inference/prior.py",
+        "return np.asarray(eqx.filter_jit(f)(*args)) if",
+        "return 0.0 * np.asarray(eqx.filter_jit(f)(*args)) if",
+        ("test_descent_in_numpy.py", "pieces"),
+    ),
+    Mutant(
         "padded nuisances in the place of parameters",
         "inference/stacked.py",
         "np.concatenate([own, np.arange(n, k)])",
