@@ -1,4 +1,4 @@
-"""The descent in NumPy: its pieces are those of JAX, and it asks no more than needed."""
+"""The descent in NumPy: its pieces are those of JAX, and it asks no more than due."""
 
 import jax
 import jax.numpy as jnp
@@ -67,7 +67,7 @@ def test_the_pieces_are_those_of_jax(damping: float) -> None:
 
 
 class Arctangent(AbstractLikelihood):
-    """``10 atan(z)``, whose Gauss-Newton steps overshoot; it tells what it was asked."""
+    """``10 atan(z)``, whose Gauss-Newton steps overshoot; it notes what is asked."""
 
     counts: Float[Array, "1 1"]
     floor: Float[Array, " 1"]
