@@ -7,7 +7,9 @@ import pytest
 from jaxtyping import Array, Float
 
 from descents import some_noise
+from sim2gp.errors import DeadParameters, NotFinite
 from sim2gp.inference.arrowhead import Blocks, Noise
+from sim2gp.inference.estimate import estimate
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.host_descent import descend
 from sim2gp.inference.laplace import expected_noise, laplace, log_normaliser
@@ -26,6 +28,7 @@ TABLE = Parameters(
         Parameter("c", "", "any", "identity", -np.inf, np.inf),
     )
 )
+UNBOUNDED = Parameters((Parameter("z", "", "any", "identity", -np.inf, np.inf),))
 
 
 def numpy_of(tree):
@@ -97,10 +100,49 @@ class Arctangent(AbstractLikelihood):
         return Trial(np.sum(r**2)[None, None], blocks)
 
 
+class Given(Arctangent):
+    """``value`` of every residual and of its slope, wherever it is asked."""
+
+    value: tuple[float, float]
+
+    @property
+    def on_host(self) -> bool:
+        return True
+
+    def trial(self, tt, e, scale) -> Trial:
+        r, J = (np.full(x, v) for x, v in zip((1, (1, 1)), self.value, strict=True))
+        return Trial((r**2)[None], lambda: factor(J @ scale, r)[None, None])
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "code"),
+    [((1.0, 0.0), DeadParameters, "E146"), ((np.nan, np.nan), NotFinite, "E203")],
+)
+def test_what_no_step_can_better_is_named(value, error, code) -> None:
+    likelihood = Given(jnp.ones((1, 1)), jnp.ones(1), [], value)
+    prior = ParameterPrior(Gaussian(jnp.zeros(1), jnp.eye(1)), UNBOUNDED)
+    found = estimate(likelihood, prior, starts=jnp.zeros((1, 1)), rounds=1)
+    with pytest.raises(error, match=code):
+        found.convergence.check(("z",), "here")
+
+
+def test_a_step_that_runs_away_is_refused() -> None:
+    class Cliff(Arctangent):
+        def trial(self, tt, e, scale) -> Trial:
+            found = super().trial(tt, e, scale)
+            # Steps over the top of the arctangent end far from everything.
+            return found._replace(squares=found.squares + 1e200 * (abs(tt[0]) > 5.0))
+
+    likelihood = Cliff(jnp.ones((1, 1)), jnp.zeros(1), [])
+    prior = ParameterPrior(Gaussian(np.zeros(1), 1e3 * np.eye(1)), UNBOUNDED)
+    begin, noise = (np.asarray([3e-3]), np.zeros((1, 0))), likelihood.first_noise()
+    *_, last = descend(likelihood, prior, begin, numpy_of(noise), None, damping=1e-4)
+    assert abs(1e3 * float(last.at.z[0])) < 1e-2
+
+
 def test_a_refused_step_is_not_linearised() -> None:
     likelihood = Arctangent(jnp.ones((1, 1)), jnp.zeros(1), [])
-    free = Parameters((Parameter("z", "", "any", "identity", -np.inf, np.inf),))
-    prior = ParameterPrior(Gaussian(np.zeros(1), 1e3 * np.eye(1)), free)
+    prior = ParameterPrior(Gaussian(np.zeros(1), 1e3 * np.eye(1)), UNBOUNDED)
     begin = np.asarray([3e-3]), np.zeros((1, 0))
     noise = numpy_of(likelihood.first_noise())
     kept = list(descend(likelihood, prior, begin, noise, None, damping=1e-4))

@@ -119,6 +119,8 @@ def estimate(
     return _estimate(likelihood, prior, *start, freedom, needed, rounds)
 
 
+# As in JAX, what is not finite is judged and not warned of.
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def _estimate_on_host(
     likelihood: AbstractLikelihood,
     prior: AbstractPrior,

@@ -95,7 +95,10 @@ def descend(
         gain = cost - _cost(prior, z, e, trial, noise)
         keep = gain > 1e-12 * (1.0 + cost)
         refused = 0 if keep else refused + 1
-        damping = float(next_damping(damping, keep, gain / predicted))
+        # More than all is worth no more, and what is refused has no ratio: neither may
+        # be divided by a step that promises nothing.
+        ratio = gain / predicted if keep and gain < predicted else 1.0
+        damping = float(next_damping(damping, keep, ratio))
         damping *= 4.0 ** max(0, refused - 1)  # each refusal raises it by more
         vain = size <= NEAR and gain <= NOTHING
         if keep:
