@@ -102,7 +102,6 @@ def _arguments(asked: AbstractAsked, windows: Windows, e: Array, k: int) -> Any:
             theta, x0, u = asked.system.enter(params, x0, inputs)
             return Arguments(theta, x0, u, held.span), origin
 
-        along, at = value_and_jacobian(arguments, jnp.zeros(k))[::-1]
-        return at, along
+        return value_and_jacobian(arguments, jnp.zeros(k))
 
     return windows.each(one, e)

@@ -29,6 +29,7 @@ from sim2gp.inference.arrowhead import Blocks, Noise, eliminate
 from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.least_squares import factor
 from sim2gp.inference.likelihood import AbstractLikelihood, Trial
+from sim2gp.inference.linalg import library
 from sim2gp.inference.linearized import jacobian_by_columns, value_and_jacobian
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.plants.external import (
@@ -37,7 +38,7 @@ from sim2gp.systems.plants.external import (
     simulator_of,
 )
 from sim2gp.systems.simulate import inputs_of, simulate
-from sim2gp.types import in_float64
+from sim2gp.types import AnyArray, in_float64
 
 
 class WindowsLikelihood(AbstractLikelihood):
@@ -116,7 +117,7 @@ class WindowsLikelihood(AbstractLikelihood):
         run = HostRun(simulator, asked, self.windows, jnp.asarray(e), k)
         windows = jax.tree.map(np.asarray, self.windows)
         outputs = list(windows.outputs)
-        r = np.where(windows.mask, run.states[..., outputs] - windows.y, 0.0)
+        r = _residual(windows, run.states)
 
         def blocks() -> Float[np.ndarray, "W c k k"]:
             J = np.where(windows.mask[..., None], run.slopes()[:, :, outputs], 0.0)
@@ -158,9 +159,12 @@ class _About(AbstractAsked):
         return params, window, x0, jnp.zeros(window.area.shape[1])
 
 
-def _residual(window: Windows, states: Float[Array, "L n"]) -> Float[Array, "L c"]:
-    r = states[:, np.asarray(window.outputs)] - window.y
-    return jnp.where(window.mask, r, 0.0)
+def _residual(
+    windows: Windows, states: Float[AnyArray, "*W L n"]
+) -> Float[AnyArray, "*W L c"]:
+    """Of one window, or of all."""
+    r = states[..., np.asarray(windows.outputs)] - windows.y
+    return library(r).where(windows.mask, r, 0.0)
 
 
 def start_states(windows: Windows, fitted: Estimate) -> Float[np.ndarray, "W n"]:

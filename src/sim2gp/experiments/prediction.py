@@ -313,32 +313,28 @@ def trace_arrays(
 
 def _pictured(grid: Grid) -> np.ndarray:
     """Windows that follow each other without overlap and are half a second long."""
-    row = steps_of(TRACE)
-    chosen = []
-    for k in np.unique(grid.log):
-        inside = np.flatnonzero(grid.log == k)
-        inside = inside[:: _apart(grid.since[inside])]
-        whole = np.asarray(grid.windows.mask)[inside, row].any(axis=1)
-        chosen.append(inside[whole])
-    return np.concatenate(chosen)
+    apart = _apart(grid)
+    whole = np.asarray(grid.windows.mask)[apart, steps_of(TRACE)].any(axis=1)
+    return apart[whole]
 
 
 def thinned(grid: Grid) -> Grid:
     """The windows that start half a second apart."""
-    which = np.zeros(len(grid.log), bool)
+    return subset(grid, _apart(grid))
+
+
+def _apart(grid: Grid) -> Int[np.ndarray, " w"]:
+    """Windows of each log that start half a second apart, by number."""
+    chosen = []
     for k in np.unique(grid.log):
         inside = np.flatnonzero(grid.log == k)
-        which[inside[:: _apart(grid.since[inside])]] = True
-    return subset(grid, which)
-
-
-def _apart(since: Float[np.ndarray, " w"]) -> int:
-    """How many windows on one starts half a second later."""
-    return max(1, round(TRACE / np.diff(since).min(initial=TRACE)))
+        closest = np.diff(grid.since[inside]).min(initial=TRACE)
+        chosen.append(inside[:: max(1, round(TRACE / closest))])
+    return np.concatenate(chosen)
 
 
 def subset(grid: Grid, which: np.ndarray) -> Grid:
-    """The evaluation windows chosen by a mask."""
+    """The evaluation windows chosen by a mask or by number."""
     return Grid(
         grid.windows.some(which),
         grid.log[which],

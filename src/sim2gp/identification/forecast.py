@@ -88,8 +88,6 @@ def forecast(
     """
     windows, W = grid.windows, len(grid.windows)
     simulator, passed = simulator_of(system), np.union1d(_passed(grid), rows)
-    if simulator is not None:  # no compilation to share: it goes no farther than asked
-        passed = passed[passed <= rows.max(initial=0)]
     places = np.searchsorted(passed, rows)
     parts = []
     for first in range(0, W, _BATCH):

@@ -165,7 +165,7 @@ class AbstractSimulator(abc.ABC):
             out[:, k] = x = self.flow(theta, x, u[:, k], span[:, k])
         return out
 
-    def rolled(self, at: "Arguments") -> "Rolled":
+    def rolled(self, at: Arguments) -> Rolled:
         """`rollout` in steps that can be linearised."""
         counts = self.substeps(at.span)
         most = int(counts.max(initial=1))
@@ -177,9 +177,7 @@ class AbstractSimulator(abc.ABC):
             at, inputs, fine, self.rollout(at.theta, at.x0, inputs, fine), most
         )
 
-    def linearised(
-        self, run: "Rolled", along: "Arguments"
-    ) -> Float[np.ndarray, "W L n k"]:
+    def linearised(self, run: Rolled, along: Arguments) -> Float[np.ndarray, "W L n k"]:
         """Derivatives of a run's states along ``k`` directions of its arguments.
 
         ``along`` has their directions in a last axis (its spans are not read). Each row
@@ -197,9 +195,7 @@ class AbstractSimulator(abc.ABC):
             )
         return out
 
-    def _recursion(
-        self, run: "Rolled", along: "Arguments"
-    ) -> Float[np.ndarray, "W L n k"]:
+    def _recursion(self, run: Rolled, along: Arguments) -> Float[np.ndarray, "W L n k"]:
         (theta, x0, *_), inputs, fine, states, most = run
         of_theta, S, of_u, _ = along
         before = np.concatenate([x0[:, None], states[:, :-1]], axis=1)
@@ -218,7 +214,7 @@ class AbstractSimulator(abc.ABC):
         return out
 
     def linearised_rollout(
-        self, at: "Arguments", along: "Arguments"
+        self, at: Arguments, along: Arguments
     ) -> tuple[Float[np.ndarray, "W L n"], Float[np.ndarray, "W L n k"]]:
         """`rollout`, and its derivatives along ``k`` directions of its arguments."""
         run = self.rolled(at)
