@@ -53,6 +53,7 @@ def test_the_pieces_are_those_of_jax(damping: float) -> None:
         learned = expected_noise(noise, *squares, counts, floor, 4.0)
         return (
             at,
+            prior.curvature(z, at.by_z - z),
             step(prior, at, noise, damping),
             squares,
             learned,
