@@ -11,7 +11,7 @@ from sim2gp.errors import DeadParameters, NotFinite
 from sim2gp.inference.arrowhead import Blocks, Noise
 from sim2gp.inference.estimate import estimate
 from sim2gp.inference.gaussian import Gaussian
-from sim2gp.inference.host_descent import descend
+from sim2gp.inference.host_descent import begin_at, descend
 from sim2gp.inference.laplace import expected_noise, laplace, log_normaliser
 from sim2gp.inference.least_squares import factor
 from sim2gp.inference.levenberg_marquardt import point, step
@@ -136,16 +136,17 @@ def test_a_step_that_runs_away_is_refused() -> None:
 
     likelihood = Cliff(jnp.ones((1, 1)), jnp.zeros(1), [])
     prior = ParameterPrior(Gaussian(np.zeros(1), 1e3 * np.eye(1)), UNBOUNDED)
-    begin, noise = (np.asarray([3e-3]), np.zeros((1, 0))), likelihood.first_noise()
-    *_, last = descend(likelihood, prior, begin, numpy_of(noise), None, damping=1e-4)
+    noise = numpy_of(likelihood.first_noise())
+    begin = begin_at(likelihood, prior, np.asarray([3e-3]), np.zeros((1, 0)), noise)
+    *_, last = descend(likelihood, prior, begin, noise, None, damping=1e-4)
     assert abs(1e3 * float(last.at.z[0])) < 1e-2
 
 
 def test_a_refused_step_is_not_linearised() -> None:
     likelihood = Arctangent(jnp.ones((1, 1)), jnp.zeros(1), [])
     prior = ParameterPrior(Gaussian(np.zeros(1), 1e3 * np.eye(1)), UNBOUNDED)
-    begin = np.asarray([3e-3]), np.zeros((1, 0))
     noise = numpy_of(likelihood.first_noise())
+    begin = begin_at(likelihood, prior, np.asarray([3e-3]), np.zeros((1, 0)), noise)
     kept = list(descend(likelihood, prior, begin, noise, None, damping=1e-4))
     assert likelihood.asked.count("slopes") == len(kept)
     assert likelihood.asked.count("value") > len(kept)

@@ -270,6 +270,29 @@ def test_delayed_inputs_are_smooth_in_the_delay(short: Log) -> None:
         assert abs(total) < 4.0
 
 
+def test_delayed_inputs_of_numpy_are_those_of_jax(short: Log) -> None:
+    """And so is their derivative in the delay, which is written by hand."""
+    system = free_parts(pendulum(), [Delay("voltage")])
+    windows, _ = cut([short], system, window=0.1)
+    held = windows.span[1], windows.knots[1], windows.area[1]
+    one, blur = stretch.HeldInputs(*held), stretch.DELAY_BLUR
+    with jax.enable_x64(True):
+        of = stretch.HeldInputs(*map(jnp.asarray, held))
+        for late in ([0.0], [0.004], [0.0137]):
+            at = jnp.asarray(late)
+            by = jax.jacfwd(lambda d: stretch.inputs_of(of, d, blur)[:, 0])(at)
+            u = stretch.inputs_of(one, np.asarray(late), blur)
+            assert isinstance(u, np.ndarray)
+            scale = np.abs(u).max()
+            np.testing.assert_allclose(
+                u, stretch.inputs_of(of, at, blur), atol=1e-9 * scale
+            )
+            found = stretch.inputs_by_delay(one, np.asarray(late), blur)
+            assert np.abs(by).max() > 1.0
+            # Integrals of the input are differenced over the blur.
+            np.testing.assert_allclose(found, by, atol=1e-7 * np.abs(by).max())
+
+
 def test_a_fit_near_another_ends_where_its_own_windows_say(short: Log) -> None:
     """Begun at the MAP of all windows, a fit of half of them forgets the others."""
     system, key = pendulum(), jax.random.key(0)

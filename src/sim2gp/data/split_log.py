@@ -23,9 +23,10 @@ HALF_WIDTH = 0.025  # s, half the span of the local parabola that guesses a star
 PAST = 0.049  # s, the span of the causal one: 25 samples of 2 ms
 SPACING = 0.1  # s, between the starts of forecasts
 #: A start's unmeasured rate may lie so many times its rms away, or what slopes over
-#: different times differ by: a servo forgets its start's rate at once, and where noise
-#: alone decides it, it would go to where forces saturate.
-FAR = 10.0
+#: different times differ by. A servo forgets its start's rate at once: only this prior
+#: keeps it from where forces saturate, where a simulation jumps (of 10 windows of an
+#: arm's log, one began there with 10 in place of 3, and its constants followed).
+FAR = 3.0
 TOLERANCE = 0.05  # a substep may exceed its limit by this share of clock jitter
 Start = Literal["smoothed", "causal"]
 

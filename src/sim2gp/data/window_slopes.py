@@ -21,7 +21,14 @@ from sim2gp.data.windows import Windows
 from sim2gp.inference.linearized import value_and_jacobian
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.plants.external import AbstractSimulator, Arguments
-from sim2gp.systems.simulate import HeldInputs, arriving, simulate
+from sim2gp.systems.simulate import (
+    HeldInputs,
+    blur_of,
+    inputs_by_delay,
+    inputs_of,
+    simulate,
+)
+from sim2gp.types import AnyArray
 
 
 class AbstractAsked(eqx.Module):
@@ -63,7 +70,9 @@ class HostRun:
         e: Float[Array, "W n"],
         k: int,
     ) -> None:
-        found = _arguments(asked, windows, e, k)
+        late = _delays(asked, windows, e, k)
+        inputs = _inputs(asked.system, windows, np.asarray(late))
+        found = _arguments(asked, windows, e, inputs, k)
         # Of the host's own kind, in its order: it works along the rows.
         found = jax.tree.map(np.asarray, found)
         (at, origin), (self._along, self._origin_by) = found
@@ -90,18 +99,59 @@ def slopes_on_host(
 
 
 @eqx.filter_jit
-def _arguments(asked: AbstractAsked, windows: Windows, e: Array, k: int) -> Any:
+def _delays(
+    asked: AbstractAsked, windows: Windows, e: Array, k: int
+) -> Float[Array, "W m"]:
+    """By how much the inputs of each window are late, s."""
+
+    def one(window: Windows, e: Array) -> Array:
+        return asked.system.delays(asked(window, e, jnp.zeros(k))[0])
+
+    found: Array = windows.each(one, e)
+    return found
+
+
+def _inputs(
+    system: AbstractSystem, windows: Windows, late: Float[np.ndarray, "W m"]
+) -> tuple[Float[np.ndarray, "W L m"], Float[np.ndarray, "W L m"]]:
+    """The inputs that arrive, and their derivatives in their delays.
+
+    They are found here because JAX would take longer to trace the derivative, along
+    each of ``x``, than all of a fit takes to ask for it.
+    """
+    if not late.size:  # a machine without inputs
+        none = np.zeros((*windows.span.shape, 0))
+        return none, none
+    blur = blur_of(system)
+    held = map(np.asarray, (windows.span, windows.knots, windows.area))
+    pairs = [(HeldInputs(*x), delays) for *x, delays in zip(*held, late, strict=True)]
+    u = np.stack([inputs_of(*pair, blur) for pair in pairs])
+    if not blur:
+        return u, np.zeros_like(u)
+    return u, np.stack([inputs_by_delay(*pair, blur) for pair in pairs])
+
+
+@eqx.filter_jit
+def _arguments(
+    asked: AbstractAsked,
+    windows: Windows,
+    e: Array,
+    arriving: tuple[AnyArray, AnyArray],
+    k: int,
+) -> Any:
     """What the plant is given and what its states are offset by; both by ``x``."""
 
-    def one(window: Windows, e: Array) -> Any:
+    def one(window: Windows, e: Array, u: Array, by_delay: Array) -> Any:
         def arguments(x: Array) -> Any:
             params, held, x0, added = asked(window, e, x)
             # `leave` adds to a state what does not depend on it.
             origin = asked.system.leave(params, jnp.zeros((1, x0.size)))
-            inputs = arriving(asked.system, params, held) + added[None]
-            theta, x0, u = asked.system.enter(params, x0, inputs)
-            return Arguments(theta, x0, u, held.span), origin
+            late = asked.system.delays(params)
+            later = late - jax.lax.stop_gradient(late)  # zero, with a derivative
+            inputs = u + by_delay * later[None] + added[None]
+            theta, x0, inputs = asked.system.enter(params, x0, inputs)
+            return Arguments(theta, x0, inputs, held.span), origin
 
         return value_and_jacobian(arguments, jnp.zeros(k))
 
-    return windows.each(one, e)
+    return windows.each(one, e, *arriving)

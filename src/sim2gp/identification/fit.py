@@ -22,7 +22,7 @@ NOISE_ROUNDS = 8  # fewer leave noise and starts of real logs short of a fixed p
 WARM_ROUNDS = 3  # of a fit that begins with the noise of another one
 #: Share of the windows that a fit on the host begins with, how few they may be, and of
 #: how many rows: of fewer, all windows are faster than another compilation.
-SHARE, LEAST, MANY = 0.2, 4, 20_000
+SHARE, LEAST, MANY = 0.2, 4, 2_000
 FREEDOM = 4.0  # degrees of freedom of the Student-t weight
 
 

@@ -143,7 +143,7 @@ def _estimate_on_host(
         return jax.tree.map(jnp.asarray, _about(found.found, *args))
 
     damping = min(best.damping, AGAIN_DAMPING)
-    begin = (best.at.z, best.at.e), noise, update
+    begin = best.found, noise, update
     for found in descend(likelihood, of_prior, *begin, damping=damping):
         if report is not None:
             report(found, partial(about, found))

@@ -67,7 +67,7 @@ class Progress(NamedTuple):
 def descend(
     likelihood: AbstractLikelihood,
     prior: AbstractPrior,
-    start: tuple[Vector, Starts],
+    here: Laplace,
     noise: Noise,
     update: Update | None,
     *,
@@ -75,14 +75,13 @@ def descend(
     most: int | None = None,
     damping: float = FIRST_DAMPING,
 ) -> Iterator[Progress]:
-    """Each step that is kept, from ``start`` to where the next is no longer ``until``.
+    """Each step that is kept, from ``here`` to where the next is no longer ``until``.
 
     Without an ``update`` the noise stays. It ends where so short a step as `NEAR` gains
     nothing, too: a machine with dry friction or stops has kinks, and in one of them the
     linearisation goes on to promise more. It ends early at ``most`` steps, and at once
     where the start has no finite cost.
     """
-    here = _linearised(prior, *start, _tried(likelihood, prior, *start), noise)
     change = np.inf if update else 0.0
     sd, refused = float(here.newton_step_sd()), 0
     yield Progress(here, noise, 1, sd, damping, sd)
@@ -111,6 +110,17 @@ def descend(
             yield Progress(here, noise, count, sd, damping, away)
         if vain or (sd <= until and change <= STILL):
             return
+
+
+def begin_at(
+    likelihood: AbstractLikelihood,
+    prior: AbstractPrior,
+    z: Vector,
+    e: Starts,
+    noise: Noise,
+) -> Laplace:
+    """The data linearised where a descent begins."""
+    return _linearised(prior, z, e, _tried(likelihood, prior, z, e), noise)
 
 
 def _rested(
@@ -143,8 +153,8 @@ def best_start(
     for z in starts:
         if np.isnan(z).any():
             continue
-        begin = likelihood, prior, (z, e), noise, None
-        *_, last = descend(*begin, until=ROUGH, most=FIRST_STEPS)
+        begin = likelihood, prior, begin_at(likelihood, prior, z, e, noise), noise
+        *_, last = descend(*begin, None, until=ROUGH, most=FIRST_STEPS)
         found.append(last)
     finite = [x for x in found if np.isfinite(x.at.cost)]
     return min(finite or found, key=lambda x: float(x.at.cost))

@@ -9,12 +9,12 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sim2gp.inference.linalg import each_window, library
 from sim2gp.systems.base import AbstractSystem
-from sim2gp.types import AnyArray
+from sim2gp.types import AnyArray, AnyScalar
 
 DELAY_BLUR = 4e-3  # s, of inputs that may be delayed
 
@@ -33,52 +33,78 @@ class HeldInputs(eqx.Module):
 
 
 def inputs_of(
-    window: HeldInputs, delays: Float[Array, " m"], blur: float = 0.0
-) -> Float[Array, "L m"]:
+    window: HeldInputs, delays: Float[AnyArray, " m"], blur: float = 0.0
+) -> Float[AnyArray, "L m"]:
     """Mean delayed input over the step that ends at each row of one window.
 
     Where every step is as long as the input is held, all of these means bend at the
     same delays, and a fit is caught in the kink. ``blur`` (s) averages the held input
     over that width around each time first, which makes them smooth in the delay.
     """
-    end = jnp.cumsum(window.span)
-    # A row without length has no mean; its input does not matter but must be finite.
-    h = jnp.where(window.span > 0.0, window.span, 1.0)
+    xp, (ends, h) = library(window.area, delays), _ends(window)
 
-    ends = jnp.concatenate([jnp.zeros(1, end.dtype), end])
-
-    def channel(area: Array, delay: Array) -> Array:
+    def channel(area: AnyArray, delay: AnyScalar) -> AnyArray:
         t = ends - delay
         if blur:
             sides = 0.5 * blur * np.asarray([[-1.0], [1.0]], t.dtype)
             early, late = _second_integral(window.knots, area)(t[None] + sides)
             integral = (late - early) / blur
         else:
-            integral = jnp.interp(t, window.knots, area)
-        return jnp.diff(integral) / h
+            integral = xp.interp(t, window.knots, area)
+        return xp.diff(integral) / h
 
-    return jax.vmap(channel, in_axes=(1, 0), out_axes=1)(window.area, delays)
+    return each_window(channel, window.area.T, delays).T
+
+
+def inputs_by_delay(
+    window: HeldInputs, delays: Float[np.ndarray, " m"], blur: float
+) -> Float[np.ndarray, "L m"]:
+    """Derivative of `inputs_of` in each channel's delay, for a ``blur`` above zero."""
+    ends, h = _ends(window)
+
+    def channel(area: np.ndarray, delay: AnyScalar) -> np.ndarray:
+        sides = ends - delay + 0.5 * blur * np.asarray([[-1.0], [1.0]])
+        early, late = np.interp(sides, window.knots, area)
+        return -np.diff((late - early) / blur) / h
+
+    return each_window(channel, window.area.T, delays).T
 
 
 def arriving(
     system: AbstractSystem, params: Any, window: HeldInputs
 ) -> Float[Array, "L m"]:
     """The inputs of each step, delayed as the machine delays them."""
-    blur = DELAY_BLUR if system.longest_delay else 0.0
-    return inputs_of(window, system.delays(params), blur)
+    return inputs_of(window, system.delays(params), blur_of(system))
+
+
+def blur_of(system: AbstractSystem) -> float:
+    """Over how long inputs are averaged, s; zero where none may be delayed."""
+    return DELAY_BLUR if system.longest_delay else 0.0
+
+
+def _ends(window: HeldInputs) -> tuple[Float[AnyArray, " L1"], Float[AnyArray, " L"]]:
+    """Times at which the steps end, after the first begins at zero; their lengths.
+
+    A row without length has no mean; its input does not matter but must be finite.
+    """
+    xp = library(window.span)
+    end = xp.cumsum(window.span)
+    h = xp.where(window.span > 0.0, window.span, 1.0)
+    return xp.concatenate([xp.zeros(1, end.dtype), end]), h
 
 
 def _second_integral(
-    knots: Float[Array, " H"], area: Float[Array, " H"]
-) -> Callable[[Array], Array]:
+    knots: Float[AnyArray, " H"], area: Float[AnyArray, " H"]
+) -> Callable[[AnyArray], AnyArray]:
     """The integral of a piecewise straight function, as a function of its end."""
-    length = jnp.diff(knots)
-    slope = jnp.diff(area) / length
-    whole = jnp.cumsum(length * 0.5 * (area[1:] + area[:-1]))
-    whole = jnp.concatenate([jnp.zeros_like(whole[:1]), whole])
+    xp = library(knots, area)
+    length = xp.diff(knots)
+    slope = xp.diff(area) / length
+    whole = xp.cumsum(length * 0.5 * (area[1:] + area[:-1]))
+    whole = xp.concatenate([xp.zeros_like(whole[:1]), whole])
 
-    def at(t: Array) -> Array:
-        k = jnp.clip(jnp.searchsorted(knots, t, side="right") - 1, 0, slope.size - 1)
+    def at(t: AnyArray) -> AnyArray:
+        k = xp.clip(xp.searchsorted(knots, t, side="right") - 1, 0, slope.size - 1)
         x = t - knots[k]
         return whole[k] + x * (area[k] + 0.5 * x * slope[k])
 
