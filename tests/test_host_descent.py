@@ -17,8 +17,14 @@ from sim2gp.errors import NotConverged
 from sim2gp.experiments.first_answer import FirstAnswer
 from sim2gp.identification import fit
 from sim2gp.identification.fit import fit_windows
+from sim2gp.inference.arrowhead import Noise
 from sim2gp.inference.convergence import NEAR
-from sim2gp.inference.parameters import Parameter
+from sim2gp.inference.estimate import estimate
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.least_squares import factor
+from sim2gp.inference.linear_likelihood import LinearLikelihood
+from sim2gp.inference.parameters import Parameter, Parameters
+from sim2gp.inference.prior import ParameterPrior
 from sim2gp.systems import ODE, BlackBox, Channel, EncoderOffset, free_parts
 from sim2gp.types import in_float64
 from test_passive_model import PROJECT, SWING
@@ -29,6 +35,7 @@ TABLE = (
     Parameter("gravity", "1/s^2", "gravity over length", "log_bounded", 3.0, 30.0),
     Parameter("damping", "1/s", "viscous friction", "log_bounded", 0.05, 5.0),
 )
+PAIR = tuple(Parameter(n, "1", n, "identity", mean=0.0, sd=1.0) for n in "ab")
 STATES = Channel("q", "rad", angle=True), Channel("q.velocity", "rad/s")
 ACTIONS = (Channel("torque", "1/s^2", low=-5.0, high=5.0),)
 STEP, NOISE = 2e-3, 1e-3
@@ -211,3 +218,25 @@ def test_a_failed_fit_leaves_what_it_knows(tmp_path, capsys, monkeypatch):
     assert "E201" in known["headline"]
     assert "joint/q/damping" in known["parameters"]
     assert (tmp_path / "run-first" / "report.html").exists()
+
+
+@in_float64
+def test_a_large_first_noise_does_not_end_a_descent():
+    """Beside it the first step promises nothing, whatever it is of the true noise."""
+    rng = np.random.default_rng(0)
+    J = rng.normal(size=(200, 2))
+    y = J @ [0.3, -0.2] + 1e-3 * rng.normal(size=200)
+    at = factor(J, -y)[None, None]
+    counts, floor = jnp.full((1, 1), 200.0), jnp.full(1, 1e-6)
+    prior, found = Gaussian(jnp.zeros(2), jnp.eye(2)), []
+    for first in (1e3, 1e-3):
+        noise = Noise(jnp.full(1, first), jnp.ones(1))
+        about = np.zeros(2), np.eye(2), noise
+        likelihood = LinearLikelihood(counts, floor, at, *about)
+        known = ParameterPrior(prior, Parameters(PAIR))
+        found.append(estimate(likelihood, known, starts=jnp.zeros((1, 2)), rounds=0))
+    for x in found:
+        assert float(x.noise.sd[0]) == pytest.approx(1e-3, rel=0.2)
+        exact, _ = np.linalg.lstsq(J, y, rcond=None)[:2]
+        away = (x.posterior.mean - exact) / x.posterior.sd()
+        assert np.abs(away).max() < 0.05

@@ -50,3 +50,10 @@ class Windows(HeldInputs):
         """``f`` of one window (and of one row of each argument), for all windows."""
         axes = eqx.tree_at(lambda w: w.floor, jax.tree.map(lambda _: 0, self), None)
         return jax.vmap(f, in_axes=(axes, *[0] * len(per_window)))(self, *per_window)
+
+
+def motion(windows: Windows) -> Float[np.ndarray, "W c"]:
+    """Mean square of how far each channel went within a window."""
+    y, mask = np.asarray(windows.y), np.asarray(windows.mask)
+    away = np.where(mask, (y - y[:, :1]) ** 2, 0.0)
+    return np.asarray(away.sum(axis=1) / np.maximum(mask.sum(axis=1), 1))

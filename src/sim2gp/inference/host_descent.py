@@ -102,10 +102,12 @@ def descend(
         vain = size <= NEAR and gain <= NOTHING
         if keep:
             here = _linearised(prior, z, e, trial, noise)
+        if keep or vain:
             if update is not None:
                 here, noise, change = _rested(update, here, noise)
             sd = float(here.newton_step_sd())
-        if keep or vain:
+            # Of a noise that is another now, the step says nothing: the first is large.
+            vain = vain and change <= STILL
             away = min(sd, size) if vain else sd
             yield Progress(here, noise, count, sd, damping, away)
         if vain or (sd <= until and change <= STILL):

@@ -1,6 +1,7 @@
 """The first project file: a model and some recordings in, a checked draft out.
 
 Every guess is in the file with its reason, for the user who knows the machine to read.
+Constants of a model's file that the logs do not tell apart are held, and said to be.
 What is written can be identified as it is: it is loaded, with its logs, before it takes
 its place. Without recordings the file says which columns they need.
 """
@@ -16,10 +17,13 @@ import numpy as np
 from sim2gp.data.logs import Budget, Column, Log, read_log
 from sim2gp.data.logs.formats import recordings
 from sim2gp.data.logs.units import UNITS
+from sim2gp.identification.identifiability.selection import Selection
 from sim2gp.project.columns import Match, match, time_column
 from sim2gp.project.draft_text import Contents, draft_text
+from sim2gp.project.open_constants import try_selection
 from sim2gp.project.project import (
     SYSTEMS,
+    Project,
     is_model,
     system_class,
     unknown_system,
@@ -77,6 +81,7 @@ class Draft:
     text: str
     columns: dict[str, Match]
     found: Found
+    selection: Selection | None = None
 
 
 def draft_project(asked: Request) -> Draft:
@@ -101,16 +106,30 @@ def draft_project(asked: Request) -> Draft:
     found = find_readings(system, question, until=until)
     reason = f"the {asked.seconds:g} s were over" if asked.readings else "--no-readings"
     said = {n: _as_read(n, m, found, options, reason) for n, m in columns.items()}
-    text = draft_text(
-        Contents(
-            asked.model, asked.files, asked.out, system, asked.root, time_,
-            asked.period, said, asked.constant, found.images,
-            max(float(np.ptp(log.time)) for log in logs),
-        )
+    contents = Contents(
+        asked.model, asked.files, asked.out, system, asked.root, time_,
+        asked.period, said, asked.constant, found.images,
+        max(float(np.ptp(log.time)) for log in logs),
     )  # fmt: skip
-    budget = asked.budget
-    replace_project(asked.out, text, lambda p: replace(p, budget=budget).load_logs())
-    return Draft(system, text, said, found)
+    project, logs = _placed(asked, draft_text(contents))
+    if asked.readings and is_model(asked.model):
+        limit = asked.started, asked.seconds
+        selection, why = try_selection(project, logs, *limit)
+        contents = replace(contents, selection=selection, unselected=why)
+        _placed(asked, draft_text(contents))
+    return Draft(system, draft_text(contents), said, found, contents.selection)
+
+
+def _placed(asked: Request, text: str) -> tuple[Project, list[Log]]:
+    """The file in its place, once it was loaded with its logs."""
+    read: list[tuple[Project, list[Log]]] = []
+
+    def check(project: Project) -> None:
+        project = replace(project, budget=asked.budget)
+        read.append((project, [*project.load_logs()]))
+
+    replace_project(asked.out, text, check)
+    return read[0]
 
 
 def _machine(asked: Request) -> AbstractSystem:
@@ -298,6 +317,7 @@ def told(draft: Draft, out: Path) -> dict[str, Any]:
         for name, m in draft.columns.items()
     }
     surer = draft.found.surer
+    held = draft.selection.held if draft.selection else {}
     doubts = [name for name, z in surer.items() if z <= SURE]
     untried = [
         name
@@ -312,6 +332,7 @@ def told(draft: Draft, out: Path) -> dict[str, Any]:
         "headline": f"Wrote {out}: read it, then sim2gp identify {out}",
         "file": str(out),
         "columns": table,
-        "open_constants": len(draft.system.parameters),
+        "open_constants": len(draft.system.parameters) - len(held),
+        **({"held_constants": list(held)} if held else {}),
         "warnings": warnings,
     }

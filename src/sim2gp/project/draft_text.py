@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from sim2gp.data.logs import Column
+from sim2gp.identification.identifiability.selection import Selection
+from sim2gp.identification.words import digits, linear_sum
 from sim2gp.project.columns import Match
 from sim2gp.project.project import is_model
 from sim2gp.project.replace import key as toml_key
@@ -22,7 +24,10 @@ _GAINS = ("kp", "kv")
 
 @dataclass(frozen=True)
 class Contents:
-    """What a draft says; ``longest`` is the duration of the longest log in s."""
+    """What a draft says; ``longest`` is the duration of the longest log in s.
+
+    ``unselected`` is why there is no ``selection``, where one was to be made.
+    """
 
     model: str
     files: Sequence[Path]
@@ -35,6 +40,8 @@ class Contents:
     constant: Mapping[str, float] = field(default_factory=dict)
     images: int = 1
     longest: float = 0.0
+    selection: Selection | None = None
+    unselected: str = ""
 
 
 def draft_text(c: Contents) -> str:
@@ -48,7 +55,7 @@ def draft_text(c: Contents) -> str:
     ]
     if c.root is not None:
         rows += ["[options]", f"root = {quoted(_relative(c.root, folder))}", ""]
-    rows += _constants(c.system, file)
+    rows += _constants(c, file)
     rows += ["", *(_logs(c) if c.files else _wanted(c.system))]
     if isinstance(c.system, MuJoCo) and c.system.servos:
         rows += ["", *_window(c.longest if c.files else WINDOW)]
@@ -63,23 +70,54 @@ def draft_text(c: Contents) -> str:
     return "\n".join(rows) + "\n"
 
 
-def _constants(system: AbstractSystem, file: bool) -> list[str]:
-    """What is open, and how to say more about it."""
-    table, nominal = system.parameters.free, system.parameters.nominal()
+def _constants(c: Contents, file: bool) -> list[str]:
+    """What is open, what is held, and how to say more about it."""
+    table, nominal = c.system.parameters.free, c.system.parameters.nominal()
+    selection = c.selection or Selection({}, {})
+    opened = [p for p in table if p.name not in selection.held]
     whose = "within a factor of three of the file's numbers" if file else "as bundled"
-    rows = [f"# {len(table)} constants are open, {whose}:"]
-    for p in table[:LISTED]:
-        rows.append(f"#   {p.name} = {nominal[p.name]:.4g} {p.unit}".rstrip())
-    if len(table) > LISTED:
-        rows.append(f"#   and {len(table) - LISTED} more")
-    example = toml_key(table[0].name) if table else "NAME"
-    rows.append(f"# To say what you know: [parameters.{example}] mean = ... sd = ...")
-    if _has_servos(system):
+    rows = [f"# {len(opened)} constants are open, {whose}:"]
+    if c.unselected:
+        rows.append(f"# (which of them the logs tell apart is {c.unselected})")
+    value = {p.name: f"{nominal[p.name]:.4g} {p.unit}".rstrip() for p in table}
+    if selection.held:
+        rows += _selected(selection, [p.name for p in opened], value)
+        rows.append('# To say what you know: "NAME" = {mean = ..., sd = ...}')
+    else:
+        rows += [f"#   {p.name} = {value[p.name]}" for p in table[:LISTED]]
+        if len(table) > LISTED:
+            rows.append(f"#   and {len(table) - LISTED} more")
+        example = toml_key(table[0].name) if table else "NAME"
+        known = f"[parameters.{example}] mean = ... sd = ..."
+        rows.append(f"# To say what you know: {known}")
+    if _has_servos(c.system):
         rows += [
             "# Not open, as the model has them: the gains of the servos, kp and kv.",
             "# Masses, friction and these gains share a factor that logs of positions",
             "# and targets do not tell. Open one if you know the masses.",
         ]
+    return rows
+
+
+def _selected(
+    selection: Selection, opened: Sequence[str], value: Mapping[str, str]
+) -> list[str]:
+    """The open constants by name, then the held ones with what the logs say of them."""
+    rows = ["[parameters]"]
+    for name in opened:
+        taken = selection.stands_for.get(name)
+        row = f"{toml_key(name)} = {{}}  # {value[name]}"
+        if taken:
+            terms = [(1.0, name), *((w, other) for other, w in taken.items())]
+            row += f"; stands for {linear_sum(terms, 3)}"
+        rows.append(row)
+    rows += [
+        "# Held at the file's numbers: the logs do not depend on these, or not apart",
+        "# from the open ones. To open one, remove its #.",
+    ]
+    for name, left in selection.held.items():
+        share = f"the logs leave {digits(100.0 * left)} % of its spread"
+        rows.append(f"# {toml_key(name)} = {{}}  # {value[name]}; {share}")
     return rows
 
 

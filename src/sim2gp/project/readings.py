@@ -26,7 +26,7 @@ from jaxtyping import Float
 from sim2gp.data.logs import Column, Log
 from sim2gp.data.logs.units import factor
 from sim2gp.data.split_log import cut
-from sim2gp.data.windows import Windows
+from sim2gp.data.windows import Windows, motion
 from sim2gp.systems import MuJoCo
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import in_float64
@@ -186,7 +186,7 @@ class _Trial:
 
     def __init__(self, system: AbstractSystem, asked: Question, until: float) -> None:
         windows, _ = cut(_beginning(asked.logs), system, window=WINDOW)
-        most = np.argsort(-_motion(windows).mean(axis=1), kind="stable")[:WINDOWS]
+        most = np.argsort(-motion(windows).mean(axis=1), kind="stable")[:WINDOWS]
         self.windows = windows.some(np.sort(most))
         self.inputs = _inputs(self.windows)
         self.states = [c.name for c in system.physical_states]
@@ -231,8 +231,8 @@ class _Trial:
             away = s[:, seen].reshape(K, W, -1) - y[:, :, row]
             error += np.where(w.mask[:, row], away**2, 0.0)
         error /= np.maximum(w.mask[:, 1:].sum(axis=1), 1)
-        motion = _motion(w).mean(axis=0) * scale[:, None, seen] ** 2
-        share = np.sqrt(error / np.maximum(motion, 1e-30))
+        moved = motion(w).mean(axis=0) * scale[:, None, seen] ** 2
+        share = np.sqrt(error / np.maximum(moved, 1e-30))
         share = np.where(np.isfinite(share), np.clip(share, _FLOOR, _CAP), _CAP)
         return np.asarray(np.log(share))
 
@@ -271,13 +271,6 @@ def _beginning(logs: Sequence[Log]) -> list[Log]:
             )
         )
     return some
-
-
-def _motion(windows: Windows) -> Float[np.ndarray, "W c"]:
-    """Mean square of how far each channel went within a window."""
-    y, mask = np.asarray(windows.y), np.asarray(windows.mask)
-    away = np.where(mask, (y - y[:, :1]) ** 2, 0.0)
-    return np.asarray(away.sum(axis=1) / np.maximum(mask.sum(axis=1), 1))
 
 
 def _inputs(windows: Windows) -> Float[np.ndarray, "W L m"]:
