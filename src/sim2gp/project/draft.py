@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from sim2gp.data.clock import clock_lines
 from sim2gp.data.logs import Budget, Column, Log, read_log
 from sim2gp.data.logs.formats import recordings
 from sim2gp.data.logs.units import UNITS
@@ -105,7 +106,7 @@ def draft_project(asked: Request) -> Draft:
         Contents(
             asked.model, asked.files, asked.out, system, asked.root, time_,
             asked.period, said, asked.constant, found.images,
-            max(float(np.ptp(log.time)) for log in logs),
+            max(float(np.ptp(log.time)) for log in logs), clock_lines(logs, system),
         )
     )  # fmt: skip
     budget = asked.budget

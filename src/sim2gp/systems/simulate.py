@@ -16,8 +16,6 @@ from jaxtyping import Array, Float
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import AnyArray
 
-DELAY_BLUR = 4e-3  # s, of inputs that may be delayed
-
 
 class HeldInputs(eqx.Module):
     """The steps of a simulation, and the inputs that reach it.
@@ -64,7 +62,7 @@ def arriving(
     system: AbstractSystem, params: Any, window: HeldInputs
 ) -> Float[Array, "L m"]:
     """The inputs of each step, delayed as the machine delays them."""
-    blur = DELAY_BLUR if system.longest_delay else 0.0
+    blur = system.delay_blur if system.longest_delay else 0.0
     return inputs_of(window, system.delays(params), blur)
 
 
