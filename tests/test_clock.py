@@ -151,6 +151,7 @@ def test_forecasts_take_the_steps_of_the_fit() -> None:
     for step, period, every in (
         (0.005, 0.01, 5),
         (0.005, 0.008, 2),
+        (0.005, 0.012, 2),
         (0.002, 0.01, 5),
         (0.005, 0.002, 1),
     ):

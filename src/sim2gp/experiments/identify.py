@@ -133,7 +133,8 @@ def _sizes(project: Project, logs: Sequence[Log], windows: Windows) -> str:
         f"{parameters} parameters, {len(windows)} windows of {length:g} s, "
         f"{columns} measured columns"
     )
-    return "\n".join([sizes, *clock_lines(logs, project.system)])
+    still = [line for line in note_lines(logs) if line.startswith("W117")]
+    return "\n".join([sizes, *clock_lines(logs, project.system), *still])
 
 
 def _compile(system: AbstractSystem, grid: Grid, windows: Windows) -> None:

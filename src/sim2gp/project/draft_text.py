@@ -26,7 +26,8 @@ class Contents:
     """What a draft says.
 
     ``longest`` is the duration of the longest log in s, ``clock`` how the rows of the
-    logs and the model's steps go together.
+    logs and the model's steps go together, ``mended`` keys without which the logs are
+    refused, and why.
     """
 
     model: str
@@ -41,6 +42,7 @@ class Contents:
     images: int = 1
     longest: float = 0.0
     clock: Sequence[str] = ()
+    mended: Mapping[str, str] = field(default_factory=dict)
 
 
 def draft_text(c: Contents) -> str:
@@ -104,6 +106,7 @@ def _logs(c: Contents) -> list[str]:
         rows.append(f"time = {_value(c.time.column)}  # {c.time.why}")
     elif c.period is not None:
         rows.append(f"period = {c.period!r}")
+    rows += [f"{key} = true  # {why}" for key, why in c.mended.items()]
     rows += [f"# {part}" for line in c.clock for part in textwrap.wrap(line, 80)]
     if c.images > 1:
         rows += [
