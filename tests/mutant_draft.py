@@ -145,8 +145,8 @@ FIRST_DRAFT = (
     Mutant(
         "mujoco: a coarse model is stepped finely",
         "systems/mujoco/system.py",
-        "max(LONGEST_MEAN, float(self.engine.model.opt.timestep))",
-        "LONGEST_MEAN",
+        "return self.own_step",
+        "return 0.01",
         ("test_draft.py", "coarse"),
     ),
     Mutant(
@@ -155,5 +155,33 @@ FIRST_DRAFT = (
         "NEAR = 0.03",
         "NEAR = 30.0",
         ("test_laplace.py", "no_arrival"),
+    ),
+    Mutant(
+        "jitter of the stamps is one of the steps",
+        "data/clock.py",
+        "if away > EVEN:\n        part",
+        "if True:\n        part",
+        ("test_clock.py", "jitter"),
+    ),
+    Mutant(
+        "a step a little too long is two",
+        "systems/mujoco/engine.py",
+        "/ step - STEP_TOLERANCE)",
+        "/ step - 1e-9)",
+        ("test_clock.py", "little_longer"),
+    ),
+    Mutant(
+        "forecasts of a model with its own step take another",
+        "data/grid.py",
+        "(round(away(k), 9), -k)",
+        "-k",
+        ("test_clock.py", "forecasts"),
+    ),
+    Mutant(
+        "windows of two periods are stepped as one",
+        "systems/mujoco/engine.py",
+        "if lengths.size == 1:",
+        "if lengths.size >= 1:",
+        ("test_clock.py", "two_periods"),
     ),
 )

@@ -11,15 +11,15 @@ ON_THE_HOST = (
     Mutant(
         "forecasts are stepped finer than fits",
         "data/grid.py",
-        "if whole % k == 0 and k <= longest)",
-        "if k == 1)",
+        "if whole % k == 0 and k <= rows]",
+        "if k == 1]",
         ("test_forecast.py", "stepped_as_in_a_fit"),
     ),
     Mutant(
         "forecasts are stepped coarser than the log",
         "data/grid.py",
-        "min(system.window_substep, stamps) / PERIOD",
-        "system.window_substep / PERIOD",
+        "min(rows, stamps) / PERIOD",
+        "rows / PERIOD",
         ("test_forecast.py", "stepped_as_in_a_fit"),
     ),
     Mutant(

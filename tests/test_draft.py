@@ -184,12 +184,30 @@ def test_a_coarse_model_is_stepped_as_it_is() -> None:
     text = MODEL.replace('"0.01" integrator="RK4"', '"0.03" integrator="Euler"')
     system = MuJoCo(mujoco.MjModel.from_xml_string(text))
     fine = MuJoCo(mujoco.MjModel.from_xml_string(MODEL.replace("0.01", "0.002")))
-    assert (system.window_substep, fine.window_substep) == (0.03, 0.01)
+    assert (system.window_substep, fine.window_substep) == (0.03, 0.002)
     time, y = 0.03 * np.arange(20), np.linspace(0.5, 1.0, 20)
     log = Log("a", "a.csv", time, {"hinge": y}, {"drive": 0.0 * y}, {"hinge": y > 0})
     windows, _ = cut([log], system, window=0.3)
     spans = np.asarray(windows.span)
     np.testing.assert_allclose(spans[spans > 0.0], 0.03, rtol=1e-9)
+
+
+def test_what_a_log_needs_to_be_read_is_said_in_the_draft(tmp_path: Path) -> None:
+    """A stamp that stands twice, a value that is none: the key, and where."""
+    (tmp_path / "pendulum.xml").write_text(MODEL)
+    odd_log(tmp_path / "run.csv")
+    lines = (tmp_path / "run.csv").read_text().splitlines()
+    lines.insert(20, lines[19])
+    stamp, _, command = lines[40].split(",")
+    lines[40] = f"{stamp},nan,{command}"
+    (tmp_path / "run.csv").write_text("\n".join(lines) + "\n")
+    out = tmp_path / "pendulum.toml"
+    words = [tmp_path / "pendulum.xml", tmp_path / "run.csv", "--out", out]
+    assert main(["init", *map(str, words), "--no-readings"]) == 0
+    text = out.read_text()
+    assert "keep_first = true  # duplicate time stamp in" in text
+    assert "drop_nonfinite = true  # value that is not finite in" in text
+    assert load_project(out).load_logs()
 
 
 def test_bad_input_is_one_line_and_nothing_is_written(tmp_path: Path, capsys) -> None:

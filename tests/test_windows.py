@@ -255,7 +255,7 @@ def test_delayed_inputs_are_smooth_in_the_delay(short: Log) -> None:
         one = jax.tree.map(lambda x: jnp.asarray(x[0]), eqx.tree_at(
             lambda w: w.floor, windows, None))  # fmt: skip
         one = eqx.tree_at(lambda w: w.floor, one, jnp.ones(2), is_leaf=_none)
-        blur = stretch.DELAY_BLUR
+        blur = system.delay_blur
 
         def mean(delay: float, width: float) -> jax.Array:
             return stretch.inputs_of(one, jnp.asarray([delay]), width)[1:]

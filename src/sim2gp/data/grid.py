@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sim2gp import checks
+from sim2gp.data.clock import step_between
 from sim2gp.data.logs import Log
 from sim2gp.data.split_log import (
     SPACING,
@@ -23,7 +24,7 @@ from sim2gp.data.split_log import (
     resolution,
 )
 from sim2gp.data.windows import Windows
-from sim2gp.systems.base import AbstractSystem
+from sim2gp.systems.base import LONGEST_MEAN, AbstractSystem
 
 PERIOD = 2e-3  # s
 SAMPLES = 25  # of the filter
@@ -99,14 +100,24 @@ def evaluation_windows(
 
 
 def _every(logs: Sequence[Log], system: AbstractSystem) -> int:
-    """Samples to a simulator's step; it is no longer than a log's own, either.
+    """Samples to a row of a simulation, whose steps are most like those of the fit.
 
-    A divisor of the samples in 0.1 s, so that every horizon is passed.
+    A divisor of the samples in 0.1 s, so that every horizon is passed. A simulator with
+    a step of its own takes several to a row, and no row is longer than a log's.
     """
     stamps = min(float(np.median(np.diff(log.time))) for log in logs)
-    longest = max(1.0, min(system.window_substep, stamps) / PERIOD + 1e-6)
-    whole = steps_of(SPACING)
-    return max(k for k in range(1, whole + 1) if whole % k == 0 and k <= longest)
+    whole, longest = steps_of(SPACING), system.window_substep
+    fitted = step_between(stamps, longest)
+    rows = longest if system.own_step is None else max(longest, LONGEST_MEAN)
+    rows = max(1.0, min(rows, stamps) / PERIOD + 1e-6)
+    divisors = [k for k in range(1, whole + 1) if whole % k == 0 and k <= rows]
+    if system.own_step is None:
+        return divisors[-1]
+
+    def away(k: int) -> float:
+        return abs(step_between(k * PERIOD, longest) - fitted)
+
+    return min(divisors, key=lambda k: (round(away(k), 9), -k))
 
 
 def on_grid(

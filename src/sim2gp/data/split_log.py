@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from sim2gp import checks
+from sim2gp.data.clock import on_even_clock
 from sim2gp.data.logs import Log
 from sim2gp.data.windows import Windows
 from sim2gp.errors import InputError
-from sim2gp.systems.base import AbstractSystem, index_of
-from sim2gp.systems.simulate import DELAY_BLUR
+from sim2gp.systems.base import DELAY_BLUR, STEP_TOLERANCE, AbstractSystem, index_of
 
 HALF_WIDTH = 0.025  # s, half the span of the local parabola that guesses a start
 PAST = 0.049  # s, the span of the causal one: 25 samples of 2 ms
@@ -27,7 +27,6 @@ SPACING = 0.1  # s, between the starts of forecasts
 #: keeps it from where forces saturate, where a simulation jumps (of 10 windows of an
 #: arm's log, one began there with 10 in place of 3, and its constants followed).
 FAR = 3.0
-TOLERANCE = 0.05  # a substep may exceed its limit by this share of clock jitter
 Start = Literal["smoothed", "causal"]
 
 
@@ -54,6 +53,7 @@ def cut(
     checks.one_of("cut", get_args(Start), start=start)
     checks.deviation("start_sd", **(start_sd or {}))
     checks.deviation("floor", **(floor or {}))
+    logs = [on_even_clock(log, system) for log in logs]
     measured = measured_states(logs, system, every=window == 0.0)
     pieces = []
     for k, log in enumerate(logs):
@@ -226,8 +226,8 @@ def _steps(
 
     Returns each stamp's place among the steps' ends, and the steps' lengths.
     """
-    gaps = np.diff(time)
-    count = np.maximum(1, np.ceil(gaps / longest - TOLERANCE)).astype(int)
+    gaps = np.round(np.diff(time), 9)  # those that are equal differ by rounding
+    count = np.maximum(1, np.ceil(gaps / longest - STEP_TOLERANCE)).astype(int)
     place = np.concatenate([[0], np.cumsum(count)])
     return place, np.repeat(gaps / count, count)
 

@@ -120,10 +120,13 @@ class WindowsLikelihood(AbstractLikelihood):
         r = _residual(windows, run.states)
 
         def blocks() -> Float[np.ndarray, "W c k k"]:
-            J = np.where(windows.mask[..., None], run.slopes()[:, :, outputs], 0.0)
+            J, mask = run.slopes()[:, :, outputs], windows.mask
             return np.stack(
                 [
-                    [factor(J[w, :, c], r[w, :, c]) for c in range(len(outputs))]
+                    [
+                        factor(J[w, mask[w, :, c], c], r[w, mask[w, :, c], c])
+                        for c in range(len(outputs))
+                    ]
                     for w in range(len(r))
                 ]
             )

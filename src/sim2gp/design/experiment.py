@@ -16,13 +16,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sim2gp import checks
-from sim2gp.data.split_log import TOLERANCE
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.least_squares import over
 from sim2gp.inference.linalg import triangular
 from sim2gp.inference.linearized import value_and_jacobian
-from sim2gp.systems.base import WINDOW_SUBSTEP, AbstractSystem
-from sim2gp.systems.simulate import DELAY_BLUR, HeldInputs, simulate
+from sim2gp.systems.base import (
+    DELAY_BLUR,
+    STEP_TOLERANCE,
+    WINDOW_SUBSTEP,
+    AbstractSystem,
+)
+from sim2gp.systems.simulate import HeldInputs, simulate
 
 #: Commands over each period, in the units of the inputs.
 Commands = Float[Array, "T m"]
@@ -70,7 +74,7 @@ class Experiment(eqx.Module):
     @property
     def substeps(self) -> int:
         """Of the integration, in a period."""
-        return max(1, math.ceil(self.period / self.substep - TOLERANCE))
+        return max(1, math.ceil(self.period / self.substep - STEP_TOLERANCE))
 
     @property
     def plausible(self) -> Gaussian:

@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from sim2gp.data.clock import clock_lines, clock_warnings
 from sim2gp.data.grid import CURVE, Grid, evaluation_windows
 from sim2gp.data.logs import Log, note_lines
 from sim2gp.data.windows import Windows
@@ -91,7 +92,7 @@ def run(
         key, robust = jax.random.key(seed), project.spec.likelihood.robust
         grid = evaluation_windows(logs, project.system, longest=CURVE[-1])
         _compile(project.system, grid, windows)
-        progress.say(_sizes(project, windows))
+        progress.say(_sizes(project, logs, windows))
         first = FirstAnswer(project, logs, out, task)
         with first.of_failures():
             fitted = fit_windows(
@@ -124,14 +125,16 @@ def run(
     return summary
 
 
-def _sizes(project: Project, windows: Windows) -> str:
-    """What a fit is about, before it begins."""
+def _sizes(project: Project, logs: Sequence[Log], windows: Windows) -> str:
+    """What a fit is about, and in which steps it simulates, before it begins."""
     parameters, columns = len(project.system.parameters), len(windows.outputs)
     length = project.spec.likelihood.window
-    return (
+    sizes = (
         f"{parameters} parameters, {len(windows)} windows of {length:g} s, "
         f"{columns} measured columns"
     )
+    still = [line for line in note_lines(logs) if line.startswith("W117")]
+    return "\n".join([sizes, *clock_lines(logs, project.system), *still])
 
 
 def _compile(system: AbstractSystem, grid: Grid, windows: Windows) -> None:
@@ -301,7 +304,7 @@ def _summarise(
             "input_sd": dict(zip(actions, band.input_sd.tolist(), strict=True)),
             "inflation": band.inflation,
         },
-        "warnings": note_lines(logs),
+        "warnings": [*note_lines(logs), *clock_warnings(logs, system)],
         "trace_note": "Forecasts of half a second from causal starts, of the logs that "
         "were fitted; they know the recorded inputs and nothing else of the future.",
         **listed,

@@ -7,16 +7,18 @@ its place. Without recordings the file says which columns they need.
 """
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sim2gp.data.clock import clock_lines
 from sim2gp.data.logs import Budget, Column, Log, read_log
 from sim2gp.data.logs.formats import recordings
 from sim2gp.data.logs.units import UNITS
+from sim2gp.errors import InputError
 from sim2gp.identification.identifiability.selection import Selection
 from sim2gp.project.columns import Match, match, time_column
 from sim2gp.project.draft_text import Contents, draft_text
@@ -45,6 +47,7 @@ LARGE = 3.2  # rad or m of travel that may be degrees or millimetres
 TURNS = 25.0  # rad or m: more is rather degrees or millimetres
 FAR = 10.0  # times the range of a joint: no log in the right unit travels so far
 SHARE = 0.8  # of the time, after which no further reading is begun
+_MENDS = {"E101": "drop_nonfinite", "E108": "keep_first"}  # said in the draft
 _SMALLER = {"rad": "deg", "m": "mm"}
 
 
@@ -98,7 +101,7 @@ def draft_project(asked: Request) -> Draft:
     time_, columns, travel = _columns(asked, system)
     options = _options(system, columns, travel)
     read = {n: _in_unit(n, m.column, options) for n, m in columns.items()}
-    logs = _logs(asked, system, read, time_)
+    logs, mended = _mended_logs(asked, system, read, time_)
     question = Question(logs, options, _together(system, options))
     until = asked.started + SHARE * asked.seconds
     if not asked.readings:
@@ -109,7 +112,8 @@ def draft_project(asked: Request) -> Draft:
     contents = Contents(
         asked.model, asked.files, asked.out, system, asked.root, time_,
         asked.period, said, asked.constant, found.images,
-        max(float(np.ptp(log.time)) for log in logs),
+        max(float(np.ptp(log.time)) for log in logs), clock_lines(logs, system),
+        mended,
     )  # fmt: skip
     project, logs = _placed(asked, draft_text(contents))
     if asked.readings and is_model(asked.model):
@@ -237,11 +241,30 @@ def _in_unit(
     return Reading(unit=finer(options[joint])).of(column, rate=name != joint)
 
 
+def _mended_logs(
+    asked: Request,
+    system: AbstractSystem,
+    columns: Mapping[str, Column],
+    clock: Match | None,
+) -> tuple[list[Log], dict[str, str]]:
+    """The logs, and the keys of `_MENDS` that they need, with why."""
+    keys: dict[str, str] = {}
+    while True:
+        try:
+            return _logs(asked, system, columns, clock, keys), keys
+        except InputError as error:
+            key = _MENDS.get(error.code, "")
+            if not key or key in keys or f"{key} = true" not in error.fix:
+                raise
+            keys[key] = f"{error.what} in {error.where}"
+
+
 def _logs(
     asked: Request,
     system: AbstractSystem,
     columns: Mapping[str, Column],
     clock: Match | None,
+    mended: Container[str],
 ) -> list[Log]:
     return [
         log
@@ -254,6 +277,8 @@ def _logs(
             time=None if clock is None else clock.column,
             period=asked.period,
             budget=asked.budget,
+            drop_nonfinite="drop_nonfinite" in mended,
+            keep_first="keep_first" in mended,
         )
     ]
 

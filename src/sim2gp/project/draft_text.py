@@ -1,6 +1,7 @@
 """The words of a first project file: what was found, and the reason of each guess."""
 
 import os
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,9 +25,12 @@ _GAINS = ("kp", "kv")
 
 @dataclass(frozen=True)
 class Contents:
-    """What a draft says; ``longest`` is the duration of the longest log in s.
+    """What a draft says.
 
-    ``unselected`` is why there is no ``selection``, where one was to be made.
+    ``longest`` is the duration of the longest log in s, ``clock`` how the rows of the
+    logs and the model's steps go together, ``mended`` keys without which the logs are
+    refused, and why. ``unselected`` is why there is no ``selection``, where one was to
+    be made.
     """
 
     model: str
@@ -40,6 +44,8 @@ class Contents:
     constant: Mapping[str, float] = field(default_factory=dict)
     images: int = 1
     longest: float = 0.0
+    clock: Sequence[str] = ()
+    mended: Mapping[str, str] = field(default_factory=dict)
     selection: Selection | None = None
     unselected: str = ""
 
@@ -136,6 +142,8 @@ def _logs(c: Contents) -> list[str]:
         rows.append(f"time = {_value(c.time.column)}  # {c.time.why}")
     elif c.period is not None:
         rows.append(f"period = {c.period!r}")
+    rows += [f"{key} = true  # {why}" for key, why in c.mended.items()]
+    rows += [f"# {part}" for line in c.clock for part in textwrap.wrap(line, 80)]
     if c.images > 1:
         rows += [
             "",

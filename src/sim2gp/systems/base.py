@@ -38,6 +38,12 @@ from sim2gp.types import Action, Scalar, State
 WINDOW_SUBSTEP = 2e-3
 #: An input that moves within a period is averaged over no more than this, s.
 LONGEST_MEAN = 0.01
+#: Width over which an input that may be delayed is averaged, s.
+DELAY_BLUR = 4e-3
+#: The same in steps of a simulator that has its own, which 4 ms would make another.
+BLURRED = 0.1
+#: A step may exceed its limit by this share: clocks are not exact.
+STEP_TOLERANCE = 0.05
 R = TypeVar("R")
 
 
@@ -100,6 +106,17 @@ class AbstractSystem(eqx.Module):
     @abc.abstractmethod
     def window_substep(self) -> float:
         """Longest time that one `flow` may last between two rows of a log, in s."""
+
+    @property
+    @abc.abstractmethod
+    def own_step(self) -> float | None:
+        """The step in s that a simulator has of its own; None for an equation."""
+
+    @property
+    def delay_blur(self) -> float:
+        """The width in s over which an input that may be delayed is averaged."""
+        step = self.own_step
+        return DELAY_BLUR if step is None else min(DELAY_BLUR, BLURRED * step)
 
     @property
     @abc.abstractmethod
@@ -236,6 +253,10 @@ class AbstractPlant(AbstractSystem):
     @property
     def variants(self) -> tuple[Variant, ...]:
         return ()
+
+    @property
+    def own_step(self) -> float | None:
+        return None
 
     @property
     def history(self) -> int:

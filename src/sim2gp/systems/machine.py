@@ -195,6 +195,10 @@ class Machine(AbstractSystem):
         return self.plant.window_substep
 
     @property
+    def own_step(self) -> float | None:
+        return self.plant.own_step
+
+    @property
     def longest_delay(self) -> float:
         delays = [p for p in self.actuators if isinstance(p, Delay)]
         return max((self._range(p.name)[1] for p in delays), default=0.0)

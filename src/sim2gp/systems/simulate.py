@@ -16,8 +16,6 @@ from sim2gp.inference.linalg import each_window, library
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import AnyArray, AnyScalar
 
-DELAY_BLUR = 4e-3  # s, of inputs that may be delayed
-
 
 class HeldInputs(eqx.Module):
     """The steps of a simulation, and the inputs that reach it.
@@ -79,7 +77,7 @@ def arriving(
 
 def blur_of(system: AbstractSystem) -> float:
     """Over how long inputs are averaged, s; zero where none may be delayed."""
-    return DELAY_BLUR if system.longest_delay else 0.0
+    return system.delay_blur if system.longest_delay else 0.0
 
 
 def _ends(window: HeldInputs) -> tuple[Float[AnyArray, " L1"], Float[AnyArray, " L"]]:

@@ -12,10 +12,11 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from sim2gp.errors import InputError
 from sim2gp.inference.parameters import Parameters
+from sim2gp.systems.base import STEP_TOLERANCE
 from sim2gp.systems.mujoco.constants import CENTRED, DERIVED, Constant, set_constants
 from sim2gp.systems.mujoco.slopes.numbers import moved_by, numbers_of, tree_of
 from sim2gp.systems.mujoco.slopes.step import Model, acceleration_slopes, in_closed_form
@@ -103,7 +104,7 @@ class Engine(AbstractSimulator):
 
     def substeps(self, span: Float[np.ndarray, "*r"]) -> Int[np.ndarray, "*r"]:
         step = float(self.model.opt.timestep)
-        count = np.ceil(np.round(span, 12) / step - 1e-9)
+        count = np.ceil(np.round(span, 12) / step - STEP_TOLERANCE)
         return np.asarray(np.maximum(1, count), int)
 
     def rollout(
@@ -113,13 +114,32 @@ class Engine(AbstractSimulator):
         u: Float[np.ndarray, "W L m"],
         span: Float[np.ndarray, "W L"],
     ) -> Float[np.ndarray, "W L n"]:
-        lengths = np.unique(np.round(span[span > 0.0], 12))
+        moving, length = span > 0.0, np.round(span.max(axis=1, initial=0.0), 12)
+        even = np.abs(span - length[:, None]) <= 1e-12
+        lengths, which = np.unique(
+            np.where((even | ~moving).all(axis=1), length, -1.0), return_inverse=True
+        )
         finite = all(np.isfinite(x).all() for x in (theta, x0, u))
-        if lengths.size != 1 or not finite:
+        if lengths[-1] <= 0.0 or not finite:
             return super().rollout(theta, x0, u, span)
-        # All rows are equally long, or not there: each window is one call.
-        moving = span > 0.0
-        count = int(self.substeps(lengths)[0])
+        if lengths.size == 1:
+            return self._evenly(theta, x0, u, moving, float(lengths[0]))
+        out = np.empty((*span.shape, x0.shape[1]))
+        for k in range(lengths.size):  # of logs with periods of their own
+            at = which.reshape(-1) == k
+            out[at] = self.rollout(theta[at], x0[at], u[at], span[at])
+        return out
+
+    def _evenly(
+        self,
+        theta: Float[np.ndarray, "W p"],
+        x0: Float[np.ndarray, "W n"],
+        u: Float[np.ndarray, "W L m"],
+        moving: Bool[np.ndarray, "W L"],
+        length: float,
+    ) -> Float[np.ndarray, "W L n"]:
+        """`rollout` where rows are equally long, or not there: one call a window."""
+        count = int(self.substeps(np.asarray(length)))
         order = np.argsort(~moving, axis=1, kind="stable")
         inputs = np.take_along_axis(u, order[..., None], axis=1)
         inputs = inputs[:, : moving.sum(1).max()]
@@ -128,7 +148,7 @@ class Engine(AbstractSimulator):
             values, which = _distinct(theta)
             models = self._models(values)
             chosen = [models[k] for k in which]
-            h = float(lengths[0]) / count
+            h = length / count
             states = self._stepped(chosen, models, x0, control, h)[
                 :, count - 1 :: count
             ]

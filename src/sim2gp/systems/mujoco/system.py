@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 from sim2gp.errors import InputError
 from sim2gp.inference.parameters import Parameter, Parameters
-from sim2gp.systems.base import LONGEST_MEAN, AbstractPlant, Channel
+from sim2gp.systems.base import AbstractPlant, Channel
 from sim2gp.systems.mujoco.constants import (
     OF_INERTIA,
     SIGNED,
@@ -145,9 +145,12 @@ class MuJoCo(AbstractPlant):
 
     @property
     def window_substep(self) -> float:
-        # A delayed input is averaged over no more; but a coarser model is stepped as
-        # it is: half of its step is another simulator.
-        return max(LONGEST_MEAN, float(self.engine.model.opt.timestep))
+        # A delayed input is averaged over no more than one step of the model.
+        return self.own_step
+
+    @property
+    def own_step(self) -> float:
+        return float(self.engine.model.opt.timestep)
 
     def record(self, values: Mapping[str, Scalar]) -> Float[Array, " p"]:
         """Values in the order of the engine's constants."""
