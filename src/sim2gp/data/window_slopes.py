@@ -57,10 +57,11 @@ def states_and_slopes(
 class HostRun:
     """All windows simulated on the host, and their derivatives when they are asked for.
 
-    ``states`` are those of the system. Make it in float64.
+    ``states`` are those of the system, ``inputs`` what reaches it. Make it in float64.
     """
 
     states: Float[np.ndarray, "W L n"]
+    inputs: Float[np.ndarray, "W L m"]
 
     def __init__(
         self,
@@ -71,13 +72,14 @@ class HostRun:
         k: int,
     ) -> None:
         late = _delays(asked, windows, e, k)
-        inputs = _inputs(asked.system, windows, np.asarray(late))
-        found = _arguments(asked, windows, e, inputs, k)
+        arriving = _inputs(asked.system, windows, np.asarray(late))
+        found = _arguments(asked, windows, e, arriving, k)
         # Of the host's own kind, in its order: it works along the rows.
         found = jax.tree.map(np.asarray, found)
         (at, origin), (self._along, self._origin_by) = found
         self._simulator, self._run = simulator, simulator.rolled(at)
         self.states = self._run.at_rows + origin
+        self.inputs = arriving[0]
 
     def slopes(self) -> Float[np.ndarray, "W L n k"]:
         """Derivatives of the states in ``x``."""

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sim2gp.compilation import compile_async
-from sim2gp.data.window_slopes import AbstractAsked, HostRun, slopes_on_host
+from sim2gp.data.window_slopes import AbstractAsked, HostRun
 from sim2gp.data.windows import Windows
 from sim2gp.inference.arrowhead import Blocks, Noise, eliminate
 from sim2gp.inference.estimate import Estimate
@@ -198,8 +198,8 @@ def linearise(
     if (simulator := simulator_of(likelihood.system)) is not None:
         asked = _About(likelihood.system, tt, fitted.prior.scale)
         k = e.shape[1] + tt.size
-        found = slopes_on_host(simulator, asked, likelihood.windows, e, k)
-        return _rows(likelihood, tt, *found)
+        run = HostRun(simulator, asked, likelihood.windows, e, k)
+        return _rows(likelihood.windows, run)
     return _linearise(likelihood, e, tt, fitted.prior.scale)
 
 
@@ -213,22 +213,13 @@ def compile_linearise(system: AbstractSystem, windows: Windows) -> None:
     _linearise.compile_for(likelihood, e, prior.mean, prior.scale)
 
 
-@eqx.filter_jit
-def _rows(
-    likelihood: WindowsLikelihood, tt: Array, states: Array, slopes: Array
-) -> Linearised:
+def _rows(windows: Windows, run: HostRun) -> Linearised:
     """Rows of windows that were simulated on the host; the start's columns go last."""
-    system, n = likelihood.system, states.shape[-1]
-
-    def one(window: Windows, states: Array, slopes: Array) -> Linearised:
-        J = slopes[:, np.asarray(window.outputs)]
-        J = jnp.roll(jnp.where(window.mask[..., None], J, 0.0), -n, axis=-1)
-        params = system.record(system.values(tt, window.configuration))
-        inputs = inputs_of(window, system.delays(params))
-        return Linearised(_residual(window, states), J, states, inputs)
-
-    found: Linearised = likelihood.windows.each(one, states, slopes)
-    return found
+    windows = jax.tree.map(np.asarray, windows)
+    J = run.slopes()[:, :, list(windows.outputs)]
+    J = np.roll(np.where(windows.mask[..., None], J, 0.0), -run.states.shape[-1], -1)
+    found = _residual(windows, run.states), J, run.states, run.inputs
+    return Linearised(*map(jnp.asarray, found))
 
 
 @compile_async

@@ -11,7 +11,6 @@ from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from sim2gp.data.logs import Budget, Log, none_unused
 from sim2gp.errors import InputError
@@ -22,7 +21,7 @@ from sim2gp.project import Project, load_project
 from sim2gp.runs import load_run
 from sim2gp.runs.store import Run
 from sim2gp.systems.variants import index_of
-from sim2gp.types import in_float64
+from sim2gp.types import AnyArray, in_float64
 
 PROJECT = "project.toml"  # the file's name in a run
 
@@ -67,9 +66,9 @@ class Identified(NamedTuple):
 
 
 @in_float64
-def physical(table: Parameters, tt: Array) -> Array:
+def physical(table: Parameters, tt: AnyArray) -> np.ndarray:
     """The constants at the posterior's mode, in physical units."""
-    return table.constrain(jnp.asarray(tt, float))
+    return np.asarray(table.constrain(np.asarray(tt, float)))
 
 
 def _posterior(stored: Run, which: Width) -> Gaussian:

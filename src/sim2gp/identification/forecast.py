@@ -189,15 +189,16 @@ def _passed(grid: Grid) -> Int[np.ndarray, " L"]:
 
 def _some(grid: Grid, which: np.ndarray, rows: np.ndarray) -> Windows:
     """Some of the windows, as JAX arrays, in steps from one of ``rows`` to the next."""
-    chosen = jax.tree.map(jnp.asarray, grid.windows.some(which))
+    chosen = grid.windows.some(which)
     new = np.diff(which, prepend=-1) > 0  # what fills a batch up does not move
-    span = jnp.asarray(new[:, None] * PERIOD * np.diff(rows, prepend=0))
-    thin: Windows = eqx.tree_at(
+    span = new[:, None] * PERIOD * np.diff(rows, prepend=0)
+    thin = eqx.tree_at(
         lambda w: (w.span, w.y, w.mask),
         chosen,
         (span, chosen.y[:, rows], chosen.mask[:, rows]),
     )
-    return thin
+    arrays: Windows = jax.tree.map(jnp.asarray, thin)
+    return arrays
 
 
 @dataclass(frozen=True)

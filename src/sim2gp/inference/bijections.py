@@ -16,25 +16,30 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
+from scipy.special import expit
+
+from sim2gp.inference.linalg import library
+from sim2gp.types import AnyArray
 
 MAPS = ("bounded", "log_bounded", "softplus", "log", "identity")
 _EDGE = 1e-13  # closest approach to a bound when a physical value is mapped back
 
 
-def constrain(kind: str, t: Array, low: Any, high: Any) -> Array:
+def constrain(kind: str, t: AnyArray, low: Any, high: Any) -> AnyArray:
     """Physical values of virtual ones under one kind of map, inside ``[low, high]``."""
-    huge = np.asarray(np.finfo(t.dtype).max, t.dtype)
+    xp, huge = library(t), np.asarray(np.finfo(t.dtype).max, t.dtype)
+    sigmoid = expit if xp is np else jax.nn.sigmoid
     if kind == "bounded":
-        return jnp.clip(low + (high - low) * jax.nn.sigmoid(t), low, high)
+        return xp.clip(low + (high - low) * sigmoid(t), low, high)
     if kind == "log_bounded":
         span = np.log(high) - np.log(low)
-        return jnp.clip(jnp.exp(np.log(low) + span * jax.nn.sigmoid(t)), low, high)
+        return xp.clip(xp.exp(np.log(low) + span * sigmoid(t)), low, high)
     if kind == "softplus":
-        return jnp.minimum(low + jax.nn.softplus(t), huge)
+        return xp.minimum(low + xp.logaddexp(t, 0.0), huge)
     if kind == "log":
         limit = np.floor(np.log(huge))
-        return jnp.exp(jnp.clip(t, -limit, limit))
-    return jnp.clip(t, -huge, huge)
+        return xp.exp(xp.clip(t, -limit, limit))
+    return xp.clip(t, -huge, huge)
 
 
 def unconstrain(kind: str, theta: Array, low: Any, high: Any) -> Array:
@@ -50,9 +55,9 @@ def unconstrain(kind: str, theta: Array, low: Any, high: Any) -> Array:
     return jnp.log(theta) if kind == "log" else theta
 
 
-def scatter(parts: list[Array], groups: list[Any], like: Array) -> Array:
+def scatter(parts: list[AnyArray], groups: list[Any], like: AnyArray) -> AnyArray:
     """Put the groups' values back into the table's order."""
     if not parts:
         return like
     order = np.concatenate([index for _, index, _, _ in groups])
-    return jnp.concatenate(parts)[np.argsort(order)]
+    return library(like).concatenate(parts)[np.argsort(order)]

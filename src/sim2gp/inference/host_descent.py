@@ -36,7 +36,7 @@ Starts = Float[np.ndarray, "W n"]
 SMALL, ROUGH = 1e-2, 0.3
 STILL = 1e-3
 #: A step shorter than `NEAR` that gains no more (nats) is the last.
-NOTHING = 1e-3
+NOTHING = 1e-2
 #: Steps that a descent may take; a start among others, fewer.
 MOST_STEPS, FIRST_STEPS = 100, 30
 NOISE_TURNS = 10  # of EM at one point

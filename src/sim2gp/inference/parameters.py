@@ -23,7 +23,7 @@ from sim2gp.errors import InputError, nearest
 from sim2gp.inference import bijections
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.linear_measurements import LinearMeasurement, residuals
-from sim2gp.types import Scalar
+from sim2gp.types import AnyArray, Scalar
 
 #: Standard deviation of a boxed parameter's virtual value: the box is nearly uniform
 #: and the sigmoid stays out of saturation.
@@ -81,8 +81,7 @@ class Parameter:
 
     def constrain(self, tt: float) -> float:
         """Physical value of a virtual one (host-side scalar)."""
-        with jax.enable_x64(True):
-            return float(Parameters((self,)).constrain(jnp.asarray([tt], float))[0])
+        return float(Parameters((self,)).constrain(np.asarray([tt], float))[0])
 
     def unconstrain(self, theta: float) -> float:
         """Virtual value of a physical one (host-side scalar)."""
@@ -250,7 +249,7 @@ class Parameters(eqx.Module):
     def __getitem__(self, name: str) -> Parameter:
         return self.free[self.names.index(name)]
 
-    def constrain(self, tt: Float[Array, " p"]) -> Float[Array, " p"]:
+    def constrain(self, tt: Float[AnyArray, " p"]) -> Float[AnyArray, " p"]:
         """Physical values of virtual ones, always inside the bounds."""
         out = []
         for kind, index, low, high in self._groups(tt.dtype):
