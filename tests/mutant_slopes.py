@@ -56,7 +56,7 @@ SLOPES_OF_STEPS = (
         "systems/plants/external.py",
         "@ S + C[:, k - first]",
         "@ (0.0 * S) + C[:, k - first]",
-        ("test_slopes.py", "linear_recursion"),
+        ("test_window_slopes.py", "window_is_differentiated"),
     ),
     Mutant(
         "slopes: dry friction has no regularisation of its own",

@@ -4,11 +4,10 @@ import mujoco
 import numpy as np
 import pytest
 
-import six_axis
 from sim2gp import Parameter
 from sim2gp.systems import MuJoCo
 from sim2gp.systems.mujoco.engine import Engine
-from sim2gp.systems.plants.external import AbstractSimulator, Arguments
+from sim2gp.systems.plants.external import AbstractSimulator
 
 FRICTION = "joint/*/frictionloss"
 OPEN = ["joint/*/damping", "joint/*/armature", "joint/*/stiffness", "body/*/mass",
@@ -150,41 +149,6 @@ def test_contacts_and_limits_are_left_to_differences():
     A, B = np.zeros((4, 4)), np.zeros((4, 1))
     mujoco.mjd_transitionFD(engine.model, data, 1e-6, True, A, B, None, None)
     assert np.allclose(J[0, :, 2:6], A, atol=1e-4)
-
-
-@pytest.mark.parametrize("text", [tree("implicitfast"), six_axis.model_text()])
-def test_whole_windows_are_one_linear_recursion(text):
-    constants = ["joint/*/damping", "joint/*/armature", "body/*/mass", FRICTION]
-    engine, theta = opened(text, constants)
-    rng, (W, L), n = np.random.default_rng(1), (2, 30), engine.model.nv
-    x0 = np.concatenate([0.3 * rng.normal(size=(W, n)), np.zeros((W, n))], axis=1)
-    m = engine.model.nu
-    u = x0[:, None, :m] + 0.02 * np.cumsum(rng.normal(size=(W, L, m)), axis=1)
-    span = np.full((W, L), 0.01)  # two or three steps of the model each
-    span[:, 0] = span[1, -4:] = 0.0
-    p, k = theta.size, theta.size + 2 * n + engine.model.nu
-    of_theta = np.zeros((W, p, k))
-    of_theta[:, range(p), range(p)] = engine.differences.scale
-    of_x0, of_u = np.zeros((W, 2 * n, k)), np.zeros((W, L, engine.model.nu, k))
-    of_x0[:, range(2 * n), range(p, p + 2 * n)] = 1.0
-    of_u[:, :, range(m), range(p + 2 * n, k)] = 1.0
-    at = Arguments(np.tile(theta, (W, 1)), x0, u, span)
-    states, S = engine.linearised_rollout(at, Arguments(of_theta, of_x0, of_u, span))
-    one_by_one = AbstractSimulator.rollout(engine, *at)
-    assert np.allclose(states, one_by_one, atol=1e-8)
-    for i in range(k):
-        d = 2e-5 if i < p else 1e-6
-        ends = [
-            engine.rollout(
-                at.theta + d * sign * of_theta[..., i],
-                x0 + d * sign * of_x0[..., i],
-                u + d * sign * of_u[..., i],
-                span,
-            )
-            for sign in (1.0, -1.0)
-        ]
-        expected = (ends[0] - ends[1]) / (2.0 * d)
-        assert np.abs(S[..., i] - expected).max() <= 1e-6 * np.abs(expected).max()
 
 
 def test_a_state_that_runs_away_is_no_number():
