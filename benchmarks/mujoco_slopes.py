@@ -110,11 +110,11 @@ def measured(engine: Engine) -> dict[str, Any]:
     theta = np.asarray([group[0].get(model) for group in engine.constants])
     k = n + p
     x0 = np.zeros((WINDOWS, n))
-    x0[:, : model.nq] = inside = inside(model)
+    x0[:, : model.nq] = rest = inside(model)
     t = SPAN * np.arange(WINDOWS * ROWS).reshape(WINDOWS, ROWS, 1)
     u = 0.2 * np.sin(2.0 * np.pi * rng.uniform(0.2, 1.0, m) * t)
     if m == model.nq:
-        u = u + inside  # servos
+        u = u + rest  # servos
     span = np.full((WINDOWS, ROWS), SPAN)
     at = Arguments(np.tile(theta, (WINDOWS, 1)), x0, u, span)
     eye = np.broadcast_to(np.eye(k), (WINDOWS, k, k))

@@ -45,6 +45,20 @@ SLOPES_OF_STEPS = (
         DIFFERENCES,
     ),
     Mutant(
+        "slopes: what cancels in free fall is no size",
+        BODY,
+        "size += np.einsum",
+        "size += 0.0 * np.einsum",
+        ("test_slopes.py", "free_fall"),
+    ),
+    Mutant(
+        "slopes: gravity that is switched off acts",
+        NUMBERS,
+        "np.zeros(3) if weightless else ",
+        "",
+        ("test_slopes.py", "free_fall"),
+    ),
+    Mutant(
         "slopes: whatever acts is taken for known",
         STEP,
         "(np.abs(left) <= LEFT_OVER * found.size).all(0)",

@@ -94,6 +94,27 @@ def test_a_step_is_differentiated_as_its_differences_are(integrator, friction):
     assert np.all(np.abs(J - expected).max(axis=(0, 1)) <= 1e-6 * size + 1e-10)
 
 
+LEG = """<mujoco><option timestep=".004"/><worldbody><body name="trunk" pos="0 0 1">
+<joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>
+<joint name="pitch" axis="0 1 0"/><geom name="trunk" size=".1" mass="3"/>
+<body name="leg" pos="0 0 -.1"><joint name="hip" axis="0 1 0" damping=".2"/>
+<geom name="leg" type="capsule" fromto="0 0 0 0 0 -.4" size=".03" mass="1"/></body>
+</body></worldbody><actuator><motor joint="hip"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("flag", ["", '<flag gravity="disable"/>'])
+def test_a_body_in_free_fall_is_differentiated_in_closed_form(flag, monkeypatch):
+    """Weight and inertia cancel there; the torques that are left are rounding."""
+    text = LEG.replace('timestep=".004"/>', f'timestep=".004">{flag}</option>')
+    engine, theta = opened(text, ["joint/hip/damping", "body/*/mass"])
+    x = points(engine, theta, 10)
+    out, expected = AbstractSimulator.slopes(engine, *x)
+    monkeypatch.setattr(AbstractSimulator, "slopes", None)
+    size = np.abs(expected).max(axis=(0, 1))
+    error = np.abs(engine.jacobian(*x, out) - expected).max(axis=(0, 1))
+    assert np.all(error <= 1e-6 * size + 1e-10)
+
+
 @pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
 def test_a_step_is_differentiated_as_mujoco_does(integrator):
     engine, theta = opened(tree(integrator), ["body/*/mass"])

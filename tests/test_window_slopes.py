@@ -112,7 +112,9 @@ def check(model: Any) -> None:
     slopes = engine.linearised(run, along)
     step_by_step = AbstractSimulator.rollout(engine, *at)
     assert np.allclose(run.at_rows, step_by_step, atol=1e-8)
-    rough = [i for i in range(slopes.shape[-1]) if not agree(engine, at, along, i, slopes)]
+    rough = [
+        i for i in range(slopes.shape[-1]) if not agree(engine, at, along, i, slopes)
+    ]
     # The mass of a base that is fixed; dampings that are almost zero.
     assert len(rough) <= 2, rough
 
@@ -257,6 +259,7 @@ def mjx_slopes(model: Any, fields: tuple[str, ...], at: Arguments) -> np.ndarray
         return np.asarray(jax.jit(jax.jacfwd(states))(x))
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("text", "fields"),
     [
@@ -268,35 +271,35 @@ def mjx_slopes(model: Any, fields: tuple[str, ...], at: Arguments) -> np.ndarray
 )
 @in_float64
 def test_a_window_is_differentiated_as_by_mjx(text, fields):
-    """Forward mode through its steps; nothing there is of this library."""
+    """Forward mode through its steps; nothing there is of this library.
+
+    Servos stay off their largest forces, where MJX's `implicitfast` is not MuJoCo's.
+    """
     pytest.importorskip("mujoco.mjx", reason="MJX is not installed")
     model = compiled(text)
-    names = [model.joint(j).name for j in range(model.njnt)]
     every = [
-        (f"joint/{name}/{field.removeprefix('dof_')}", float(getattr(model, field)[j]))
+        (f"joint/{model.joint(j).name}/{field.removeprefix('dof_')}", value)
         for field in fields
-        for j, name in enumerate(names)
+        for j, value in enumerate(getattr(model, field).tolist())
     ]
     some = [k for k, (_, value) in enumerate(every) if value > 0.0]
     engine = MuJoCo(model, [every[k][0] for k in some]).engine
-    rng, (n, L) = np.random.default_rng(2), (model.nv, 20)
+    rng, (n, m, L) = np.random.default_rng(2), (model.nv, model.nu, 20)
     x0 = np.concatenate([0.3 * rng.normal(size=n), np.zeros(n)])[None]
-    u = x0[:, None, : model.nu] + 0.05 * np.cumsum(
-        rng.normal(size=(1, L, model.nu)), axis=1
-    )
+    u = x0[:, None, :m] + 0.005 * np.cumsum(rng.normal(size=(1, L, m)), axis=1)
     span = np.full((1, L), model.opt.timestep)
     theta = np.asarray([[every[k][1] for k in some]])
     at, p = Arguments(theta, x0, u, span), theta.size
     each = np.eye(p + 2 * n)
     each[range(p), range(p)] = theta[0]
-    of_u = np.zeros((1, L, model.nu, p + 2 * n))
+    of_u = np.zeros((1, L, m, p + 2 * n))
     along = Arguments(each[None, :p], each[None, p:], of_u, span)
     found = engine.linearised(engine.rolled(at), along)[0]
     columns = [*some, *range(len(every), len(every) + 2 * n)]
     expected = mjx_slopes(model, fields, at)[..., columns]
-    size = np.abs(expected).max(axis=(0, 1))
+    size, error = (np.abs(x).max(axis=(0, 1)) for x in (expected, found - expected))
     assert size.min() > 1e-5
-    assert (np.abs(found - expected).max(axis=(0, 1)) <= SAME * size).all()
+    assert (error <= SAME * size).all()
 
 
 def of_others(name: str) -> Any:
