@@ -57,7 +57,8 @@ def row(name: str, path: Path) -> dict[str, Any]:
             "opens": False,
             "code": error.code,
             "what": error.what,
-            "element": error.got,
+            # Not where the packages happen to be installed.
+            "element": str(error.got).replace(str(path).removesuffix(name), ""),
             "lines": len(str(error).splitlines()),
         }
     error, finite = compared(plant, path)

@@ -34,27 +34,37 @@ WINDOWS, ROWS, SPAN = 10, 200, 0.005
 SERVO = "joint/*/damping", "joint/*/armature", "joint/*/frictionloss", "body/*/mass"
 
 
+#: Model files of other packages, by name.
+OF_OTHERS = {
+    "Go1, base fixed": "mjlab/asset_zoo/robots/unitree_go1/xmls/go1.xml",
+    "G1, base fixed": "mjlab/asset_zoo/robots/unitree_g1/xmls/g1.xml",
+    "acrobot": "dm_control/suite/acrobot.xml",
+    "cart-pole": "dm_control/suite/cartpole.xml",
+}
+
+
 def models(folder: Path | None) -> dict[str, Any]:
     """Compiled models by name; those whose package is missing are left out."""
     import mujoco
 
     found = {"six axes": mujoco.MjModel.from_xml_string(six_axis.model_text())}
-    where = {
-        "Go1, base fixed": "mjlab/asset_zoo/robots/unitree_go1/xmls/go1.xml",
-        "G1, base fixed": "mjlab/asset_zoo/robots/unitree_g1/xmls/g1.xml",
-        "acrobot": "dm_control/suite/acrobot.xml",
-        "cart-pole": "dm_control/suite/cartpole.xml",
-    }
-    for name, path in where.items():
-        package, rest = path.split("/", 1)
-        spec = find_spec(package) if folder is None else None
-        root = Path(spec.origin).parent if spec and spec.origin else None
-        file = root / rest if root else (folder or Path()) / path
-        if file.is_file():
-            found[name] = _fixed(file)
+    for name, path in OF_OTHERS.items():
+        model = model_of_others(name, folder)
+        if model is None:
+            print(f"{name}: {path.split('/')[0]} is not installed")
         else:
-            print(f"{name}: {package} is not installed")
+            found[name] = model
     return found
+
+
+def model_of_others(name: str, folder: Path | None = None) -> Any | None:
+    """One of `OF_OTHERS`, compiled with its base fixed; None where it is missing."""
+    path = OF_OTHERS[name]
+    package, rest = path.split("/", 1)
+    spec = find_spec(package) if folder is None else None
+    root = Path(spec.origin).parent if spec and spec.origin else None
+    file = root / rest if root else (folder or Path()) / path
+    return _fixed(file) if file.is_file() else None
 
 
 def _fixed(file: Path) -> Any:
@@ -100,11 +110,11 @@ def measured(engine: Engine) -> dict[str, Any]:
     theta = np.asarray([group[0].get(model) for group in engine.constants])
     k = n + p
     x0 = np.zeros((WINDOWS, n))
-    x0[:, : model.nq] = inside = _inside(model)
+    x0[:, : model.nq] = rest = inside(model)
     t = SPAN * np.arange(WINDOWS * ROWS).reshape(WINDOWS, ROWS, 1)
     u = 0.2 * np.sin(2.0 * np.pi * rng.uniform(0.2, 1.0, m) * t)
     if m == model.nq:
-        u = u + inside  # servos
+        u = u + rest  # servos
     span = np.full((WINDOWS, ROWS), SPAN)
     at = Arguments(np.tile(theta, (WINDOWS, 1)), x0, u, span)
     eye = np.broadcast_to(np.eye(k), (WINDOWS, k, k))
@@ -128,7 +138,7 @@ def measured(engine: Engine) -> dict[str, Any]:
     }
 
 
-def _inside(model: Any) -> np.ndarray:
+def inside(model: Any) -> np.ndarray:
     """The file's position, off the stops of the joints."""
     low, high = model.jnt_range.T
     margin = 0.2 * (high - low)

@@ -45,6 +45,20 @@ SLOPES_OF_STEPS = (
         DIFFERENCES,
     ),
     Mutant(
+        "slopes: what cancels in free fall is no size",
+        BODY,
+        "size += np.einsum",
+        "size += 0.0 * np.einsum",
+        ("test_slopes.py", "free_fall"),
+    ),
+    Mutant(
+        "slopes: gravity that is switched off acts",
+        NUMBERS,
+        "np.zeros(3) if weightless else ",
+        "",
+        ("test_slopes.py", "free_fall"),
+    ),
+    Mutant(
         "slopes: whatever acts is taken for known",
         STEP,
         "(np.abs(left) <= LEFT_OVER * found.size).all(0)",
@@ -56,7 +70,7 @@ SLOPES_OF_STEPS = (
         "systems/plants/external.py",
         "@ S + C[:, k - first]",
         "@ (0.0 * S) + C[:, k - first]",
-        ("test_slopes.py", "linear_recursion"),
+        ("test_window_slopes.py", "window_is_differentiated"),
     ),
     Mutant(
         "slopes: dry friction has no regularisation of its own",

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 Table = Float[np.ndarray, "..."]
+NO_GRAVITY = 1 << 7
 
 
 class Numbers(NamedTuple):
@@ -91,13 +92,14 @@ def tree_of(model: Any) -> Tree | None:
 def numbers_of(model: Any) -> Numbers:
     """The numbers as they stand, in a model whose derived numbers are up to date."""
     drag, rate = _dry_friction(model)
+    weightless = model.opt.disableflags & NO_GRAVITY
     affine = np.asarray([[1.0, 0.0, 0.0], [1.0, 1.0, 1.0]])  # gains: fixed, affine
     return Numbers(
         _inertia(
             model.body_mass, model.body_ipos, model.body_iquat, model.body_inertia
         ),
         model.body_pos.copy(),
-        model.opt.gravity.copy(),
+        np.zeros(3) if weightless else model.opt.gravity.copy(),
         model.dof_armature.copy(),
         model.dof_damping.reshape(model.nv, -1)[:, 0].copy(),
         model.jnt_stiffness.reshape(model.njnt, -1)[:, 0].copy(),

@@ -48,7 +48,11 @@ class Forces(NamedTuple):
 
 
 class InverseDynamics(NamedTuple):
-    """Torques ``tau(q, v, a)`` and their derivatives; ``size`` is what they sum."""
+    """Torques ``tau(q, v, a)`` and their derivatives.
+
+    ``size`` is what they sum without signs: of a body in free fall weight and inertia
+    cancel, and the torques themselves are rounding.
+    """
 
     tau: Float[np.ndarray, "n B"]
     size: Float[np.ndarray, "n B"]
@@ -141,7 +145,7 @@ def forces(tree: Tree, inertia: Float[np.ndarray, "b 6 6"], at: Motion) -> Force
     return Forces(I, B2, F)
 
 
-def inverse_dynamics(tree: Tree, at: Motion, of: Forces) -> InverseDynamics:
+def inverse_dynamics(tree: Tree, at: Motion, of: Forces, a: Batch) -> InverseDynamics:
     """The torques of the links and their derivatives (armatures are not among them)."""
     n, _, B = at.S.shape
     tau, size = np.zeros((2, n, B))
@@ -165,6 +169,7 @@ def inverse_dynamics(tree: Tree, at: Motion, of: Forces) -> InverseDynamics:
             inert, gyro = rows[k]
             by_v[k, j] = dot(gyro, S) + 2.0 * dot(inert, P)
             by_q[k, j] = dot(inert, A) + dot(gyro, P)
+    size += np.einsum("ijB,jB->iB", np.abs(mass), np.abs(a))
     return InverseDynamics(tau, size, by_q, by_v, mass)
 
 

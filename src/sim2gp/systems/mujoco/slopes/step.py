@@ -91,7 +91,7 @@ def _smooth(
     model, tree, has, by = of
     at = rigid_body.motion(tree, has, q, v, a)
     bodies = rigid_body.forces(tree, has.inertia, at)
-    links = rigid_body.inverse_dynamics(tree, at, bodies)
+    links = rigid_body.inverse_dynamics(tree, at, bodies, a)
     acts, drives = actuation.torques(model, tree, has, q, v, after, u)
     rotor = has.armature[:, None] * a
     size = links.size + acts.size + np.abs(rotor) + has.frictionloss[:, None]
@@ -154,7 +154,7 @@ def _sticking(
     still = has._replace(gravity=np.zeros(3))
     moved = rigid_body.motion(of.tree, still, q, np.zeros_like(v), -lag)
     bodies = rigid_body.forces(of.tree, has.inertia, moved)
-    by_q = rigid_body.inverse_dynamics(of.tree, moved, bodies).by_q
+    by_q = rigid_body.inverse_dynamics(of.tree, moved, bodies, -lag).by_q
     by_c = np.zeros_like(at.by_c)
     for i, change in enumerate(by):
         by_c[:, i] = -change.armature[:, None] * lag + h * at.late_by_c[:, i] * a
