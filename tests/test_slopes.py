@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-import six_axis
+import servo_arm
 from sim2gp import Parameter
 from sim2gp.systems import MuJoCo
 from sim2gp.systems.mujoco.engine import Engine
@@ -152,7 +152,7 @@ def test_contacts_and_limits_are_left_to_differences():
     assert np.allclose(J[0, :, 2:6], A, atol=1e-4)
 
 
-@pytest.mark.parametrize("text", [tree("implicitfast"), six_axis.model_text()])
+@pytest.mark.parametrize("text", [tree("implicitfast"), servo_arm.model_text()])
 def test_whole_windows_are_one_linear_recursion(text):
     constants = ["joint/*/damping", "joint/*/armature", "body/*/mass", FRICTION]
     engine, theta = opened(text, constants)
