@@ -27,7 +27,7 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
-import six_axis  # noqa: E402
+import servo_arm  # noqa: E402
 
 #: What is open, and how far the truth lies from the file, in log units.
 OPEN = (
@@ -52,7 +52,7 @@ def truth(seed: int) -> dict[str, float]:
 def nominal(path: str) -> float:
     """The file's number."""
     _, name, quantity = path.split("/")
-    link = six_axis.LINKS[int(name[-1]) - 1]
+    link = servo_arm.LINKS[int(name[-1]) - 1]
     return float(
         link[{"mass": 0, "damping": 5, "armature": 6, "frictionloss": 7}[quantity]]
     )
@@ -65,10 +65,10 @@ def by_sysid(folder: Path, delay: float) -> dict[str, tuple[float, float]]:
 
     table = np.loadtxt(folder / "log.csv", delimiter=",", skiprows=1)
     spec = mujoco.MjSpec.from_file(str(folder / "arm.xml"))
-    model, time_, period = spec.compile(), table[:, 0], six_axis.PERIOD
+    model, time_, period = spec.compile(), table[:, 0], servo_arm.PERIOD
     late = round(delay / period)
     u = table[np.maximum(np.arange(len(table)) - late, 0), 7:]
-    joints = [(name, sysid.SignalType.MjStateQPos) for name in six_axis.NAMES]
+    joints = [(name, sysid.SignalType.MjStateQPos) for name in servo_arm.NAMES]
     measured = sysid.TimeSeries.from_names(time_, table[:, 1:7], model, joints)
     start = sysid.create_initial_state(model, table[0, 1:7], np.zeros(6))
     control = sysid.TimeSeries(time_, u)
@@ -96,7 +96,7 @@ def _change(path: str) -> Any:
     def modifier(spec: Any, parameter: Any) -> None:
         value = float(parameter.value[0])
         if kind == "body":
-            body, link = spec.body(name), six_axis.LINKS[int(name[-1]) - 1]
+            body, link = spec.body(name), servo_arm.LINKS[int(name[-1]) - 1]
             body.mass, body.inertia = value, np.asarray(link[2]) * value / link[0]
         elif quantity == "damping":
             spec.joint(name).damping = [value, 0.0, 0.0]
@@ -108,15 +108,15 @@ def _change(path: str) -> Any:
 
 def write(folder: Path, seconds: float, seed: int, delay: float) -> None:
     """The arm, its log and its project."""
-    (folder / "arm.xml").write_text(six_axis.model_text())
-    six_axis.record(
+    (folder / "arm.xml").write_text(servo_arm.model_text())
+    servo_arm.record(
         folder / "log.csv",
         seconds=seconds,
         seed=seed,
         delay=delay,
         values=truth(seed),
     )
-    project = six_axis.project_text(["log.csv"], constants=OPEN)
+    project = servo_arm.project_text(["log.csv"], constants=OPEN)
     (folder / "arm.toml").write_text(project)
     told = project.replace("{low = 0.0, high = 0.03}\ntie = true", f"{delay}")
     (folder / "told.toml").write_text(told)

@@ -28,7 +28,7 @@ from sim2gp.systems.plants.external import AbstractSimulator, Arguments
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
-import six_axis  # noqa: E402
+import servo_arm  # noqa: E402
 
 WINDOWS, ROWS, SPAN = 10, 200, 0.005
 SERVO = "joint/*/damping", "joint/*/armature", "joint/*/frictionloss", "body/*/mass"
@@ -47,7 +47,7 @@ def models(folder: Path | None) -> dict[str, Any]:
     """Compiled models by name; those whose package is missing are left out."""
     import mujoco
 
-    found = {"six axes": mujoco.MjModel.from_xml_string(six_axis.model_text())}
+    found = {"six axes": mujoco.MjModel.from_xml_string(servo_arm.model_text())}
     for name, path in OF_OTHERS.items():
         model = model_of_others(name, folder)
         if model is None:

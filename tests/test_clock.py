@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import six_axis
+import servo_arm
 from sim2gp.data.clock import (
     clock_lines,
     clock_warnings,
@@ -33,7 +33,7 @@ SERVO = (
 
 
 def arm(step: float) -> MuJoCo:
-    text = six_axis.model_text(step)
+    text = servo_arm.model_text(step)
     paths = [f"joint/joint{k}/damping" for k in range(1, 7)]
     return MuJoCo(mujoco.MjModel.from_xml_string(text), paths)
 
@@ -41,7 +41,7 @@ def arm(step: float) -> MuJoCo:
 def log_of(period: float, rows: int = 101) -> Log:
     """Targets that change at every row; what is measured does not matter."""
     time, rng = period * np.arange(rows), np.random.default_rng(3)
-    y = {name: np.sin(3.0 * time) for name in six_axis.NAMES}
+    y = {name: np.sin(3.0 * time) for name in servo_arm.NAMES}
     u = {f"servo{k}": rng.uniform(-0.3, 0.3, rows) for k in range(1, 7)}
     return Log("a", "a.csv", time, y, u, dict.fromkeys(y, time >= 0))
 
@@ -88,13 +88,13 @@ def test_delayed_inputs_arrive_in_the_steps_of_mujoco(
     run = likelihood.trial(
         np.asarray(tt), np.zeros(windows.start.shape), np.eye(len(tt))
     )
-    model = mujoco.MjModel.from_xml_string(six_axis.model_text(step))
+    model = mujoco.MjModel.from_xml_string(servo_arm.model_text(step))
     model.opt.timestep = h = step_between(period, step)
     data, cost = mujoco.MjData(model), np.zeros(6)
     data.qpos[:], data.qvel[:] = np.split(np.asarray(windows.start)[0], 2)
     u = log.commanded([c.name for c in machine.actions])
     rows = int(np.asarray(windows.mask)[0].any(axis=1).sum())
-    y = log.measured(six_axis.NAMES)[0]
+    y = log.measured(servo_arm.NAMES)[0]
     for k in range(rows):
         cost += (data.qpos - y[k]) ** 2
         for i in range(round(period / h)):
@@ -162,7 +162,7 @@ def test_forecasts_take_the_steps_of_the_fit() -> None:
 def test_windows_of_two_periods_are_two_calls() -> None:
     """Oracle: each by itself, row by row."""
     engine, rng = arm(0.005).engine, np.random.default_rng(1)
-    theta = np.tile([x[5] for x in six_axis.LINKS], (3, 1)).astype(float)
+    theta = np.tile([x[5] for x in servo_arm.LINKS], (3, 1)).astype(float)
     x0, u = 0.1 * rng.normal(size=(3, 12)), 0.1 * rng.normal(size=(3, 8, 6))
     span = np.full((3, 8), 0.005)
     span[1] = 0.004

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import six_axis
+import servo_arm
 from linear_system import linear, windows_of
 from sim2gp.cli import main
 from sim2gp.data.windows_likelihood import WindowsLikelihood
@@ -126,9 +126,9 @@ def six_axis_project(folder: Path, seconds: float = 3.0) -> Any:
     kinds = "damping", "armature", "frictionloss"
     joints = [f"joint/joint{k}/{x}" for k in range(1, 7) for x in kinds]
     masses = [f"body/link{k}/mass" for k in range(1, 7)]
-    (folder / "arm.xml").write_text(six_axis.model_text())
-    six_axis.record(folder / "log.csv", seconds=seconds, delay=0.01)
-    text = six_axis.project_text(["log.csv"], constants=[*joints, *masses])
+    (folder / "arm.xml").write_text(servo_arm.model_text())
+    servo_arm.record(folder / "log.csv", seconds=seconds, delay=0.01)
+    text = servo_arm.project_text(["log.csv"], constants=[*joints, *masses])
     (folder / "arm.toml").write_text(text)
     project = load_project(folder / "arm.toml")
     return project, project.load_logs()
@@ -141,7 +141,7 @@ def test_the_first_link_of_an_arm_is_held(tmp_path: Path) -> None:
     found = select_constants(project, logs, until=np.inf)
     assert [*found.held] == ["body/link1/mass"]
     assert found.held["body/link1/mass"] > 0.99
-    mass, about_z = six_axis.LINKS[0][0], six_axis.LINKS[0][2][2]
+    mass, about_z = servo_arm.LINKS[0][0], servo_arm.LINKS[0][2][2]
     assert found.stands_for == {
         "joint/joint1/armature": {"body/link1/mass": pytest.approx(about_z / mass)}
     }

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import six_axis
+import servo_arm
 from sim2gp.data.split_log import cut
 from sim2gp.data.window_slopes import HostRun
 from sim2gp.data.windows_likelihood import _About
@@ -144,7 +144,7 @@ def no_differences(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("integrator", [EULER, IMPLICIT_FAST])
 @pytest.mark.parametrize(
     "text",
-    [CARTPOLE, ACROBOT, six_axis.model_text(), tree("Euler")],
+    [CARTPOLE, ACROBOT, servo_arm.model_text(), tree("Euler")],
     ids=["cart-pole", "acrobot", "arm", "tree"],
 )
 def test_a_window_is_differentiated_as_its_differences_are(text, integrator):
@@ -173,10 +173,10 @@ def test_so_is_one_in_steps_of_runge_and_kutta(name):
 @in_float64
 def test_the_likelihood_of_logs_has_the_slopes_of_its_own_simulation(tmp_path):
     """In virtual constants and starts, one delay of all drives among the constants."""
-    (tmp_path / "arm.xml").write_text(six_axis.model_text())
-    six_axis.record(tmp_path / "log.csv", seconds=1.0, delay=0.01)
+    (tmp_path / "arm.xml").write_text(servo_arm.model_text())
+    servo_arm.record(tmp_path / "log.csv", seconds=1.0, delay=0.01)
     constants = ["joint/*/armature", "joint/*/frictionloss", "body/*/mass"]
-    text = six_axis.project_text(["log.csv"], constants=constants)
+    text = servo_arm.project_text(["log.csv"], constants=constants)
     (tmp_path / "arm.toml").write_text(text.replace("window = 1.0", "window = 0.5"))
     project = load_project(tmp_path / "arm.toml")
     system = project.build_system()
@@ -265,7 +265,7 @@ def mjx_slopes(model: Any, fields: tuple[str, ...], at: Arguments) -> np.ndarray
     [
         (CARTPOLE, ("dof_damping", "dof_frictionloss")),
         (ACROBOT, ("dof_damping", "dof_armature")),
-        (six_axis.model_text(), ("dof_damping", "dof_frictionloss")),
+        (servo_arm.model_text(), ("dof_damping", "dof_frictionloss")),
     ],
     ids=["cart-pole", "acrobot", "arm"],
 )
