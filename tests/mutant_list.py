@@ -58,7 +58,7 @@ WHITEN = "solve_triangular(noise_scale, block, lower=True)"
 EVIDENCE = "return -0.5 * full[:, -1] @ full[:, -1] - log_det"
 RESIDUAL = "jnp.where(valid, value - s2[:d], 0.0)"
 POSTERIOR = "        found.posterior,\n"
-BOX = "low + (high - low) * jax.nn.sigmoid(t), low, high"
+BOX = "low + (high - low) * sigmoid(t), low, high"
 HESSIAN = """        Gaussian(
             found.posterior.mean,
             model.prior.scale
@@ -106,11 +106,11 @@ MUTANTS = (
         BOX.replace("(high - low)", "high").replace(", low, high", ", low, low + high"),
         BOUNDS,
     ),
-    Mutant("box not clamped", MAPS, f"jnp.clip({BOX})", BOX.split(",")[0], BOUNDS),
+    Mutant("box not clamped", MAPS, f"xp.clip({BOX})", BOX.split(",")[0], BOUNDS),
     Mutant(
         "log box without its exponential",
         MAPS,
-        "jnp.exp(np.log(low) + span",
+        "xp.exp(np.log(low) + span",
         "(np.log(low) + span",
         BOUNDS,
     ),
