@@ -64,11 +64,13 @@ def model_of_others(name: str, folder: Path | None = None) -> Any | None:
     spec = find_spec(package) if folder is None else None
     root = Path(spec.origin).parent if spec and spec.origin else None
     file = root / rest if root else (folder or Path()) / path
-    return _fixed(file) if file.is_file() else None
+    return fixed(file).compile() if file.is_file() else None
 
 
-def _fixed(file: Path) -> Any:
-    """Without its free joint; servos and friction where the file has no actuators."""
+def fixed(file: Path) -> Any:
+    """A model to be compiled, without its free joint; servos and friction where the
+    file has no actuators.
+    """
     import mujoco
 
     spec = mujoco.MjSpec.from_file(str(file))
@@ -86,7 +88,7 @@ def _fixed(file: Path) -> Any:
             servo.set_to_position(kp=100.0, kv=3.0)
     for key in list(spec.keys):
         spec.delete(key)
-    return spec.compile()
+    return spec
 
 
 def opened(model: Any) -> Engine:

@@ -192,10 +192,12 @@ def test_the_likelihood_of_logs_has_the_slopes_of_its_own_simulation(tmp_path):
 
     slopes = run(np.zeros(k)).slopes()
     for i in range(k):
-        up, down = (run(x).states for x in STEPS[0] * np.eye(k)[i] * [[1.0], [-1.0]])
-        expected = (up - down) / (2.0 * STEPS[0])
+        # A delayed input is a difference of integrals: it has more rounding.
+        step = STEPS[1] if i == k - 1 else STEPS[0]
+        up, down = (run(x).states for x in step * np.eye(k)[i] * [[1.0], [-1.0]])
+        expected = (up - down) / (2.0 * step)
         size, error = (np.abs(x).max() for x in (expected, slopes[..., i] - expected))
-        assert error <= SAME * size + ROUNDING / STEPS[0], (i, error, size)
+        assert error <= SAME * size + ROUNDING / step, (i, error, size)
 
 
 def test_where_contacts_come_and_go_each_step_is_as_mujoco_has_it():

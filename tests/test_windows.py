@@ -275,7 +275,7 @@ def test_delayed_inputs_of_numpy_are_those_of_jax(short: Log) -> None:
     system = free_parts(pendulum(), [Delay("voltage")])
     windows, _ = cut([short], system, window=0.1)
     held = windows.span[1], windows.knots[1], windows.area[1]
-    one, blur = stretch.HeldInputs(*held), stretch.DELAY_BLUR
+    one, blur = stretch.HeldInputs(*held), system.delay_blur
     with jax.enable_x64(True):
         of = stretch.HeldInputs(*map(jnp.asarray, held))
         for late in ([0.0], [0.004], [0.0137]):

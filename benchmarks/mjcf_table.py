@@ -1,0 +1,154 @@
+"""From an MJCF file and a log to a posterior: how long it takes, by number of joints.
+
+    python benchmarks/mjcf_table.py [NAME ...] [--models FOLDER] [--out DIR]
+
+Arms of 2, 3, 6, 7 and 12 joints with position servos (12: two arms side by side), and
+the G1 humanoid of `mjlab` with its base fixed, where that is installed. C MuJoCo
+records 10 s at 200 Hz, with encoders of 1e-3 rad. Then `sim2gp init` and `sim2gp
+identify --quick` run as whole commands, with what they open by themselves: seconds,
+seconds until the first answer is written, the largest memory, and how many of the open
+constants have the file's value inside their 95 % intervals. Each model compiles what
+the models before it have not. Writes `mjcf_table.json` and prints a table.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "benchmarks")]
+from mujoco_slopes import OF_OTHERS, fixed  # noqa: E402
+
+import servo_arm  # noqa: E402
+
+ARMS: dict[str, dict[str, Any]] = {
+    "2 joints": {"links": servo_arm.LINKS[1:3]},
+    "3 joints": {"links": servo_arm.LINKS[:3]},
+    "6 joints": {},
+    "7 joints": {"links": (*servo_arm.LINKS[:2], servo_arm.ROLL, *servo_arm.LINKS[2:])},
+    "12 joints": {"arms": 2},
+}
+HUMANOID = "29 joints (G1)"
+LIMIT = 1200.0  # s, of one command
+
+
+def text_of(name: str, folder: Path) -> str | None:
+    """The model as MJCF; None where its package is missing."""
+    if name != HUMANOID:
+        return servo_arm.model_text(**ARMS[name])
+    file = folder / OF_OTHERS["G1, base fixed"]
+    if not file.is_file():
+        return None
+    spec = fixed(file)
+    for thing in (*spec.geoms, *spec.meshes, *spec.sensors):
+        spec.delete(thing)  # its meshes are not in the folder, its inertias are
+    spec.compile()
+    text: str = spec.to_xml()
+    return text
+
+
+def write(folder: Path, text: str) -> Any:
+    """Model and log, whose columns have the names of joints and actuators."""
+    import mujoco
+
+    (folder / "robot.xml").write_text(text)
+    model = mujoco.MjModel.from_xml_string(text)
+    log = folder / "log.csv"
+    servo_arm.record(log, model, seconds=10.0)
+    head, rest = log.read_text().split("\n", 1)
+    names = [model.actuator(k).name for k in range(model.nu)]
+    columns = [*head.split(",")[: -model.nu], *names]
+    log.write_text(",".join(columns) + "\n" + rest)
+    return mujoco.MjModel.from_xml_string(text)
+
+
+def timed(folder: Path, args: list[str], watched: Path | None = None) -> dict[str, Any]:
+    """Seconds of a command, until a file was there, and its largest memory in MiB."""
+    started, seen, usage = time.perf_counter(), None, None
+    command = [sys.executable, "-c", "from sim2gp.cli import main; main()", *args]
+    with (folder / "said.txt").open("w") as said:
+        child = subprocess.Popen(command, cwd=folder, stdout=said, stderr=said)
+    while usage is None:
+        time.sleep(0.02)
+        if seen is None and watched is not None and watched.exists():
+            seen = time.perf_counter() - started
+        pid, status, found = os.wait4(child.pid, os.WNOHANG)
+        usage = found if pid else None
+        if not pid and time.perf_counter() - started > LIMIT:
+            child.kill()
+    if status:
+        raise SystemExit(f"{' '.join(args)}\n{(folder / 'said.txt').read_text()}")
+    out = {"seconds": round(time.perf_counter() - started, 1)}
+    if seen is not None:
+        out["first"] = round(seen, 1)
+    return out | {"memory": round(usage.ru_maxrss / 1024)}
+
+
+def row(name: str, text: str) -> dict[str, Any]:
+    """One model, through both commands."""
+    from sim2gp.systems.mujoco.constants import constants_of
+
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        model = write(folder, text)
+        out: dict[str, Any] = {"model": name, "joints": model.nv}
+        out["init"] = timed(folder, ["init", "robot.xml", "log.csv"])
+        first = folder / "run-first" / "summary.json"
+        identify = ["identify", "robot.toml", "--quick", "--out", "run"]
+        out["identify"] = timed(folder, identify, first)
+        summary = json.loads((folder / "run" / "summary.json").read_text())
+        known = {c.path: float(c.get(model)) for c in constants_of(model).values()}
+        found = {k: v for k, v in summary["parameters"].items() if k in known}
+        inside = [v["q025"] <= known[k] <= v["q975"] for k, v in found.items()]
+        out |= {"parameters": len(summary["parameters"]), "constants": len(found)}
+        return out | {"inside": int(np.sum(inside))}
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """As Markdown."""
+    lines = [
+        "| model | parameters | `init` | first answer | posterior | memory |",
+        "|---|---|---|---|---|---|",
+    ]
+    for x in rows:
+        fit = x["identify"]
+        first = f"{fit['first']:.0f} s" if "first" in fit else "-"
+        lines.append(
+            f"| {x['model']} | {x['parameters']} | {x['init']['seconds']:.0f} s "
+            f"| {first} | {fit['seconds']:.0f} s | {fit['memory'] / 1024:.1f} GiB |"
+        )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Measure the models asked for, and write them down."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*", default=[*ARMS, HUMANOID])
+    parser.add_argument("--models", type=Path, default=Path())
+    parser.add_argument("--out", type=Path, default=ROOT / "results")
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as cache:
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = cache
+        os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+        rows = []
+        for name in given.names:
+            if (text := text_of(name, given.models)) is None:
+                print(f"{name}: mjlab is not installed")
+                continue
+            rows.append(row(name, text))
+            print(json.dumps(rows[-1]), flush=True)
+    given.out.mkdir(exist_ok=True)
+    (given.out / "mjcf_table.json").write_text(json.dumps(rows, indent=1) + "\n")
+    print(table(rows))
+
+
+if __name__ == "__main__":
+    main()
