@@ -165,9 +165,9 @@ FIRST_DRAFT = (
     ),
     Mutant(
         "a step a little too long is two",
-        "systems/mujoco/engine.py",
-        "/ step - STEP_TOLERANCE)",
-        "/ step - 1e-9)",
+        "systems/base.py",
+        "/ longest - STEP_TOLERANCE)",
+        "/ longest - 1e-9)",
         ("test_clock.py", "little_longer"),
     ),
     Mutant(

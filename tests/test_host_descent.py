@@ -231,7 +231,7 @@ def test_a_large_first_noise_does_not_end_a_descent():
     prior, found = Gaussian(jnp.zeros(2), jnp.eye(2)), []
     for first in (1e3, 1e-3):
         noise = Noise(jnp.full(1, first), jnp.ones(1))
-        about = np.zeros(2), np.eye(2), noise
+        about = np.zeros(2), np.zeros((1, 0)), noise
         likelihood = LinearLikelihood(counts, floor, at, *about)
         known = ParameterPrior(prior, Parameters(PAIR))
         found.append(estimate(likelihood, known, starts=jnp.zeros((1, 2)), rounds=0))

@@ -106,10 +106,10 @@ def test_a_likelihood_linearised_once_is_the_linear_one_everywhere() -> None:
     windows = windows_of(J, y, np.zeros(4, int))
     true = WindowsLikelihood(linear(3, 2), windows)
     n, W = true.n_nuisances, len(windows)
-    L0, tt = np.tril(rng.normal(size=(3, 3))) + 2.0 * np.eye(3), rng.normal(size=3)
-    at = true.blocks(jnp.asarray(tt), jnp.zeros((W, n)), jnp.asarray(L0))
+    tt, e0 = rng.normal(size=3), rng.normal(size=(W, n))
+    at = np.asarray(true.blocks(jnp.asarray(tt), jnp.asarray(e0), jnp.eye(3)))
     noise = Noise(jnp.ones(2), jnp.ones(W))
-    once = LinearLikelihood(true.counts, true.floor, np.asarray(at), tt, L0, noise)
+    once = LinearLikelihood(true.counts, true.floor, at, tt, e0, noise)
     assert once.n_nuisances == n
     e, scale = rng.normal(size=(W, n)), rng.normal(size=(3, 3))
     elsewhere = tt + rng.normal(size=3)

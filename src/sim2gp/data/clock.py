@@ -6,14 +6,13 @@ of gain ``kp`` act as if its damping were ``kp h / 2`` smaller. So jitter of the
 must not become jitter of the steps: stamps of an even clock are taken as even.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from sim2gp.data.logs import Log
-from sim2gp.systems.base import STEP_TOLERANCE, AbstractSystem
+from sim2gp.systems.base import AbstractSystem, steps_in
 
 EVEN = 0.1  # periods that a stamp of an even clock may be off
 PARTS = 10  # of a period, that stamps of another clock are rounded to
@@ -24,7 +23,7 @@ SAME = 1e-3  # of two steps, relative
 
 def step_between(gap: float, longest: float) -> float:
     """The length of the equal steps in a gap between two rows, all in s."""
-    return gap / max(1, math.ceil(gap / longest - STEP_TOLERANCE))
+    return gap / int(steps_in(gap, longest))
 
 
 def on_even_clock(log: Log, system: AbstractSystem) -> Log:

@@ -17,15 +17,15 @@ from sim2gp.data.clock import on_even_clock
 from sim2gp.data.logs import Log
 from sim2gp.data.windows import Windows
 from sim2gp.errors import InputError
-from sim2gp.systems.base import DELAY_BLUR, STEP_TOLERANCE, AbstractSystem, index_of
+from sim2gp.systems.base import DELAY_BLUR, AbstractSystem, index_of, steps_in
 
 HALF_WIDTH = 0.025  # s, half the span of the local parabola that guesses a start
 PAST = 0.049  # s, the span of the causal one: 25 samples of 2 ms
 SPACING = 0.1  # s, between the starts of forecasts
 #: A start's unmeasured rate may lie so many times its rms away, or what slopes over
 #: different times differ by. A servo forgets its start's rate at once: only this prior
-#: keeps it from where forces saturate, where a simulation jumps (of 10 windows of an
-#: arm's log, one began there with 10 in place of 3, and its constants followed).
+#: keeps it from where forces saturate, where a simulation jumps (with 10 in place of 3
+#: one of the thirty windows of an arm's log began there, and its constants followed).
 FAR = 3.0
 Start = Literal["smoothed", "causal"]
 
@@ -227,7 +227,7 @@ def _steps(
     Returns each stamp's place among the steps' ends, and the steps' lengths.
     """
     gaps = np.round(np.diff(time), 9)  # those that are equal differ by rounding
-    count = np.maximum(1, np.ceil(gaps / longest - STEP_TOLERANCE)).astype(int)
+    count = steps_in(gaps, longest)
     place = np.concatenate([[0], np.cumsum(count)])
     return place, np.repeat(gaps / count, count)
 

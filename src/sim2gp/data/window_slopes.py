@@ -88,18 +88,6 @@ class HostRun:
         return found
 
 
-def slopes_on_host(
-    simulator: AbstractSimulator,
-    asked: AbstractAsked,
-    windows: Windows,
-    e: Float[Array, "W n"],
-    k: int,
-) -> tuple[Float[Array, "W L n"], Float[Array, "W L n k"]]:
-    """The same of all windows, by a simulator on the host. Call it in float64."""
-    run = HostRun(simulator, asked, windows, e, k)
-    return jnp.asarray(run.states), jnp.asarray(run.slopes())
-
-
 @eqx.filter_jit
 def _delays(
     asked: AbstractAsked, windows: Windows, e: Array, k: int
@@ -125,8 +113,7 @@ def _inputs(
         none = np.zeros((*windows.span.shape, 0))
         return none, none
     blur = blur_of(system)
-    held = map(np.asarray, (windows.span, windows.knots, windows.area))
-    pairs = [(HeldInputs(*x), delays) for *x, delays in zip(*held, late, strict=True)]
+    pairs = list(zip(windows.held(), late, strict=True))
     u = np.stack([inputs_of(*pair, blur) for pair in pairs])
     if not blur:
         return u, np.zeros_like(u)

@@ -46,6 +46,11 @@ class Windows(HeldInputs):
         )
         return chosen
 
+    def held(self) -> list[HeldInputs]:
+        """The inputs of each window alone, as NumPy's arrays."""
+        parts = map(np.asarray, (self.span, self.knots, self.area))
+        return [HeldInputs(*rows) for rows in zip(*parts, strict=True)]
+
     def each(self, f: Callable[..., Any], *per_window: Any) -> Any:
         """``f`` of one window (and of one row of each argument), for all windows."""
         axes = eqx.tree_at(lambda w: w.floor, jax.tree.map(lambda _: 0, self), None)

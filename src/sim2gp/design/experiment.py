@@ -22,9 +22,9 @@ from sim2gp.inference.linalg import triangular
 from sim2gp.inference.linearized import value_and_jacobian
 from sim2gp.systems.base import (
     DELAY_BLUR,
-    STEP_TOLERANCE,
     WINDOW_SUBSTEP,
     AbstractSystem,
+    steps_in,
 )
 from sim2gp.systems.simulate import HeldInputs, simulate
 
@@ -74,7 +74,7 @@ class Experiment(eqx.Module):
     @property
     def substeps(self) -> int:
         """Of the integration, in a period."""
-        return max(1, math.ceil(self.period / self.substep - STEP_TOLERANCE))
+        return int(steps_in(self.period, self.substep))
 
     @property
     def plausible(self) -> Gaussian:

@@ -33,7 +33,7 @@ from sim2gp.compilation import compile_async
 from sim2gp.data.grid import PERIOD, Grid
 from sim2gp.data.window_slopes import (
     AbstractAsked,
-    slopes_on_host,
+    HostRun,
     states_and_slopes,
 )
 from sim2gp.data.windows import Windows
@@ -139,8 +139,8 @@ def _forecast_on_host(
     windows: Windows,
 ) -> tuple[Array, Array, Array, Array]:
     asked, k = _From(system, posterior), _directions(posterior, windows)
-    args = simulator, asked, windows, windows.start, k
-    return _all_parts(windows, *slopes_on_host(*args))
+    run = HostRun(simulator, asked, windows, windows.start, k)
+    return _all_parts(windows, jnp.asarray(run.states), jnp.asarray(run.slopes()))
 
 
 class _From(AbstractAsked):

@@ -1,53 +1,59 @@
 """A likelihood linearised once: the same fit, without a simulator.
 
-    r(z, e) = r0 + J_e e + J_z (z - z0)
+    r(tt, e) = r0 + J_e (e - e0) + J_tt (tt - tt0)
 
-From the factors of ``[J_e J_z r0]`` at one point, as any likelihood gives them
+From the factors of ``[J_e J_tt r0]`` at one point, as any likelihood gives them
 (`sim2gp.inference.likelihood`), follow those at any other. `estimate` of it is exact
 linear regression with unknown noise: what one linearisation of the data says.
 """
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from sim2gp.inference.arrowhead import Blocks, Noise
 from sim2gp.inference.likelihood import AbstractLikelihood, Trial
+from sim2gp.inference.linalg import library
+from sim2gp.types import AnyArray
 
 
 class LinearLikelihood(AbstractLikelihood):
-    """``at`` are the factors at virtual parameters ``tt`` and nuisances of zero.
+    """``base`` are the factors at virtual parameters ``tt0`` and nuisances ``e0``.
 
-    ``scale`` are the directions of their ``J_z``, a square matrix; ``noise`` is the
-    first one of a fit.
+    Its derivatives are those in ``tt`` itself; ``noise`` is the first one of a fit. Of
+    NumPy's arrays the fit is one of the host: there is nothing to compile.
     """
 
-    counts: Float[Array, "W c"]
-    floor: Float[Array, " c"]
-    at: Float[np.ndarray, "W c k k"]
-    tt: Float[np.ndarray, " p"]
-    scale: Float[np.ndarray, "p p"]
+    counts: Float[AnyArray, "W c"]
+    floor: Float[AnyArray, " c"]
+    base: Blocks
+    tt0: Float[AnyArray, " p"]
+    e0: Float[AnyArray, "W n"]
     noise: Noise
 
     @property
     def n_nuisances(self) -> int:
-        return int(self.at.shape[-1] - len(self.tt) - 1)
+        return int(self.e0.shape[1])
 
     @property
     def on_host(self) -> bool:
-        return True  # NumPy: there is nothing to compile
+        return library(self.base) is np
 
     def first_noise(self) -> Noise:
         return self.noise
 
     def blocks(
         self,
-        tt: Float[Array, " p"],
-        e: Float[Array, "W n"],
-        scale: Float[Array, "p p"],
+        tt: Float[AnyArray, " p"],
+        e: Float[AnyArray, "W n"],
+        scale: Float[AnyArray, "p p"],
     ) -> Blocks:
-        trial = self.trial(*map(np.asarray, (tt, e, scale)))
-        return jnp.asarray(trial.blocks())
+        xp, n = library(self.base, tt, e), self.n_nuisances
+        away = xp.broadcast_to(tt - self.tt0, (len(e), tt.size))
+        step = xp.concatenate([e - self.e0, away], axis=1)
+        moved = xp.einsum("wckj,wj->wck", self.base[..., :-1], step)
+        own, shared, r = self.base[..., :n], self.base[..., n:-1], self.base[..., -1]
+        rows = [own, shared @ scale, (r + moved)[..., None]]
+        return xp.concatenate(rows, axis=-1)
 
     def trial(
         self,
@@ -55,13 +61,5 @@ class LinearLikelihood(AbstractLikelihood):
         e: Float[np.ndarray, "W n"],
         scale: Float[np.ndarray, "p p"],
     ) -> Trial:
-        n = self.n_nuisances
-        own, shared = self.at[..., :n], self.at[..., n:-1]
-        moved = shared @ np.linalg.solve(self.scale, tt - self.tt)
-        r = self.at[..., -1] + moved + np.einsum("wcij,wj->wci", own, e)
-
-        def blocks() -> Float[np.ndarray, "W c k k"]:
-            turned = shared @ np.linalg.solve(self.scale, scale)
-            return np.concatenate([own, turned, r[..., None]], axis=-1)
-
-        return Trial(np.sum(r**2, axis=-1), blocks)
+        found = np.asarray(self.blocks(tt, e, scale))
+        return Trial(np.sum(found[..., -1] ** 2, axis=-1), lambda: found)

@@ -115,25 +115,20 @@ def draft_project(asked: Request) -> Draft:
         max(float(np.ptp(log.time)) for log in logs), clock_lines(logs, system),
         mended,
     )  # fmt: skip
-    project, logs = _placed(asked, draft_text(contents))
-    if asked.readings and is_model(asked.model):
-        limit = asked.started, asked.seconds
-        selection, why = try_selection(project, logs, *limit)
-        contents = replace(contents, selection=selection, unselected=why)
-        _placed(asked, draft_text(contents))
-    return Draft(system, draft_text(contents), said, found, contents.selection)
-
-
-def _placed(asked: Request, text: str) -> tuple[Project, list[Log]]:
-    """The file in its place, once it was loaded with its logs."""
-    read: list[tuple[Project, list[Log]]] = []
+    text, ready = draft_text(contents), []
 
     def check(project: Project) -> None:
         project = replace(project, budget=asked.budget)
-        read.append((project, [*project.load_logs()]))
+        ready.append((project, project.load_logs()))
 
     replace_project(asked.out, text, check)
-    return read[0]
+    if asked.readings and is_model(asked.model):
+        limit = asked.started, asked.seconds
+        selection, why = try_selection(*ready[0], *limit)
+        contents = replace(contents, selection=selection, unselected=why)
+        text = draft_text(contents)
+        replace_project(asked.out, text, lambda _: None)
+    return Draft(system, text, said, found, contents.selection)
 
 
 def _machine(asked: Request) -> AbstractSystem:

@@ -85,7 +85,7 @@ def _linearised(
     until: float,
 ) -> LinearLikelihood:
     """The likelihood of these windows about the prior's mean."""
-    tt, scale = np.asarray(prior.mean), np.asarray(prior.scale)
+    tt = np.asarray(prior.mean)
     parts, seconds = [], 0.0
     for which in batches:
         started = time.monotonic()
@@ -94,15 +94,15 @@ def _linearised(
         part = likelihood.some(which)
         e = np.zeros((len(which), part.n_nuisances))
         with np.errstate(over="ignore", invalid="ignore"):
-            parts.append(part.trial(tt, e, scale).blocks())
+            parts.append(part.trial(tt, e, np.eye(tt.size)).blocks())
         seconds = time.monotonic() - started
     blocks, which = np.concatenate(parts), batches.ravel()
     if not np.isfinite(blocks).all():
         raise _not_finite()
     # The first noise of a fit is that of all windows: a large one.
     noise = Noise(likelihood.first_noise().sd, jnp.ones(len(which)))
-    counts = likelihood.counts[which]
-    return LinearLikelihood(counts, likelihood.floor, blocks, tt, scale, noise)
+    counts, e = likelihood.counts[which], np.zeros((len(which), likelihood.n_nuisances))
+    return LinearLikelihood(counts, likelihood.floor, blocks, tt, e, noise)
 
 
 def _not_finite() -> NotFinite:

@@ -26,9 +26,10 @@ from jaxtyping import Float
 from sim2gp.data.logs import Column, Log
 from sim2gp.data.logs.units import factor
 from sim2gp.data.split_log import cut
-from sim2gp.data.windows import Windows, motion
+from sim2gp.data.windows import motion
 from sim2gp.systems import MuJoCo
 from sim2gp.systems.base import AbstractSystem
+from sim2gp.systems.simulate import inputs_of
 from sim2gp.types import in_float64
 
 SURE = 3.0  # (windows won - windows lost) / sqrt(windows): the sign test's z
@@ -188,7 +189,8 @@ class _Trial:
         windows, _ = cut(_beginning(asked.logs), system, window=WINDOW)
         most = np.argsort(-motion(windows).mean(axis=1), kind="stable")[:WINDOWS]
         self.windows = windows.some(np.sort(most))
-        self.inputs = _inputs(self.windows)
+        now = np.zeros(self.windows.area.shape[-1])
+        self.inputs = np.stack([inputs_of(x, now) for x in self.windows.held()])
         self.states = [c.name for c in system.physical_states]
         self.actions = [c.name for c in system.actions]
         self.units = {
@@ -271,20 +273,6 @@ def _beginning(logs: Sequence[Log]) -> list[Log]:
             )
         )
     return some
-
-
-def _inputs(windows: Windows) -> Float[np.ndarray, "W L m"]:
-    """The mean input over the step that ends at each row."""
-    ends = np.cumsum(windows.span, axis=1)
-    h = np.diff(ends, axis=1, prepend=0.0)[..., None]
-    area = np.asarray(
-        [
-            [np.interp(end, knots, a) for a in area.T]
-            for end, knots, area in zip(ends, windows.knots, windows.area, strict=True)
-        ]
-    ).transpose(0, 2, 1)
-    moved = np.diff(area, axis=1, prepend=area[:, :1])
-    return np.asarray(np.where(h > 0.0, moved, 0.0) / np.where(h > 0.0, h, 1.0))
 
 
 def _step_of(system: AbstractSystem) -> Callable[..., Float[np.ndarray, "B n"]]:

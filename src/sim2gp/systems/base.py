@@ -20,10 +20,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from equinox import AbstractVar
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from sim2gp import checks
 from sim2gp.errors import InputError, nearest
+from sim2gp.inference.linalg import library
 from sim2gp.inference.parameters import (
     Parameter,
     Parameters,
@@ -32,7 +33,7 @@ from sim2gp.inference.parameters import (
 )
 from sim2gp.systems.function_checks import check_returns, names_of
 from sim2gp.systems.variants import Variant, Which, values_of
-from sim2gp.types import Action, Scalar, State
+from sim2gp.types import Action, AnyArray, AnyScalar, Scalar, State
 
 #: Of RK4 inside the windows that logs are cut into, s.
 WINDOW_SUBSTEP = 2e-3
@@ -45,6 +46,15 @@ BLURRED = 0.1
 #: A step may exceed its limit by this share: clocks are not exact.
 STEP_TOLERANCE = 0.05
 R = TypeVar("R")
+
+
+def steps_in(
+    span: Float[AnyArray, "*r"] | AnyScalar, longest: float
+) -> Int[AnyArray, "*r"]:
+    """Equal steps in a time: the fewest that are no longer than ``longest``, in s."""
+    xp = library(span)
+    count = xp.maximum(1, xp.ceil(span / longest - STEP_TOLERANCE))
+    return xp.asarray(count).astype(int)
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from jaxtyping import Array, Float
 
 from sim2gp.identification.identifiability.spectrum import physical, virtual_columns
 from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.least_squares import over, stack
 from sim2gp.inference.parameters import Parameters
 from sim2gp.types import in_float64
 
@@ -92,6 +93,5 @@ def select_parameters(
 
 def _left(J: Float[np.ndarray, "r q"]) -> Float[np.ndarray, " q"]:
     """Posterior sd in prior sd, of independent priors."""
-    R = np.linalg.qr(np.concatenate([J, np.eye(J.shape[1])]), mode="r")
-    root = scipy.linalg.solve_triangular(R, np.eye(len(R)))
-    return np.asarray(np.linalg.norm(root, axis=1))
+    eye = np.eye(J.shape[1])
+    return np.asarray(np.linalg.norm(over(eye, stack(J, eye)), axis=1))

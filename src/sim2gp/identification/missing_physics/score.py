@@ -26,12 +26,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sim2gp.identification.missing_physics.data import AbstractData
-from sim2gp.inference.arrowhead import Blocks, Noise, eliminate
+from sim2gp.inference.arrowhead import eliminate
 from sim2gp.inference.estimate import Estimate, estimate
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.least_squares import prior_rows
 from sim2gp.inference.likelihood import AbstractLikelihood
 from sim2gp.inference.linalg import triangular
+from sim2gp.inference.linear_likelihood import LinearLikelihood
 from sim2gp.inference.prior import AbstractPrior
 from sim2gp.systems.assemble import free_parts
 from sim2gp.systems.base import AbstractSystem
@@ -141,7 +142,7 @@ def _linear(
     z0 = jnp.asarray(z)
     standard = Gaussian(jnp.zeros_like(z0), jnp.eye(z0.size))
     found = estimate(
-        _LinearLikelihood(
+        LinearLikelihood(
             counts, floor, jnp.asarray(blocks), z0, bare.nuisances, bare.noise
         ),
         _LinearPrior(standard, rows, z0),
@@ -155,39 +156,6 @@ def _linear(
     inflation = inflation_of(np.asarray(found.scores), data.cluster, row, -1)
     z = np.array(found.posterior.mean)
     return _Linear(float(found.log_evidence), z, math.sqrt(row[-1]), inflation)
-
-
-class _LinearLikelihood(AbstractLikelihood):
-    """A likelihood that is its own linearisation at ``(z0, e0)``, whitened already.
-
-    ``noise`` is that of the fit about which it is.
-    """
-
-    counts: Float[Array, "W c"]
-    floor: Float[Array, " c"]
-    base: Blocks
-    z0: Float[Array, " p"]
-    e0: Float[Array, "W n"]
-    noise: Noise
-
-    @property
-    def n_nuisances(self) -> int:
-        return self.e0.shape[1]
-
-    def first_noise(self) -> Noise:
-        return self.noise
-
-    def blocks(
-        self,
-        tt: Float[Array, " p"],
-        e: Float[Array, "W n"],
-        scale: Float[Array, "p p"],
-    ) -> Blocks:
-        del scale
-        away = jnp.broadcast_to(tt - self.z0, (len(e), tt.size))
-        step = jnp.concatenate([e - self.e0, away], axis=1)
-        moved = jnp.einsum("wckj,wj->wck", self.base[..., :-1], step)
-        return self.base.at[..., -1].add(moved)
 
 
 class _LinearPrior(AbstractPrior):

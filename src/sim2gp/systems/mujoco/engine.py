@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 
 from sim2gp.errors import InputError
 from sim2gp.inference.parameters import Parameters
-from sim2gp.systems.base import STEP_TOLERANCE
+from sim2gp.systems.base import steps_in
 from sim2gp.systems.mujoco.constants import CENTRED, DERIVED, Constant, set_constants
 from sim2gp.systems.mujoco.slopes.numbers import moved_by, numbers_of, tree_of
 from sim2gp.systems.mujoco.slopes.step import Model, acceleration_slopes, in_closed_form
@@ -103,9 +103,7 @@ class Engine(AbstractSimulator):
         return out
 
     def substeps(self, span: Float[np.ndarray, "*r"]) -> Int[np.ndarray, "*r"]:
-        step = float(self.model.opt.timestep)
-        count = np.ceil(np.round(span, 12) / step - STEP_TOLERANCE)
-        return np.asarray(np.maximum(1, count), int)
+        return steps_in(np.round(span, 12), float(self.model.opt.timestep))
 
     def rollout(
         self,

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sim2gp.errors import InputError
-from sim2gp.systems.base import STEP_TOLERANCE
+from sim2gp.systems.base import steps_in
 from sim2gp.systems.mujoco.constants import CENTRED, DERIVED, Constant, set_constants
 from sim2gp.systems.mujoco.inertia import unframe
 from sim2gp.types import Action, Scalar, State
@@ -70,8 +70,7 @@ class MJXEngine:
 
         with _lenient():
             model = self.with_values(theta)
-            count = jnp.maximum(1, jnp.ceil(h / self.timestep - STEP_TOLERANCE))
-            count = count.astype(int)
+            count = steps_in(h, self.timestep)
             step = h / count
             model = model.tree_replace({"opt.timestep": step})
             nq, nv = model.nq, model.nv
