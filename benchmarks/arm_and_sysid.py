@@ -14,12 +14,9 @@ Cold: without anything compiled before.
 import argparse
 import contextlib
 import json
-import os
 import statistics
-import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +24,8 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
+from commands import MAIN, timed  # noqa: E402
+
 import servo_arm  # noqa: E402
 
 #: What is open, and how far the truth lies from the file, in log units.
@@ -132,7 +131,7 @@ def cell(seconds: float, seed: int, delay: float, *, cold: bool) -> dict[str, An
         if not cold:
             out["told"] = _ours(folder, "told", seed, cache)
         sysid = [str(Path(__file__)), "--sysid", str(folder), "--delay", str(delay)]
-        out["sysid"] = _timed(folder, sysid, None)
+        out["sysid"] = timed(folder, sysid, one_core=True)
         theirs = json.loads((folder / "sysid.json").read_text())
         out["sysid"] |= _judged(
             seed, {path: (x, x - h, x + h) for path, (x, h) in theirs.items()}
@@ -141,9 +140,8 @@ def cell(seconds: float, seed: int, delay: float, *, cold: bool) -> dict[str, An
 
 
 def _ours(folder: Path, name: str, seed: int, cache: str | None) -> dict[str, Any]:
-    start = "from sim2gp.cli import main; main()"
-    run = ["-c", start, "identify", f"{name}.toml", "--quick", "--out", name]
-    out: dict[str, Any] = dict(_timed(folder, run, cache))
+    run = [*MAIN, "identify", f"{name}.toml", "--quick", "--out", name]
+    out: dict[str, Any] = dict(timed(folder, run, cache=cache, one_core=True))
     summary = json.loads((folder / name / "summary.json").read_text())
     found = {
         path: (entry["mean"], entry["q025"], entry["q975"])
@@ -159,35 +157,6 @@ def _judged(seed: int, found: dict[str, tuple[float, float, float]]) -> dict[str
     errors = [abs(found[p][0] / true[p] - 1.0) for p in OPEN]
     inside = [found[p][1] <= true[p] <= found[p][2] for p in OPEN]
     return {"median_error": statistics.median(errors), "inside": sum(inside)}
-
-
-def _timed(folder: Path, args: list[str], cache: str | None) -> dict[str, float]:
-    """A command on one core: seconds in all, and the largest memory in MiB."""
-    env = dict(os.environ, OPENBLAS_NUM_THREADS="1", MUJOCO_GL="disable")
-    env.pop("JAX_COMPILATION_CACHE_DIR", None)
-    if cache:
-        env |= {"JAX_COMPILATION_CACHE_DIR": cache}
-        env["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
-    one = ["taskset", "-c", "0"] if hasattr(os, "sched_setaffinity") else []
-    started = time.perf_counter()
-    child = subprocess.Popen(
-        [*one, sys.executable, *args],
-        cwd=folder,
-        env=env,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    said = child.stderr.read() if child.stderr else ""
-    _, status, usage = os.wait4(child.pid, 0)
-    if status:
-        raise SystemExit(f"{' '.join(args)}\n{said}")
-    seconds = time.perf_counter() - started
-    return {
-        "wall": round(seconds, 2),
-        "cpu": round(usage.ru_utime + usage.ru_stime, 2),
-        "memory": round(usage.ru_maxrss / 1024),
-    }
 
 
 def _cache() -> str:

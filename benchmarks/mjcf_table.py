@@ -13,11 +13,8 @@ the models before it have not. Writes `mjcf_table.json` and prints a table.
 
 import argparse
 import json
-import os
-import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +22,7 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "benchmarks")]
+from commands import MAIN, timed  # noqa: E402
 from mujoco_slopes import OF_OTHERS, fixed  # noqa: E402
 
 import servo_arm  # noqa: E402
@@ -37,7 +35,6 @@ ARMS: dict[str, dict[str, Any]] = {
     "12 joints": {"arms": 2},
 }
 HUMANOID = "29 joints (G1)"
-LIMIT = 1200.0  # s, of one command
 
 
 def text_of(name: str, folder: Path) -> str | None:
@@ -70,29 +67,7 @@ def write(folder: Path, text: str) -> Any:
     return mujoco.MjModel.from_xml_string(text)
 
 
-def timed(folder: Path, args: list[str], watched: Path | None = None) -> dict[str, Any]:
-    """Seconds of a command, until a file was there, and its largest memory in MiB."""
-    started, seen, usage = time.perf_counter(), None, None
-    command = [sys.executable, "-c", "from sim2gp.cli import main; main()", *args]
-    with (folder / "said.txt").open("w") as said:
-        child = subprocess.Popen(command, cwd=folder, stdout=said, stderr=said)
-    while usage is None:
-        time.sleep(0.02)
-        if seen is None and watched is not None and watched.exists():
-            seen = time.perf_counter() - started
-        pid, status, found = os.wait4(child.pid, os.WNOHANG)
-        usage = found if pid else None
-        if not pid and time.perf_counter() - started > LIMIT:
-            child.kill()
-    if status:
-        raise SystemExit(f"{' '.join(args)}\n{(folder / 'said.txt').read_text()}")
-    out = {"seconds": round(time.perf_counter() - started, 1)}
-    if seen is not None:
-        out["first"] = round(seen, 1)
-    return out | {"memory": round(usage.ru_maxrss / 1024)}
-
-
-def row(name: str, text: str) -> dict[str, Any]:
+def row(name: str, text: str, cache: str) -> dict[str, Any]:
     """One model, through both commands."""
     from sim2gp.systems.mujoco.constants import constants_of
 
@@ -100,10 +75,11 @@ def row(name: str, text: str) -> dict[str, Any]:
         folder = Path(place)
         model = write(folder, text)
         out: dict[str, Any] = {"model": name, "joints": model.nv}
-        out["init"] = timed(folder, ["init", "robot.xml", "log.csv"])
+        init = [*MAIN, "init", "robot.xml", "log.csv"]
+        out["init"] = timed(folder, init, cache=cache)
         first = folder / "run-first" / "summary.json"
-        identify = ["identify", "robot.toml", "--quick", "--out", "run"]
-        out["identify"] = timed(folder, identify, first)
+        identify = [*MAIN, "identify", "robot.toml", "--quick", "--out", "run"]
+        out["identify"] = timed(folder, identify, cache=cache, watched=first)
         summary = json.loads((folder / "run" / "summary.json").read_text())
         known = {c.path: float(c.get(model)) for c in constants_of(model).values()}
         found = {k: v for k, v in summary["parameters"].items() if k in known}
@@ -122,8 +98,8 @@ def table(rows: list[dict[str, Any]]) -> str:
         fit = x["identify"]
         first = f"{fit['first']:.0f} s" if "first" in fit else "-"
         lines.append(
-            f"| {x['model']} | {x['parameters']} | {x['init']['seconds']:.0f} s "
-            f"| {first} | {fit['seconds']:.0f} s | {fit['memory'] / 1024:.1f} GiB |"
+            f"| {x['model']} | {x['parameters']} | {x['init']['wall']:.0f} s "
+            f"| {first} | {fit['wall']:.0f} s | {fit['memory'] / 1024:.1f} GiB |"
         )
     return "\n".join(lines)
 
@@ -136,14 +112,12 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=ROOT / "results")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as cache:
-        os.environ["JAX_COMPILATION_CACHE_DIR"] = cache
-        os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
         rows = []
         for name in given.names:
             if (text := text_of(name, given.models)) is None:
                 print(f"{name}: mjlab is not installed")
                 continue
-            rows.append(row(name, text))
+            rows.append(row(name, text, cache))
             print(json.dumps(rows[-1]), flush=True)
     given.out.mkdir(exist_ok=True)
     (given.out / "mjcf_table.json").write_text(json.dumps(rows, indent=1) + "\n")
