@@ -4,6 +4,7 @@ from mutant_list import Hunt, Mutant
 
 FRICTION, LAWS = "systems/effects/friction.py", "systems/effects/friction_laws.py"
 KICKS, LIST = "systems/effects/kicks.py", "systems/effects/registry.py"
+HOST = "systems/host.py"
 KICK: Hunt = ("test_effects_anywhere.py", "kick or steep or order")
 LISTED: Hunt = ("test_effects_anywhere.py", "registered or names")
 LAW: Hunt = ("test_effects_anywhere.py", "new_law")
@@ -22,6 +23,20 @@ EFFECTS = (
         "reversed(effects)",
         "effects",
         KICK,
+    ),
+    Mutant(
+        "on the host the second kick in the first's order",
+        HOST,
+        "after(size[:, ::-1], self.engine",
+        "before(size, self.engine",
+        ("test_window_slopes.py", "act_on_the_host"),
+    ),
+    Mutant(
+        "the second kick's magnitudes act at the step's end alone",
+        HOST,
+        "        whole[..., p : p + self._count] += last",
+        "        whole[..., p : p + self._count] += 0.0 * last",
+        ("test_window_slopes.py", "slopes_of_its_own"),
     ),
     Mutant("drag's sign", FRICTION, "x * jnp.abs(v) * t", "x * v * t", KICK),
     Mutant(

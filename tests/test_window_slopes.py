@@ -20,9 +20,12 @@ from sim2gp.data.split_log import cut
 from sim2gp.data.window_slopes import HostRun
 from sim2gp.data.windows_likelihood import _About
 from sim2gp.project import load_project
-from sim2gp.systems import MuJoCo
+from sim2gp.systems import Coulomb, Drag, MuJoCo, Spring, Viscous
+from sim2gp.systems.assemble import free_parts
+from sim2gp.systems.host import simulator_of
 from sim2gp.systems.mujoco.engine import Engine
-from sim2gp.systems.plants.external import AbstractSimulator, Arguments, simulator_of
+from sim2gp.systems.plants.external import AbstractSimulator, Arguments
+from sim2gp.systems.simulate import simulate
 from sim2gp.types import in_float64
 from test_slopes import CONTACT, tree
 
@@ -170,34 +173,66 @@ def test_so_is_one_in_steps_of_runge_and_kutta(name):
     check(of_others(name))
 
 
-@in_float64
-def test_the_likelihood_of_logs_has_the_slopes_of_its_own_simulation(tmp_path):
-    """In virtual constants and starts, one delay of all drives among the constants."""
-    (tmp_path / "arm.xml").write_text(servo_arm.model_text())
-    servo_arm.record(tmp_path / "log.csv", seconds=1.0, delay=0.01)
+def arm_and_windows(folder: Path) -> tuple[Any, Any]:
+    """The six-axis arm with an unknown delay, and half seconds of a log."""
+    (folder / "arm.xml").write_text(servo_arm.model_text())
+    servo_arm.record(folder / "log.csv", seconds=1.0, delay=0.01)
     constants = ["joint/*/armature", "joint/*/frictionloss", "body/*/mass"]
     text = servo_arm.project_text(["log.csv"], constants=constants)
-    (tmp_path / "arm.toml").write_text(text.replace("window = 1.0", "window = 0.5"))
-    project = load_project(tmp_path / "arm.toml")
+    (folder / "arm.toml").write_text(text.replace("window = 1.0", "window = 0.5"))
+    project = load_project(folder / "arm.toml")
     system = project.build_system()
-    cuts, _ = cut(project.load_logs(), system, window=0.5)
+    return system, cut(project.load_logs(), system, window=0.5)[0]
+
+
+#: Two on one joint, so that their order matters.
+FORCES = (
+    Coulomb("joint2", 0.3, width=0.3),
+    Spring("joint2", 2.0),
+    Viscous("joint4", 1.0),
+    Drag("joint5", 0.5),
+)
+
+
+@pytest.mark.parametrize("forces", [(), FORCES], ids=["as it is", "forces on joints"])
+@in_float64
+def test_the_likelihood_of_logs_has_the_slopes_of_its_own_simulation(tmp_path, forces):
+    """In virtual constants and starts, one delay of all drives among the constants."""
+    plain, cuts = arm_and_windows(tmp_path)
+    system = free_parts(plain, forces)
     prior, e = system.parameters.prior(), np.zeros(cuts.start.shape)
     simulator, n = simulator_of(system), e.shape[1]
-    k = n + prior.mean.size
+    k, names = n + prior.mean.size, system.parameters.names
+    z = 0.5 * np.asarray([name in [f.name for f in forces] for name in names])
 
     def run(x: np.ndarray) -> HostRun:
-        tt = prior.mean + prior.scale @ x[n:]
+        tt = prior.mean + prior.scale @ (z + x[n:])
         asked = _About(system, tt, prior.scale)
         return HostRun(simulator, asked, cuts, jnp.asarray(e + x[:n]), k)
 
     slopes = run(np.zeros(k)).slopes()
+    late = [n + i for i, name in enumerate(names) if name.endswith(".delay")]
     for i in range(k):
         # A delayed input is a difference of integrals: it has more rounding.
-        step = STEPS[1] if i == k - 1 else STEPS[0]
+        step = STEPS[1] if i in late else STEPS[0]
         up, down = (run(x).states for x in step * np.eye(k)[i] * [[1.0], [-1.0]])
         expected = (up - down) / (2.0 * step)
         size, error = (np.abs(x).max() for x in (expected, slopes[..., i] - expected))
         assert error <= SAME * size + ROUNDING / step, (i, error, size)
+
+
+@in_float64
+def test_forces_on_joints_act_on_the_host_as_in_jax(tmp_path):
+    """Windows moved by the simulator and its kicks, and step by step by `flow`."""
+    plain, cuts = arm_and_windows(tmp_path)
+    system = free_parts(plain, FORCES)
+    prior, e = system.parameters.prior(), jnp.zeros(cuts.start.shape)
+    tt = prior.mean + 0.5 * jnp.diag(prior.scale)
+    asked = _About(system, tt, prior.scale)
+    run = HostRun(simulator_of(system), asked, cuts, e, e.shape[1] + tt.size)
+    params = system.record(system.values(tt))
+    expected = cuts.each(lambda one: simulate(system, params, one, one.start))
+    assert np.allclose(run.states, expected, rtol=0.0, atol=1e-8)
 
 
 def test_where_contacts_come_and_go_each_step_is_as_mujoco_has_it():

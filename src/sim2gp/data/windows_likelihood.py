@@ -32,11 +32,8 @@ from sim2gp.inference.likelihood import AbstractLikelihood, Trial
 from sim2gp.inference.linalg import library
 from sim2gp.inference.linearized import jacobian_by_columns, value_and_jacobian
 from sim2gp.systems.base import AbstractSystem
-from sim2gp.systems.plants.external import (
-    AbstractSimulator,
-    on_host,
-    simulator_of,
-)
+from sim2gp.systems.host import simulator_of
+from sim2gp.systems.plants.external import AbstractSimulator
 from sim2gp.systems.simulate import inputs_of, simulate
 from sim2gp.types import AnyArray, in_float64
 
@@ -240,9 +237,7 @@ def _linearise(
         found: tuple[Array, ...] = likelihood.windows.each(one, e)
         return found
 
-    J, (r, states, inputs) = jacobian_by_columns(
-        rows, jnp.zeros(p + n), at_once=on_host(likelihood.system)
-    )
+    J, (r, states, inputs) = jacobian_by_columns(rows, jnp.zeros(p + n))
     return Linearised(r, J, states, inputs)
 
 

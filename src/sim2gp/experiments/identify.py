@@ -56,7 +56,7 @@ from sim2gp.project import Project
 from sim2gp.runs import Progress, new_run
 from sim2gp.runs.store import Writer
 from sim2gp.systems.base import AbstractSystem
-from sim2gp.systems.plants.external import simulator_of
+from sim2gp.systems.host import simulator_of
 
 #: Forecasts to draw: of whom, and what and where they are.
 Drawn = tuple[Gaussian, Picture, Grid]

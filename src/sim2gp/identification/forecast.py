@@ -39,7 +39,8 @@ from sim2gp.data.window_slopes import (
 from sim2gp.data.windows import Windows
 from sim2gp.inference.gaussian import LOG_2PI, Gaussian
 from sim2gp.systems.base import AbstractSystem
-from sim2gp.systems.plants.external import AbstractSimulator, simulator_of
+from sim2gp.systems.host import simulator_of
+from sim2gp.systems.plants.external import AbstractSimulator
 from sim2gp.types import in_float64
 
 _BATCH = 64  # windows at a time: bounds the memory of sensitivities

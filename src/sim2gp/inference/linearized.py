@@ -35,16 +35,12 @@ def value_and_jacobian(
 
 
 def jacobian_by_columns(
-    f: Callable[[Array], tuple[Array, ...]],
-    x: Float[Array, " p"],
-    *,
-    at_once: bool = False,
+    f: Callable[[Array], tuple[Array, ...]], x: Float[Array, " p"]
 ) -> tuple[Float[Array, "*d p"], tuple[Array, ...]]:
     """Jacobian of the first output of ``f`` at ``x``, and all of its values there.
 
     One column after the other: the code of a single one takes a third of the time to
-    compile. For what runs at few points. All ``at_once`` where a simulator on the host
-    would be asked the same for each.
+    compile. For what runs at few points.
     """
 
     def column(v: Array) -> tuple[Array, tuple[Array, ...]]:
@@ -52,7 +48,7 @@ def jacobian_by_columns(
         return slopes[0], values
 
     columns = jnp.eye(x.size, dtype=x.dtype)
-    J, values = jax.vmap(column)(columns) if at_once else jax.lax.map(column, columns)
+    J, values = jax.lax.map(column, columns)
     return jnp.moveaxis(J, 0, -1), jax.tree.map(lambda a: a[0], values)
 
 

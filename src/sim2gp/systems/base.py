@@ -163,9 +163,10 @@ class AbstractSystem(eqx.Module):
     def enter(
         self, params: Any, x0: Float[Array, " n"], inputs: Float[Array, "L m"]
     ) -> tuple[Any, Float[Array, " n"], Float[Array, "L m"]]:
-        """What the plant is given: its constants, start, and the inputs of each step.
+        """What a simulator on the host is given (`sim2gp.systems.host`).
 
-        With `leave`, `flow` of a system without effects on its joints is the plant's.
+        Constants of the plant and magnitudes of effects on its joints, the start, and
+        the inputs of each step. With `leave`, `flow` of the system is the simulator's.
         """
 
     @abc.abstractmethod

@@ -170,6 +170,11 @@ class Machine(AbstractSystem):
         return *self.effects, *self.sensors, *self.actuators
 
     @property
+    def joint_effects(self) -> tuple[AbstractJointEffect, ...]:
+        """Those that act on the joints, in their order."""
+        return tuple(e for e in self.effects if isinstance(e, AbstractJointEffect))
+
+    @property
     def states(self) -> tuple[Channel, ...]:
         past = tuple(
             replace(channel, name=f"{channel.name}[-{k}]")
@@ -235,7 +240,10 @@ class Machine(AbstractSystem):
         inputs = jax.vmap(lambda a: self._through(params, a))(inputs)
         if self.sensors:
             x0 = x0 + self._offset(params).astype(x0.dtype)
-        return params.plant, x0, inputs
+        theta, acting = params.plant, [x for _, x in self.acting(params)]
+        if acting:  # of a plant with equations the effects are inside them
+            theta = jnp.concatenate([theta, jnp.stack(acting)])
+        return theta, x0, inputs
 
     def leave(
         self, params: MachineParams, states: Float[Array, "L n"]
@@ -292,8 +300,7 @@ class Machine(AbstractSystem):
 
     def acting(self, params: MachineParams) -> Effects:
         """Effects on the joints, with their magnitudes."""
-        effects = [e for e in self.effects if isinstance(e, AbstractJointEffect)]
-        return [(effect, params.parts[effect.name]) for effect in effects]
+        return [(effect, params.parts[effect.name]) for effect in self.joint_effects]
 
     def _moved(
         self, params: MachineParams, s: State, a: Action, h: float | Scalar

@@ -96,6 +96,11 @@ class AbstractData(abc.ABC):
     ) -> Float[Array, "G W c k k"]:
         """`Blocks` at points of the parameters, whitened by the prior."""
         prior, likelihood = system.parameters.prior(), self.likelihood(system)
+        if likelihood.on_host:
+            each = [
+                likelihood.blocks(prior.at(one), nuisances, prior.scale) for one in z
+            ]
+            return jnp.stack(each)
         return _blocks(likelihood, prior, jnp.asarray(z, float), nuisances)
 
 

@@ -29,17 +29,18 @@ def kicked(
 ) -> State:
     """State ``h`` seconds later of a plant whose joints are accelerated by effects."""
     half = jnp.asarray(0.5 * h, s.dtype)
-    s = _kick(plant, effects, s, half)
+    s = kick(plant, effects, s, half)
     s = plant.flow(params, s, a, h)
-    return _kick(plant, reversed(effects), s, half)
+    return kick(plant, reversed(effects), s, half)
 
 
-def _kick(
+def kick(
     plant: AbstractPlant,
     effects: Iterable[tuple[AbstractJointEffect, Scalar]],
     s: State,
     t: Scalar,
 ) -> State:
+    """State whose joints' velocities the effects have changed for ``t`` seconds."""
     for effect, x in effects:
         assert isinstance(effect, AbstractJointForce)  # as `check_effect` asks
         i = index_of(effect.where, plant.physical_states)

@@ -25,9 +25,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp.inference.parameters import Parameters
-from sim2gp.systems.base import AbstractSystem
-from sim2gp.systems.effects.base import AbstractJointEffect
-from sim2gp.systems.machine import Machine, plant_of
 from sim2gp.types import Action, AnyArray, Scalar, State
 
 #: What a constant changes by less, of the largest number, it does not change.
@@ -245,26 +242,6 @@ class AbstractSimulator(abc.ABC):
     ) -> Float[np.ndarray, "B n pnm"]:
         """That of `slopes`, where the states ``after`` are known already."""
         return self.slopes(theta, s, a, h)[1]
-
-
-def on_host(system: AbstractSystem) -> bool:
-    """Whether a simulator here moves it, which tells all slopes or none."""
-    found = plant_of(system)
-    engine = isinstance(getattr(found, "engine", None), AbstractSimulator)
-    return engine and getattr(found, "mjx", None) is None
-
-
-def simulator_of(system: AbstractSystem) -> AbstractSimulator | None:
-    """The simulator that moves whole windows of a machine by itself.
-
-    None where JAX does, and where effects act on the joints between its steps.
-    """
-    effects = system.effects if isinstance(system, Machine) else ()
-    kicked = any(isinstance(effect, AbstractJointEffect) for effect in effects)
-    if kicked or not on_host(system):
-        return None
-    engine: AbstractSimulator = plant_of(system).engine  # type: ignore[attr-defined]
-    return engine
 
 
 def untouched(

@@ -1,0 +1,128 @@
+"""The simulator on the host that moves a machine, with the forces on its joints.
+
+JAX asks a simulator on the host for single steps; whole windows of logs it moves by
+itself (`sim2gp.data.window_slopes`). Forces on the joints of such a machine are kicks
+around each of its steps, as in `sim2gp.systems.effects.kicks`.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sim2gp.inference.linearized import value_and_jacobian
+from sim2gp.systems.base import AbstractPlant, AbstractSystem
+from sim2gp.systems.effects.base import AbstractJointEffect
+from sim2gp.systems.effects.kicks import kick
+from sim2gp.systems.machine import Machine, plant_of
+from sim2gp.systems.plants.external import AbstractSimulator
+from sim2gp.types import AnyArray
+
+
+def simulator_of(system: AbstractSystem) -> AbstractSimulator | None:
+    """The simulator that moves whole windows of a machine; None where JAX does.
+
+    Its constants are those of the plant, then the magnitudes of the machine's effects
+    on the joints.
+    """
+    plant = plant_of(system)
+    engine = getattr(plant, "engine", None)
+    if not isinstance(engine, AbstractSimulator) or getattr(plant, "mjx", None):
+        return None
+    effects = system.joint_effects if isinstance(system, Machine) else ()
+    return WithForces(engine, plant, effects) if effects else engine
+
+
+class WithForces(AbstractSimulator):
+    """A simulator whose steps lie between half kicks of its joints' velocities."""
+
+    def __init__(
+        self,
+        engine: AbstractSimulator,
+        plant: AbstractPlant,
+        effects: tuple[AbstractJointEffect, ...],
+    ) -> None:
+        self.engine, self.differences = engine, engine.differences
+        self._kicks = _Kicks(plant, effects), _Kicks(plant, effects[::-1])
+        self._count = len(effects)
+
+    def flow(
+        self,
+        theta: Float[np.ndarray, "B p"],
+        s: Float[np.ndarray, "B n"],
+        a: Float[np.ndarray, "B m"],
+        h: Float[np.ndarray, " B"],
+    ) -> Float[np.ndarray, "B n"]:
+        of_plant, size = np.split(theta, [-self._count], axis=1)
+        before, after = self._kicks
+        s = before(size, s, 0.5 * h)
+        return after(size[:, ::-1], self.engine.flow(of_plant, s, a, h), 0.5 * h)
+
+    def slopes(
+        self,
+        theta: Float[np.ndarray, "B p"],
+        s: Float[np.ndarray, "B n"],
+        a: Float[np.ndarray, "B m"],
+        h: Float[np.ndarray, " B"],
+    ) -> tuple[Float[np.ndarray, "B n"], Float[np.ndarray, "B n pnm"]]:
+        of_plant, size = np.split(theta, [-self._count], axis=1)
+        p, n = of_plant.shape[1], s.shape[1]
+        before, after = self._kicks
+        s, first = before.slopes(size, s, 0.5 * h)
+        s, middle = self.engine.slopes(of_plant, s, a, h)
+        s, last = after.slopes(size[:, ::-1], s, 0.5 * h)
+        by_plant, by_s, by_a = np.split(middle, [p, p + n], axis=2)
+        by_size = by_s @ first[..., :-n]
+        whole = np.concatenate([by_plant, by_size, by_s @ first[..., -n:], by_a], 2)
+        whole = last[..., -n:] @ whole
+        whole[..., p : p + self._count] += last[..., self._count - 1 :: -1]
+        return s, whole
+
+
+class _Kicks(eqx.Module):
+    """Kicks of a batch of states by effects in their order, one compiled program."""
+
+    plant: AbstractPlant
+    effects: tuple[AbstractJointEffect, ...]
+
+    def __call__(
+        self,
+        size: Float[np.ndarray, "B e"],
+        s: Float[np.ndarray, "B n"],
+        t: Float[np.ndarray, " B"],
+    ) -> Float[np.ndarray, "B n"]:
+        """States after kicks of ``t`` seconds, for magnitudes ``size``."""
+        with jax.enable_x64(True):  # also where JAX calls back, in a thread of its own
+            return np.asarray(_kicked(self, size, s, t))
+
+    def slopes(
+        self,
+        size: Float[np.ndarray, "B e"],
+        s: Float[np.ndarray, "B n"],
+        t: Float[np.ndarray, " B"],
+    ) -> tuple[Float[np.ndarray, "B n"], Float[np.ndarray, "B n en"]]:
+        """The same, and their Jacobian in magnitudes and state."""
+        with jax.enable_x64(True):
+            state, J = _kicked_slopes(self, size, s, t)
+            return np.asarray(state), np.asarray(J)
+
+
+@eqx.filter_jit
+def _kicked(kicks: _Kicks, size: AnyArray, s: AnyArray, t: AnyArray) -> Array:
+    return jax.vmap(_kick, (None, 0, 0))(kicks, jnp.concatenate([size, s], 1), t)
+
+
+@eqx.filter_jit
+def _kicked_slopes(kicks: _Kicks, size: AnyArray, s: AnyArray, t: AnyArray) -> Any:
+    def one(x: Array, t: Array) -> Any:
+        return value_and_jacobian(lambda x: _kick(kicks, x, t), x)
+
+    return jax.vmap(one)(jnp.concatenate([size, s], axis=1), t)
+
+
+def _kick(kicks: _Kicks, x: Float[Array, " en"], t: Array) -> Float[Array, " n"]:
+    size, s = jnp.split(x, [len(kicks.effects)])
+    return kick(kicks.plant, list(zip(kicks.effects, size, strict=True)), s, t)
