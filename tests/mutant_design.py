@@ -4,6 +4,7 @@ from mutant_list import Mutant
 
 EXPERIMENT, GOALS = "design/experiment.py", "design/goals.py"
 LIMITS, SIGNALS, SEARCH = "design/limits.py", "design/signals.py", "design/search.py"
+CLIMB, SAMPLES = "design/by_gradients.py", "design/by_samples.py"
 RUN, VERDICT = "experiments/design.py", "experiments/design_verdict.py"
 TOLD = ("test_design.py", "tells_what_the_log")
 GOAL = ("test_design.py", "dense_covariances")
@@ -104,28 +105,42 @@ DESIGN = (
     ),
     Mutant(
         "search: the worst plan",
-        SEARCH,
+        CLIMB,
         "return cost * beyond(states[1:]) - worth",
         "return cost * beyond(states[1:]) + worth",
         SEARCHED,
     ),
     Mutant(
         "search: what is lost is kept",
-        SEARCH,
+        CLIMB,
         "if jnp.mean(then < LOST) > 1.0 - LEAVING:",
         "if True:",
         ("test_design_search.py", "given_up"),
     ),
     Mutant(
         "search: a turn at most",
-        SEARCH,
+        CLIMB,
         "return jnp.sum(jnp.maximum(worst, 0.0))",
         "return jnp.max(jnp.maximum(worst, 0.0))",
         ("test_design.py", "every_turn"),
     ),
     Mutant(
+        "search by samples: the worst ones are kept",
+        SAMPLES,
+        "np.argsort(-values, kind",
+        "np.argsort(values, kind",
+        ("test_design_mujoco.py", "beats_random"),
+    ),
+    Mutant(
+        "search by samples: windows begin one late",
+        SAMPLES,
+        "states[first], first, count - 1, n + p)",
+        "states[first], first + 1, count - 1, n + p)",
+        ("test_design_mujoco.py", "of_the_definition"),
+    ),
+    Mutant(
         "search: longer periods with the noise of short ones",
-        SEARCH,
+        CLIMB,
         "noise=experiment.noise / math.sqrt(k)",
         "noise=experiment.noise",
         ("test_design_search.py", "longer_periods"),
@@ -160,7 +175,7 @@ DESIGN = (
     ),
     Mutant(
         "search: limits hold for machines of the plain posterior",
-        SEARCH,
+        CLIMB,
         "jax.vmap(experiment.plausible.at)(draws)",
         "jax.vmap(experiment.belief.at)(draws)",
         ("test_design_search.py", "corrected_posterior"),

@@ -88,10 +88,10 @@ FIRST_DRAFT = (
     ),
     Mutant(
         "first experiment: targets jump",
-        EXPERIMENT,
-        "(high - low) / SLOW, np.inf)",
-        "np.inf, np.inf)",
-        ("test_first_draft.py", "without_logs"),
+        "design/limits.py",
+        "return {name: span / SLOW for",
+        "return {name: math.inf * span for",
+        ("test_design_mujoco.py", "move_slowly"),
     ),
     Mutant(
         "a missing column of an input cannot be a number",

@@ -24,7 +24,7 @@ from sim2gp import design as d
 from sim2gp.data.logs import Log
 from sim2gp.data.split_log import cut
 from sim2gp.data.windows_likelihood import WindowsLikelihood, information_at
-from sim2gp.design import search
+from sim2gp.design import by_gradients
 from sim2gp.design.limits import excess, kept
 from sim2gp.errors import InputError
 from sim2gp.inference.arrowhead import Noise
@@ -178,7 +178,7 @@ def test_excess_is_a_share_of_the_half_width() -> None:
 def test_every_turn_beyond_the_limits_counts() -> None:
     """Each at its worst; then the mean over machines."""
     e, box = experiment(), limits(pendulum())
-    beyond = search._beyond_of(e, box)
+    beyond = by_gradients._beyond_of(e, box)
     states = np.zeros((2, STEPS + 1, 4))
     states[0, 10:13, 0] = 1.8, 2.1, 1.8
     states[0, 100, 2] = -18.0

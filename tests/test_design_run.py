@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sim2gp.cli import main
-from sim2gp.design import Everything, Limits, Named, search
+from sim2gp.design import Everything, Limits, Named, by_gradients
 from sim2gp.experiments import identify
 from sim2gp.experiments.design import goal_of, setting
 from sim2gp.experiments.design_verdict import Asked, foretold, verdict
@@ -41,7 +41,7 @@ def run(folder: Path) -> Path:
 def brief(monkeypatch: pytest.MonkeyPatch) -> None:
     """A few steps."""
     for name, value in QUICK.items():
-        monkeypatch.setattr(search, name, value)
+        monkeypatch.setattr(by_gradients, name, value)
 
 
 def rows(path: Path) -> np.ndarray:

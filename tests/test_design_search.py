@@ -18,7 +18,7 @@ from design_cases import (
     limits,
 )
 from sim2gp import design as d
-from sim2gp.design import search
+from sim2gp.design import by_gradients, search
 from sim2gp.design.limits import excess
 from sim2gp.errors import InputError
 from sim2gp.inference.gaussian import Gaussian
@@ -37,7 +37,7 @@ def test_worth_has_a_gradient_in_the_commands() -> None:
     @jax.jit
     def worth(U):
         states = d.trajectory(e, e.belief.at(z), U)
-        return search._worth_at(e, d.Everything(), z, U, states)[0]
+        return by_gradients._worth_at(e, d.Everything(), z, U, states)[0]
 
     U = commands(2).at[: STEPS // 2].set(0.0)
     V = commands(3)
@@ -51,17 +51,17 @@ def test_worth_has_a_gradient_in_the_commands() -> None:
 def test_a_search_on_longer_periods_sees_the_same() -> None:
     """Fewer samples of as much less noise; an experiment of few periods stays whole."""
     fine = dataclasses.replace(experiment(), period=0.002, steps=500, window=50)
-    coarse, signal = search._coarser(fine, d.Multisine(0.002, 500))
+    coarse, signal = by_gradients._coarser(fine, d.Multisine(0.002, 500))
     assert (coarse.period, coarse.steps, coarse.window) == (0.01, 100, 10)
     box, nowhere = limits(fine.system), jnp.zeros((1, 3))
     C = 0.1 * jax.random.normal(jax.random.key(1), (signal.coefficients, 1))
     told = [
-        float(search._worth(e, d.Everything(), nowhere, s.commands(C, box))[0])
+        float(by_gradients._worth(e, d.Everything(), nowhere, s.commands(C, box))[0])
         for e, s in ((fine, d.Multisine(0.002, 500)), (coarse, signal))
     ]
     assert told[1] == pytest.approx(told[0], abs=0.1)
     short = dataclasses.replace(fine, steps=3, window=3)
-    kept, _ = search._coarser(short, d.Multisine(0.002, 3))
+    kept, _ = by_gradients._coarser(short, d.Multisine(0.002, 3))
     assert (kept.period, kept.steps, kept.window) == (0.002, 3, 3)
 
 
@@ -69,12 +69,16 @@ def test_a_search_on_longer_periods_sees_the_same() -> None:
 def test_commands_are_made_no_smaller_than_they_must_be() -> None:
     e = experiment()
     box, draws = limits(e.system), jax.random.normal(jax.random.key(1), (100, 3))
-    U, states, bad = search._kept(e, box, commands(4, 5.0), draws)
+
+    def check(U):
+        return by_gradients._checked(e, box, U, draws)
+
+    U, states, bad = search._kept(check, commands(4, 5.0))
     share = float(jnp.max(jnp.abs(U)) / jnp.max(jnp.abs(commands(4, 5.0))))
     assert 0.0 < share < 1.0
     assert bad <= 0.01
     assert np.mean([float(excess(box, S)) > 0.0 for S in states]) == pytest.approx(bad)
-    _, larger = search._checked(e, box, U / search.SMALLER, draws)
+    _, larger = check(U / search.SMALLER)
     assert float(jnp.mean(larger > 0.0)) > 0.01
 
 
@@ -94,14 +98,14 @@ def test_a_climb_that_ends_far_outside_is_given_up(monkeypatch) -> None:
     e = experiment()
     box, signal = limits(e.system), d.Multisine(PERIOD, STEPS)
     draws = jax.random.normal(jax.random.key(1), (50, 3))
-    monkeypatch.setattr(search, "_climb", Away())
-    improve = search._climber(e, signal, d.Everything(), box, draws[:2], draws)
+    monkeypatch.setattr(by_gradients, "_climb", Away())
+    improve = by_gradients._climber(e, signal, d.Everything(), box, draws[:2], draws)
     start = improve(jax.random.key(3))
     assert float(jnp.max(jnp.abs(start))) < 1.0
     # It begins nearly within its limits.
     U = signal.commands(start.astype(float), box)
-    _, beyond = search._checked(e, search._narrowed(box), U, draws)
-    assert float(jnp.mean(beyond > 0.0)) <= search.LEAVING + 0.05
+    _, beyond = by_gradients._checked(e, by_gradients.narrowed(box), U, draws)
+    assert float(jnp.mean(beyond > 0.0)) <= by_gradients.LEAVING + 0.05
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +113,7 @@ def found():
     """A short search."""
     with jax.enable_x64(True), pytest.MonkeyPatch.context() as patch:
         for name, value in QUICK.items():
-            patch.setattr(search, name, value)
+            patch.setattr(by_gradients, name, value)
         e = experiment()
         box = limits(e.system, LIMITS, {"voltage": 100.0})
         signal = d.Multisine(PERIOD, STEPS)
@@ -151,7 +155,7 @@ def test_a_refused_start_does_not_end_the_search(found, monkeypatch) -> None:
     """The second of two is returned; the first one's refusal is not."""
     e, box, signal, _ = found
     for name, value in QUICK.items():
-        monkeypatch.setattr(search, name, value)
+        monkeypatch.setattr(by_gradients, name, value)
     kept, calls = search._kept, []
 
     def refused_once(*args: object) -> object:
@@ -174,7 +178,7 @@ def test_no_commands_keep_limits_that_nothing_can(found) -> None:
     box = limits(e.system, {"alpha": (-0.2, 0.401)})
     with pytest.MonkeyPatch.context() as patch:
         for name, value in QUICK.items():
-            patch.setattr(search, name, value)
+            patch.setattr(by_gradients, name, value)
         with pytest.raises(InputError, match="E150 no commands keep the limits"):
             d.design(e, d.Everything(), box, signal, key=jax.random.key(0))
 
@@ -186,15 +190,15 @@ def test_limits_hold_for_the_corrected_posterior_and_nats_are_of_the_plain() -> 
     wide = dataclasses.replace(e, corrected=shifted)
     box, U = limits(e.system), commands()
     draws = jax.random.normal(jax.random.key(2), (5, 3))
-    states, beyond = search._checked(wide, box, U, draws)
+    states, beyond = by_gradients._checked(wide, box, U, draws)
     one = eqx.filter_jit(d.trajectory)
     for z, S, far in zip(draws, states, beyond, strict=True):
         tt = shifted.mean + shifted.scale @ z
         alone = one(e, tt, U)
         np.testing.assert_allclose(S, alone, rtol=1e-6, atol=1e-8)
         assert float(far) == pytest.approx(float(excess(box, alone)), rel=1e-6)
-    told, scale, middle = search._worth(wide, goal, draws, U)
-    expected = search._worth(e, goal, draws, U)
+    told, scale, middle = by_gradients._worth(wide, goal, draws, U)
+    expected = by_gradients._worth(e, goal, draws, U)
     assert float(told) == pytest.approx(float(expected[0]), rel=1e-12)
     np.testing.assert_allclose(scale, expected[1], rtol=1e-12)
     np.testing.assert_allclose(middle, one(e, shifted.mean, U), rtol=1e-6, atol=1e-8)

@@ -17,7 +17,7 @@ import numpy as np
 from equinox import AbstractVar
 from jaxtyping import Array, Float
 
-from sim2gp.data.windows import Windows
+from sim2gp.data.windows import Pieces, Windows
 from sim2gp.inference.linearized import value_and_jacobian
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.plants.external import AbstractSimulator, Arguments
@@ -67,7 +67,7 @@ class HostRun:
         self,
         simulator: AbstractSimulator,
         asked: AbstractAsked,
-        windows: Windows,
+        windows: Pieces,
         e: Float[Array, "W n"],
         k: int,
     ) -> None:
@@ -90,11 +90,11 @@ class HostRun:
 
 @eqx.filter_jit
 def _delays(
-    asked: AbstractAsked, windows: Windows, e: Array, k: int
+    asked: AbstractAsked, windows: Pieces, e: Array, k: int
 ) -> Float[Array, "W m"]:
     """By how much the inputs of each window are late, s."""
 
-    def one(window: Windows, e: Array) -> Array:
+    def one(window: Any, e: Array) -> Array:
         return asked.system.delays(asked(window, e, jnp.zeros(k))[0])
 
     found: Array = windows.each(one, e)
@@ -102,7 +102,7 @@ def _delays(
 
 
 def _inputs(
-    system: AbstractSystem, windows: Windows, late: Float[np.ndarray, "W m"]
+    system: AbstractSystem, windows: Pieces, late: Float[np.ndarray, "W m"]
 ) -> tuple[Float[np.ndarray, "W L m"], Float[np.ndarray, "W L m"]]:
     """The inputs that arrive, and their derivatives in their delays.
 
@@ -123,14 +123,14 @@ def _inputs(
 @eqx.filter_jit
 def _arguments(
     asked: AbstractAsked,
-    windows: Windows,
+    windows: Pieces,
     e: Array,
     arriving: tuple[AnyArray, AnyArray],
     k: int,
 ) -> Any:
     """What the plant is given and what its states are offset by; both by ``x``."""
 
-    def one(window: Windows, e: Array, u: Array, by_delay: Array) -> Any:
+    def one(window: Any, e: Array, u: Array, by_delay: Array) -> Any:
         def arguments(x: Array) -> Any:
             params, held, x0, added = asked(window, e, x)
             # `leave` adds to a state what does not depend on it.

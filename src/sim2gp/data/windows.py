@@ -12,7 +12,28 @@ from sim2gp.systems.simulate import HeldInputs
 from sim2gp.types import AnyArray
 
 
-class Windows(HeldInputs):
+class Pieces(HeldInputs):
+    """Stretches of held inputs, all of one size, a row for each end of a step."""
+
+    span: Float[AnyArray, "W L"]
+    knots: Float[AnyArray, "W H"]
+    area: Float[AnyArray, "W H m"]
+
+    def held(self) -> list[HeldInputs]:
+        """The inputs of each alone, as NumPy's arrays."""
+        parts = map(np.asarray, (self.span, self.knots, self.area))
+        return [HeldInputs(*rows) for rows in zip(*parts, strict=True)]
+
+    def each(self, f: Callable[..., Any], *per_window: Any) -> Any:
+        """``f`` of one of them (and of one row of each argument), for all."""
+        axes = (self._axes(), *[0] * len(per_window))
+        return jax.vmap(f, in_axes=axes)(self, *per_window)
+
+    def _axes(self) -> Any:
+        return 0
+
+
+class Windows(Pieces):
     """Padded windows, a row for each end of an integration step.
 
     Row 0 is the start, padding rows have zero length, and a row without a sample (where
@@ -21,9 +42,6 @@ class Windows(HeldInputs):
     is the machine's, an index into its table's.
     """
 
-    span: Float[AnyArray, "W L"]
-    knots: Float[AnyArray, "W H"]
-    area: Float[AnyArray, "W H m"]
     y: Float[AnyArray, "W L c"]
     mask: Bool[AnyArray, "W L c"]
     start: Float[AnyArray, "W n"]
@@ -46,15 +64,8 @@ class Windows(HeldInputs):
         )
         return chosen
 
-    def held(self) -> list[HeldInputs]:
-        """The inputs of each window alone, as NumPy's arrays."""
-        parts = map(np.asarray, (self.span, self.knots, self.area))
-        return [HeldInputs(*rows) for rows in zip(*parts, strict=True)]
-
-    def each(self, f: Callable[..., Any], *per_window: Any) -> Any:
-        """``f`` of one window (and of one row of each argument), for all windows."""
-        axes = eqx.tree_at(lambda w: w.floor, jax.tree.map(lambda _: 0, self), None)
-        return jax.vmap(f, in_axes=(axes, *[0] * len(per_window)))(self, *per_window)
+    def _axes(self) -> Any:
+        return eqx.tree_at(lambda w: w.floor, jax.tree.map(lambda _: 0, self), None)
 
 
 def motion(windows: Windows) -> Float[np.ndarray, "W c"]:

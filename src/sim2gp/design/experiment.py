@@ -90,7 +90,7 @@ def trajectory(
     experiment: Experiment, tt: Float[Array, " p"], U: Commands
 ) -> Float[Array, "times n"]:
     """States at the beginning and after each period, for one machine."""
-    whole = _piece(experiment, U, 0, experiment.steps)
+    whole = piece(experiment, U, 0, experiment.steps)
     params = experiment.record(tt)
     states = simulate(experiment.system, params, whole, experiment.start)
     return states[:: experiment.substeps]
@@ -114,7 +114,7 @@ def information(
     outputs = np.asarray(experiment.outputs)
 
     def one(i: Array) -> Array:
-        window, x0 = _piece(experiment, U, i, count - 1), states[i]
+        window, x0 = piece(experiment, U, i, count - 1), states[i]
 
         def seen(x: Array) -> Array:
             params = experiment.record(belief.at(z + x[n:]))
@@ -124,12 +124,12 @@ def information(
             return rows.ravel()
 
         _, J = value_and_jacobian(seen, jnp.zeros(n + p, z.dtype))
-        return _about_constants(J, n)
+        return about_constants(J, n)
 
     return jax.vmap(one)(first).reshape(-1, p)
 
 
-def _about_constants(J: Float[Array, "N q"], n: int) -> Float[Array, "rows p"]:
+def about_constants(J: Float[Array, "N q"], n: int) -> Float[Array, "rows p"]:
     """Rows in all of a window's unknowns as rows in its constants alone.
 
     What an unknown start, of unit prior, explains as well is projected out: twice, as
@@ -158,7 +158,7 @@ def sensitivity_at(
     outputs = np.asarray(experiment.outputs)
 
     def one(i: Array) -> Array:
-        window = _piece(experiment, U, i, periods)
+        window = piece(experiment, U, i, periods)
 
         def ahead(tt: Array) -> Array:
             found = simulate(system, experiment.record(tt), window, states[i])
@@ -175,7 +175,7 @@ def after(belief: Gaussian, A: Float[Array, "rows p"]) -> Float[Array, "p p"]:
     return over(belief.scale, triangular(jnp.concatenate([A, eye])))
 
 
-def _piece(experiment: Experiment, U: Commands, first: Any, periods: int) -> HeldInputs:
+def piece(experiment: Experiment, U: Commands, first: Any, periods: int) -> HeldInputs:
     """Some periods, and the inputs that reach them; at rest before the experiment."""
     period, count = experiment.period, experiment.substeps
     reach = experiment.system.longest_delay + DELAY_BLUR

@@ -15,8 +15,11 @@ from jaxtyping import Array, Float
 
 from sim2gp.errors import InputError
 from sim2gp.systems.base import AbstractSystem, index_of
+from sim2gp.systems.machine import plant_of
 
 Pairs = Mapping[str, tuple[float, float]]
+MARGIN = 0.05  # of a box's half, kept free while searching
+SLOW = 3.0  # s, in which the target of a servo crosses its range at the fastest
 
 
 class Limits(eqx.Module):
@@ -86,6 +89,16 @@ class Limits(eqx.Module):
         )
 
 
+def servo_rates(system: AbstractSystem) -> dict[str, float]:
+    """How fast targets of servos may change where nothing is stated, per second.
+
+    A target that jumps drives a servo to its largest torque.
+    """
+    servos = getattr(plant_of(system), "servos", ())
+    spans = {c.name: c.high - c.low for c in system.actions if c.name in servos}
+    return {name: span / SLOW for name, span in spans.items() if math.isfinite(span)}
+
+
 def excess(limits: Limits, states: Float[Array, "T n"]) -> Float[Array, ""]:
     """How far a trajectory leaves the box at worst, in halves of it; below 0 inside."""
     half = 0.5 * (limits.state_high - limits.state_low)
@@ -94,6 +107,14 @@ def excess(limits: Limits, states: Float[Array, "T n"]) -> Float[Array, ""]:
         states - limits.state_high[None], limits.state_low[None] - states
     )
     return jnp.max(over / half[None])
+
+
+def narrowed(limits: Limits) -> Limits:
+    """With a little of the states' box kept free at each end."""
+    low, high = limits.state_low, limits.state_high
+    off = 0.5 * MARGIN * jnp.where(jnp.isfinite(high - low), high - low, 0.0)
+    box = low + off, high - off
+    return eqx.tree_at(lambda l: (l.state_low, l.state_high), limits, box)
 
 
 def kept(limits: Limits, U: Float[Array, "T m"], period: float) -> Float[Array, "T m"]:

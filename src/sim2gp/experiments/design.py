@@ -30,6 +30,7 @@ from sim2gp.design import (
     design,
     prediction_rows,
 )
+from sim2gp.design.limits import SLOW, servo_rates
 from sim2gp.errors import InputError
 from sim2gp.experiments.design_verdict import Asked, expected_table, foretold, verdict
 from sim2gp.experiments.identified import Identified, used
@@ -71,10 +72,17 @@ def run(
         stated = {
             name: (low, high) for name, (low, high) in project.spec.limits.items()
         }
+        rates = dict(project.spec.rates) | dict(asked.rates)
+        slow = servo_rates(experiment.system)
+        if slow.keys() - rates.keys():
+            notes.append(
+                f"no rate is stated of some targets of servos: they cross their range "
+                f"in {SLOW:g} s or more"
+            )
         limits = Limits.of(
             experiment.system,
             stated | dict(asked.limits),
-            dict(project.spec.rates) | dict(asked.rates),
+            slow | rates,
             start=np.asarray(experiment.start),
         )
         if not limits.stated():
@@ -148,6 +156,7 @@ def setting(
         period,
         steps,
         min(window, steps),
+        system.window_substep,
         corrected=corrected,
     )
     return project, experiment, notes

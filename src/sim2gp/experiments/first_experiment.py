@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sim2gp.design import Limits, Multisine
+from sim2gp.design.limits import servo_rates
 from sim2gp.systems import MuJoCo
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import Key, in_float64
@@ -25,7 +26,6 @@ SECONDS, PERIOD = 30.0, 0.01  # of the experiment, and of its commands, in s
 TONES, HIGHEST = 8, 1.0  # sines of each input; the fastest in Hz
 DRAWS = 8  # of the prior, next to the nominal parameters
 SHARES = (0.4, 0.25, 0.15, 0.1, 0.05)  # of the way to the limits of each input
-SLOW = 3.0  # s, in which the target of a servo crosses its range at the fastest
 MARGIN = 0.05  # of a joint's range, kept free at each end
 LOOK = 50  # steps, after which a simulation is looked at
 FORCE = 0.9  # of an actuator's largest force
@@ -64,7 +64,8 @@ def safe_excitation(system: AbstractSystem, *, key: Key, until: float) -> Excita
     start = _start(system, home)
     n = len(system.physical_states)
     none = np.full(n, np.inf)
-    rate = np.where(_is_target(system), (high - low) / SLOW, np.inf)
+    slow = servo_rates(system)
+    rate = np.asarray([slow.get(c.name, np.inf) for c in system.actions])
     box = Limits(low - home, high - home, rate, -none, none)
     signal = Multisine(PERIOD, round(SECONDS / PERIOD), tones=TONES, highest=HIGHEST)
     U = np.asarray(signal.commands(signal.random(key, len(low)), box))
@@ -97,12 +98,6 @@ def _ranges(
         low.append(a)
         high.append(b)
     return np.asarray(low), np.asarray(high)
-
-
-def _is_target(system: AbstractSystem) -> list[bool]:
-    """Of each input: whether it is the target of a servo."""
-    servos = system.servos if isinstance(system, MuJoCo) else ()
-    return [channel.name in servos for channel in system.actions]
 
 
 def _start(

@@ -142,14 +142,15 @@ class Engine(AbstractSimulator):
         inputs = np.take_along_axis(u, order[..., None], axis=1)
         inputs = inputs[:, : moving.sum(1).max()]
         control = np.repeat(inputs, count, axis=1)
+        h, (values, which) = length / count, _distinct(theta)
+        states = np.empty((*inputs.shape[:2], x0.shape[1]))
         with self._lock:
-            values, which = _distinct(theta)
-            models = self._models(values)
-            chosen = [models[k] for k in which]
-            h = length / count
-            states = self._stepped(chosen, models, x0, control, h)[
-                :, count - 1 :: count
-            ]
+            for first in range(0, len(values), COPIES):
+                models = self._models(values[first : first + COPIES])
+                at = np.flatnonzero((which >= first) & (which < first + COPIES))
+                chosen = [models[k - first] for k in which[at]]
+                found = self._stepped(chosen, models, x0[at], control[at], h)
+                states[at] = found[:, count - 1 :: count]
         whole = np.concatenate([x0[:, None], states], axis=1)
         return whole[np.arange(len(u))[:, None], np.cumsum(moving, axis=1)]
 
