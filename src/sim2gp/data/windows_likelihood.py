@@ -49,8 +49,8 @@ class WindowsLikelihood(AbstractLikelihood):
     @in_float64
     def __init__(self, system: AbstractSystem, windows: Windows) -> None:
         self.system, self.windows = system, jax.tree.map(jnp.asarray, windows)
-        mask = self.windows.mask.astype(self.windows.y.dtype)
-        self.counts, self.floor = jnp.sum(mask, axis=1), self.windows.floor
+        counts = np.sum(windows.mask, axis=1, dtype=float)
+        self.counts, self.floor = jnp.asarray(counts), self.windows.floor
 
     @property
     def n_nuisances(self) -> int:
@@ -130,16 +130,14 @@ class WindowsLikelihood(AbstractLikelihood):
 
         return Trial(np.sum(r**2, axis=1), blocks)
 
-    @eqx.filter_jit
     def first_noise(self) -> Noise:
         """The measurements' sd about each window's mean."""
-        windows = self.windows
-        mask = windows.mask.astype(windows.y.dtype)
-        y = jnp.where(windows.mask, windows.y, 0.0)
-        mean = jnp.sum(y, axis=1) / jnp.maximum(jnp.sum(mask, axis=1), 1)
-        squares = jnp.sum(mask * (y - mean[:, None]) ** 2, axis=(0, 1))
-        mean_square = squares / jnp.maximum(jnp.sum(mask, axis=(0, 1)), 1)
-        return Noise(jnp.sqrt(mean_square) + self.floor, jnp.ones(len(windows)))
+        counts, floor = np.asarray(self.counts), np.asarray(self.floor)
+        y, mask = np.asarray(self.windows.y), np.asarray(self.windows.mask)
+        mean = np.where(mask, y, 0.0).sum(axis=1) / np.maximum(counts, 1)
+        squares = np.where(mask, (y - mean[:, None]) ** 2, 0.0).sum(axis=(0, 1))
+        sd = np.sqrt(squares / np.maximum(counts.sum(axis=0), 1)) + floor
+        return Noise(jnp.asarray(sd), jnp.ones(len(y)))
 
 
 class _About(AbstractAsked):

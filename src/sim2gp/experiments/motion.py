@@ -8,7 +8,6 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -107,8 +106,7 @@ def _held(
 def _constants(
     system: AbstractSystem, posterior: Gaussian, configuration: int
 ) -> dict[str, float]:
-    mean = jnp.asarray(posterior.mean, float)
-    values = system.values(mean, configuration)
+    values = system.values(np.asarray(posterior.mean, float), configuration)
     return {name: float(value) for name, value in values.items()}
 
 

@@ -24,7 +24,6 @@ from sim2gp.identification.identifiability.directions import directions
 from sim2gp.identification.identifiability.spectrum import (
     FisherAt,
     Spectrum,
-    constrained,
     spectrum,
 )
 from sim2gp.identification.identifiability.table import add_plain, parameter_table
@@ -109,7 +108,7 @@ def _physical(
 ) -> Float[np.ndarray, "draws p"]:
     """Draws of the constants in their units."""
     tt = _draws(gaussian, jax.random.split(key, count))
-    return np.asarray(constrained(parameters, tt))
+    return parameters.constrain(np.asarray(tt))
 
 
 @eqx.filter_jit

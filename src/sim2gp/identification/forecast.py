@@ -41,7 +41,7 @@ from sim2gp.inference.gaussian import LOG_2PI, Gaussian
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.host import simulator_of
 from sim2gp.systems.plants.external import AbstractSimulator
-from sim2gp.types import in_float64
+from sim2gp.types import AnyArray, in_float64
 
 _BATCH = 64  # windows at a time: bounds the memory of sensitivities
 
@@ -138,10 +138,10 @@ def _forecast_on_host(
     system: AbstractSystem,
     posterior: Gaussian,
     windows: Windows,
-) -> tuple[Array, Array, Array, Array]:
+) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
     asked, k = _From(system, posterior), _directions(posterior, windows)
     run = HostRun(simulator, asked, windows, windows.start, k)
-    return _all_parts(windows, jnp.asarray(run.states), jnp.asarray(run.slopes()))
+    return _parts(windows, run.states, run.slopes())
 
 
 class _From(AbstractAsked):
@@ -165,22 +165,16 @@ def _directions(posterior: Gaussian, windows: Windows) -> int:
 
 
 def _parts(
-    window: Windows, states: Float[Array, "L n"], slopes: Float[Array, "L n k"]
-) -> tuple[Array, Array, Array, Array]:
+    window: Windows,
+    states: Float[AnyArray, "*W L n"],
+    slopes: Float[AnyArray, "*W L n k"],
+) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
     """Outputs, their slopes in start and input, and their variance by constants."""
     outputs = np.asarray(window.outputs)
-    n, J = states.shape[1], slopes[:, outputs]
-    inputs = n + window.area.shape[1]
-    rest = jnp.sum(J[..., inputs:] ** 2, axis=-1)
-    return states[:, outputs], J[..., :n], J[..., n:inputs], rest
-
-
-@eqx.filter_jit
-def _all_parts(
-    windows: Windows, states: Array, slopes: Array
-) -> tuple[Array, Array, Array, Array]:
-    found: tuple[Array, Array, Array, Array] = windows.each(_parts, states, slopes)
-    return found
+    n, J = states.shape[-1], slopes[..., outputs, :]
+    inputs = n + window.area.shape[-1]
+    rest = (J[..., inputs:] ** 2).sum(axis=-1)
+    return states[..., outputs], J[..., :n], J[..., n:inputs], rest
 
 
 def _passed(grid: Grid) -> Int[np.ndarray, " L"]:

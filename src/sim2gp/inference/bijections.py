@@ -42,6 +42,25 @@ def constrain(kind: str, t: AnyArray, low: Any, high: Any) -> AnyArray:
     return xp.clip(t, -huge, huge)
 
 
+def slopes(kind: str, t: AnyArray, low: Any, high: Any) -> tuple[AnyArray, AnyArray]:
+    """First derivative of `constrain` in ``t``, and the second over the first."""
+    xp, one = library(t), np.ones((), t.dtype)
+    sigmoid = expit if xp is np else jax.nn.sigmoid
+    up, down = sigmoid(t), sigmoid(-t)
+    if kind == "bounded":
+        return (high - low) * up * down, down - up
+    if kind == "log_bounded":
+        steep = (np.log(high) - np.log(low)) * up * down
+        return constrain(kind, t, low, high) * steep, steep + down - up
+    if kind == "softplus":
+        return up, down
+    if kind == "log":
+        limit = np.floor(np.log(np.finfo(t.dtype).max))
+        held = xp.where(xp.abs(t) < limit, one, 0.0 * one)
+        return held * constrain(kind, t, low, high), held
+    return xp.ones_like(t), xp.zeros_like(t)
+
+
 def unconstrain(kind: str, theta: Array, low: Any, high: Any) -> Array:
     """Virtual values of physical ones; a value on a bound maps just inside it."""
     if kind in ("bounded", "log_bounded"):
@@ -60,4 +79,4 @@ def scatter(parts: list[AnyArray], groups: list[Any], like: AnyArray) -> AnyArra
     if not parts:
         return like
     order = np.concatenate([index for _, index, _, _ in groups])
-    return library(like).concatenate(parts)[np.argsort(order)]
+    return library(like).concatenate(parts, axis=-1)[..., np.argsort(order)]

@@ -22,8 +22,9 @@ from sim2gp import checks
 from sim2gp.errors import InputError, nearest
 from sim2gp.inference import bijections
 from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.linalg import library
 from sim2gp.inference.linear_measurements import LinearMeasurement, residuals
-from sim2gp.types import AnyArray, Scalar
+from sim2gp.types import AnyArray, AnyScalar
 
 #: Standard deviation of a boxed parameter's virtual value: the box is nearly uniform
 #: and the sigmoid stays out of saturation.
@@ -249,11 +250,11 @@ class Parameters(eqx.Module):
     def __getitem__(self, name: str) -> Parameter:
         return self.free[self.names.index(name)]
 
-    def constrain(self, tt: Float[AnyArray, " p"]) -> Float[AnyArray, " p"]:
+    def constrain(self, tt: Float[AnyArray, "*n p"]) -> Float[AnyArray, "*n p"]:
         """Physical values of virtual ones, always inside the bounds."""
         out = []
         for kind, index, low, high in self._groups(tt.dtype):
-            out.append(bijections.constrain(kind, tt[index], low, high))
+            out.append(bijections.constrain(kind, tt[..., index], low, high))
         return bijections.scatter(out, self._groups(tt.dtype), tt)
 
     def unconstrain(self, theta: Float[Array, " p"]) -> Float[Array, " p"]:
@@ -263,29 +264,39 @@ class Parameters(eqx.Module):
             out.append(bijections.unconstrain(kind, theta[index], low, high))
         return bijections.scatter(out, self._groups(theta.dtype), theta)
 
+    def slopes(
+        self, tt: Float[AnyArray, " p"]
+    ) -> tuple[Float[AnyArray, " p"], Float[AnyArray, " p"]]:
+        """First derivatives of `constrain`, and second ones over the first."""
+        groups = self._groups(tt.dtype)
+        both = [bijections.slopes(kind, tt[i], a, b) for kind, i, a, b in groups]
+        first, second = ([x[k] for x in both] for k in (0, 1))
+        place = bijections.scatter
+        return place(first, groups, tt), place(second, groups, tt)
+
     def curvature(
-        self, prior: Gaussian, z: Float[Array, " p"], gradient: Float[Array, " p"]
-    ) -> Float[Array, "p p"]:
+        self,
+        prior: Gaussian,
+        z: Float[AnyArray, " p"],
+        gradient: Float[AnyArray, " p"],
+    ) -> Float[AnyArray, "p p"]:
         """What the bounded maps add to the Hessian of a function of ``theta``.
 
         At ``tt = mu0 + L0 z``, with the function's ``gradient`` in ``z``. Each map
         contributes ``dF/dtt map''/map'``: at a bound, as much as it takes to push the
         constant there.
         """
+        xp = library(z)
+        mean, scale = xp.asarray(prior.mean), xp.asarray(prior.scale)
+        first, over = self.slopes(mean + scale @ z)
+        bend = xp.where(first > 0.0, over, 0.0)
+        by_tt = xp.linalg.solve(scale.T, gradient)
+        return scale.T @ ((by_tt * bend)[:, None] * scale)
 
-        def slope(tt: Array) -> Array:
-            return jax.jvp(self.constrain, (tt,), (jnp.ones_like(tt),))[1]
-
-        tt = prior.mean + prior.scale @ z
-        first, second = jax.jvp(slope, (tt,), (jnp.ones_like(tt),))
-        bend = jnp.where(first > 0.0, second / first, 0.0)
-        by_tt = jnp.linalg.solve(prior.scale.T, gradient)
-        return prior.scale.T @ ((by_tt * bend)[:, None] * prior.scale)
-
-    def values(self, tt: Float[Array, " p"]) -> dict[str, Scalar]:
+    def values(self, tt: Float[AnyArray, " p"]) -> dict[str, AnyScalar]:
         """Every constant by name, in physical units: the free ones and the fixed."""
         theta = self.constrain(tt)
-        values = {name: jnp.asarray(v, tt.dtype) for name, v in self.fixed}
+        values = {name: library(tt).asarray(v, tt.dtype) for name, v in self.fixed}
         return values | {p.name: theta[i] for i, p in enumerate(self.free)}
 
     def measurement_rows(

@@ -67,7 +67,7 @@ class ParameterPrior(AbstractPrior):
     def curvature(
         self, z: Float[AnyArray, " p"], gradient: Float[AnyArray, " p"]
     ) -> Float[AnyArray, "p p"]:
-        return _like(z, _curved, self.table, self.gaussian, z, gradient)
+        return self.table.curvature(self.gaussian, z, gradient)
 
     @in_float64
     def linearised(self, tt: Float[Array, " p"]) -> Gaussian:
@@ -105,7 +105,3 @@ def _like(z: AnyArray, f: Callable[..., Array], *args: Any) -> Any:
 
 def _measured(table: Parameters, gaussian: Gaussian, z: Array) -> Array:
     return table.measurement_rows(gaussian, z)
-
-
-def _curved(table: Parameters, gaussian: Gaussian, z: Array, gradient: Array) -> Array:
-    return table.curvature(gaussian, z, gradient)

@@ -235,8 +235,8 @@ class AbstractSystem(eqx.Module):
         return self.step(self.record(self.values(tt, variant)), s, a, dt)
 
     def values(
-        self, tt: Float[Array, " p"], variant: Which = None
-    ) -> dict[str, Scalar]:
+        self, tt: Float[AnyArray, " p"], variant: Which = None
+    ) -> dict[str, AnyScalar]:
         """Every constant by name, in physical units, of one variant.
 
         ``variant`` is an index; only a machine that has several needs it (E152).

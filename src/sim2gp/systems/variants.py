@@ -21,7 +21,7 @@ from jaxtyping import Int
 from sim2gp.errors import InputError, nearest
 from sim2gp.inference.parameters import Parameter, Parameters, unknown_parameter
 from sim2gp.systems.function_checks import names_of
-from sim2gp.types import AnyArray, Scalar
+from sim2gp.types import AnyArray, AnyScalar
 
 #: Between a constant and the one variant whose column it is.
 AT = " @ "
@@ -52,8 +52,8 @@ class Variant:
 
 
 def values_of(
-    columns: Mapping[str, Scalar], variants: Sequence[Variant], index: Which
-) -> dict[str, Scalar]:
+    columns: Mapping[str, AnyScalar], variants: Sequence[Variant], index: Which
+) -> dict[str, AnyScalar]:
     """The constants of one variant out of all columns and known values.
 
     ``index`` may be traced: constants that differ are gathered, the others stay as they

@@ -16,8 +16,6 @@ an (often degenerate) flat space the decomposition returned.
 from collections.abc import Callable
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -122,24 +120,12 @@ def spectrum(
     )
 
 
-@in_float64
 def physical(
     parameters: Parameters, tt: Float[np.ndarray, " p"]
 ) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
     """Physical values and their slopes ``dtheta/dtt``."""
-    theta, slope = _with_slope(parameters, jnp.asarray(tt, float))
-    return np.asarray(theta), np.asarray(slope)
-
-
-@eqx.filter_jit
-def _with_slope(parameters: Parameters, tt: Array) -> tuple[Array, Array]:
-    return jax.jvp(parameters.constrain, (tt,), (jnp.ones_like(tt),))
-
-
-@eqx.filter_jit
-def constrained(parameters: Parameters, TT: Float[Array, "n p"]) -> Float[Array, "n p"]:
-    """Physical values of many vectors at once: one compilation, not one per map."""
-    return jax.vmap(parameters.constrain)(TT)
+    tt = np.asarray(tt, float)
+    return parameters.constrain(tt), parameters.slopes(tt)[0]
 
 
 def virtual_columns(

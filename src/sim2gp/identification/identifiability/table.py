@@ -16,7 +16,6 @@ would help.
 
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -25,7 +24,6 @@ from sim2gp.identification.identifiability.spectrum import (
     DOMINATED,
     IDENTIFIED,
     Spectrum,
-    constrained,
 )
 from sim2gp.identification.words import (
     digits,
@@ -99,7 +97,7 @@ def physical_moments(
     weight /= weight.sum(axis=0)
     ends = np.outer([-_UPPER, _UPPER], sd)
     values = mean + np.concatenate([sd * z, ends])
-    theta = np.asarray(constrained(parameters, jnp.asarray(values, float)))
+    theta = parameters.constrain(np.asarray(values, float))
     theta, (low, high) = theta[:-2], theta[-2:]
     first = np.sum(weight * theta, axis=0)
     second = np.sum(weight * (theta - first[None]) ** 2, axis=0)

@@ -76,7 +76,8 @@ def corrected_windows(
     pulls = pulls_of_rows(rows, cut, group)
     order = np.concatenate([own, _distinct(pulls, own)])
     lacking = np.arange(len(order)) >= p
-    prior = Gaussian(whole.prior.mean[order], whole.prior.scale[np.ix_(order, order)])
+    mean, scale = np.asarray(whole.prior.mean), np.asarray(whole.prior.scale)
+    prior = Gaussian(*map(jnp.asarray, (mean[order], scale[np.ix_(order, order)])))
     for _ in range(ROUNDS):
         here = Gaussian(jnp.asarray(at[order]), prior.scale)
         found = corrected(prior, here, pulls.of(order), lacking)
