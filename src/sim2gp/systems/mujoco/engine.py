@@ -280,10 +280,13 @@ def _distinct(
     rows: Float[np.ndarray, "B k"],
 ) -> tuple[Float[np.ndarray, "U k"], Int[np.ndarray, " B"]]:
     """The different rows, and which of them each is."""
-    if (rows == rows[:1]).all():  # as in most fits; sorting takes longer than to see it
+    differ = (rows != rows[:1]).any(axis=0)
+    if not differ.any():  # as in most fits; sorting takes longer than to see it
         return rows[:1], np.zeros(len(rows), int)
-    found, which = np.unique(rows, axis=0, return_inverse=True)
-    return found, which.reshape(-1)
+    _, first, which = np.unique(
+        rows[:, differ], axis=0, return_index=True, return_inverse=True
+    )
+    return rows[first], which.reshape(-1)
 
 
 def _check_centres(model: Any, constants: Sequence[Sequence[Constant]]) -> None:
