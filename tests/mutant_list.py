@@ -217,9 +217,16 @@ MUTANTS = (
     Mutant(
         "the maps' curvature forgotten",
         TABLE,
-        "bend = jnp.where(first > 0.0, second / first, 0.0)",
-        "bend = jnp.where(first > 0.0, 0.0 * second / first, 0.0)",
+        "bend = xp.where(first > 0.0, over, 0.0)",
+        "bend = xp.where(first > 0.0, 0.0 * over, 0.0)",
         CURVED,
+    ),
+    Mutant(
+        "a map's bend is that of its sigmoid alone",
+        "inference/bijections.py",
+        "steep + down - up",
+        "down - up",
+        ("test_parameters.py", "slopes_of_the_maps"),
     ),
     Mutant(
         "update forgets the evidence",

@@ -4,8 +4,10 @@
 """
 
 import ast
+import importlib
 import importlib.util
 import itertools
+import json
 import re
 import signal
 import tomllib
@@ -355,3 +357,26 @@ def test_the_architecture_is_that_of_the_tree() -> None:
         found = sum(len((PACKAGE / f).read_text().splitlines()) for f in files)
         told = int(re.findall(r"\((\d+) lines\)", line)[0])
         assert abs(found - told) <= 0.1 * found, line
+
+
+# ----------------------------------------------------------------- measured tables
+
+
+@pytest.mark.parametrize(
+    ("benchmark", "page"),
+    [
+        ("mjcf_table", "README.md"),
+        ("mjcf_table", "docs/your_robot.md"),
+        ("arm_and_sysid", "docs/your_robot.md"),
+        ("arm_bound", "docs/your_robot.md"),
+    ],
+)
+def test_a_table_is_that_of_its_results(
+    benchmark: str, page: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Printed by the benchmark's own function from the results that are checked in."""
+    pytest.importorskip("mujoco", reason="the extra `mujoco` is not installed")
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    module = importlib.import_module(benchmark)
+    results = json.loads((ROOT / "results" / f"{benchmark}.json").read_text())
+    assert module.table(results) in (ROOT / page).read_text(encoding="utf-8")

@@ -12,6 +12,7 @@ import scipy.integrate
 import scipy.stats
 
 from sim2gp.errors import InputError
+from sim2gp.inference import bijections
 from sim2gp.inference.bijections import MAPS
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.parameters import (
@@ -278,3 +279,22 @@ def test_curvature_is_what_the_maps_add_to_a_hessian():
         np.testing.assert_allclose(found, jax.hessian(f)(z), rtol=1e-10, atol=1e-12)
         far = table.curvature(prior, 1e4 * z, jnp.ones(5))
         assert np.all(np.isfinite(np.asarray(far)))
+
+
+@pytest.mark.parametrize("kind", bijections.MAPS)
+def test_slopes_of_the_maps_are_those_that_jax_finds(kind: str) -> None:
+    low, high = np.asarray([0.5]), np.asarray([20.0])
+    t = np.linspace(-6.0, 6.0, 13)
+
+    def physical(t: jax.Array) -> jax.Array:
+        return bijections.constrain(kind, t[None], low, high)[0]
+
+    with jax.enable_x64(True):
+        first = jax.vmap(jax.grad(physical))(jnp.asarray(t))
+        second = jax.vmap(jax.grad(jax.grad(physical)))(jnp.asarray(t))
+        in_jax = bijections.slopes(kind, jnp.asarray(t), low, high)
+        slope, bend = bijections.slopes(kind, t, low, high)
+    np.testing.assert_allclose(slope, first, rtol=1e-12)
+    np.testing.assert_allclose(bend, second / first, rtol=0.0, atol=1e-12)
+    for mine, theirs in zip((slope, bend), in_jax, strict=True):
+        np.testing.assert_allclose(theirs, mine, rtol=1e-12, atol=1e-14)

@@ -13,7 +13,6 @@ and posterior are Gaussian; moments and quantiles are reported in physical units
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Float
@@ -94,23 +93,20 @@ def arrays(
     Correlations are those of the virtual values; the maps are increasing, so they are
     the physical ones wherever the posterior is narrow.
     """
-    before, after = jax.random.split(key)
+    rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     unit = np.asarray(posterior.scale) / np.asarray(posterior.sd())[:, None]
     return {
-        "parameters/prior_samples": _physical(parameters, prior, before, count),
-        "parameters/samples": _physical(parameters, posterior, after, count),
+        "parameters/prior_samples": _physical(parameters, prior, rng, count),
+        "parameters/samples": _physical(parameters, posterior, rng, count),
         "parameters/correlation": np.clip(unit @ unit.T, -1.0, 1.0),
     }
 
 
 def _physical(
-    parameters: Parameters, gaussian: Gaussian, key: Key, count: int
+    parameters: Parameters, gaussian: Gaussian, rng: np.random.Generator, count: int
 ) -> Float[np.ndarray, "draws p"]:
     """Draws of the constants in their units."""
-    tt = _draws(gaussian, jax.random.split(key, count))
-    return parameters.constrain(np.asarray(tt))
-
-
-@eqx.filter_jit
-def _draws(gaussian: Gaussian, keys: Array) -> Array:
-    return jax.vmap(gaussian.sample)(keys)
+    mean, scale = np.asarray(gaussian.mean), np.asarray(gaussian.scale)
+    return parameters.constrain(
+        mean + rng.normal(size=(count, scale.shape[1])) @ scale.T
+    )

@@ -39,7 +39,7 @@ STILL = 1e-3
 NOTHING = 1e-2
 #: Steps that a descent may take; a start among others, fewer.
 MOST_STEPS, FIRST_STEPS = 100, 30
-NOISE_TURNS = 10  # of EM at one point
+NOISE_TURNS, NEARLY = 10, 0.05  # of EM at one point; of the first, in a last one
 
 #: Noise that the residuals about a MAP are expected to have, given the noise until now.
 Update = Callable[[Laplace, Noise], Noise]
@@ -129,12 +129,15 @@ def _rested(
     update: Update, here: Laplace, noise: Noise
 ) -> tuple[Laplace, Noise, float]:
     """The noise where it rests at a point, which asks nothing of the simulator."""
-    first, at = noise, here.at
-    for _ in range(NOISE_TURNS):
+    first, at, enough = noise, here.at, 0.1 * STILL
+    for turn in range(NOISE_TURNS):
         noise, before = update(here, noise), noise
         again = point(at.z, at.e, at.blocks, at.prior, noise)
         here = laplace(again, noise)
-        if _change(noise, before) <= 0.1 * STILL:
+        moved = _change(noise, before)
+        if turn == 0:  # it follows the next step as well
+            enough = max(enough, NEARLY * moved)
+        if moved <= enough:
             break
     return here, noise, _change(noise, first)
 

@@ -94,9 +94,19 @@ def unit_in(name: str) -> str | None:
 
 
 def time_column(columns: Mapping[str, Values], where: str) -> Match:
-    """The column of time and its unit, by name and by how it grows (E103)."""
+    """The column of time and its unit, by name and how it grows (E103, E116)."""
     grow = [name for name, x in columns.items() if _grows(x)]
     named = [name for name in grow if TIME & set(words_of(name))]
+    rows = min((len(x) for x in columns.values()), default=0)
+    if rows < 3:
+        raise InputError(
+            "E116",
+            "a log that is too short",
+            where=where,
+            got=f"{rows} rows",
+            expected="a recording of a few seconds",
+            fix="record longer, or leave it out",
+        )
     if not grow:
         raise InputError(
             "E103",
