@@ -2,12 +2,12 @@
 
     python benchmarks/arm_bound.py [--seeds N] [--out DIR]
 
-The Cramer-Rao bound at the true constants: what no unbiased estimate beats, from the
-same logs, with encoders of 1e-3 rad, unknown starts and this program's priors. A
-constant whose error is normal with that sd is off by .67 of it in half of all cases;
-the table has the median of that over the 22 constants, then over seeds, beside the
-errors that `arm_and_sysid.py` has measured. Windows of 1 s have a start each, the whole
-log has one. Writes `arm_bound.json` and prints a table.
+The information of the same logs at the true constants (the Cramer-Rao bound), with
+encoders of 1e-3 rad, unknown starts and this program's priors. A constant whose error
+is normal with that sd is off by .67 of it in half of all cases; the table has the
+median of that over the 22 constants, then over seeds, beside the errors that
+`arm_and_sysid.py` has measured. Windows of 1 s have a start each, the whole log has
+one. Writes `arm_bound.json` and prints a table.
 """
 
 import argparse
