@@ -105,7 +105,8 @@ def worth_at(
         return -np.inf, experiment.belief.scale
     count, p = experiment.window, z.size
     first = np.arange(0, experiment.steps - count + 2, count)
-    asked = _Seen(experiment.system, experiment.belief, jnp.asarray(z), _sd(experiment))
+    start_sd = jnp.asarray(experiment.start_sd)
+    asked = _Seen(experiment.system, experiment.belief, jnp.asarray(z), start_sd)
     n = states.shape[1]
     J = _rows(experiment, asked, U, states[first], first, count - 1, n + p)
     A = _about(jnp.asarray(J.reshape(len(first), -1, n + p)), n)
@@ -224,10 +225,6 @@ def _run(
     assert simulator is not None
     windows = Pieces(pieces.span, pieces.knots, pieces.area)
     return HostRun(simulator, asked, windows, jnp.asarray(e), k)
-
-
-def _sd(experiment: Experiment) -> Float[Array, " n"]:
-    return jnp.asarray(experiment.start_sd)
 
 
 @eqx.filter_jit
