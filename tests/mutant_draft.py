@@ -89,8 +89,8 @@ FIRST_DRAFT = (
     Mutant(
         "first experiment: targets jump",
         "design/limits.py",
-        "return {name: span / SLOW for",
-        "return {name: math.inf * span for",
+        "((high - low) / SLOW).tolist()",
+        "(100.0 * (high - low)).tolist()",
         ("test_design_mujoco.py", "move_slowly"),
     ),
     Mutant(

@@ -116,4 +116,7 @@ def test_targets_of_servos_move_slowly_unless_stated(tmp_path: Path) -> None:
     rates = servo_rates(arm)
     spans = {c.name: c.high - c.low for c in arm.actions}
     assert rates == {name: span / 3.0 for name, span in spans.items()}
+    # Of a target that may leave its joint's range, the joint's counts.
+    wide = servo_arm.model_text().replace('ctrlrange="-3.1 3.1"', 'ctrlrange="-9 9"')
+    assert servo_rates(MuJoCo(mujoco.MjModel.from_xml_string(wide))) == rates
     assert servo_rates(MuJoCo(mujoco.MjModel.from_xml_string(MODEL))) == {}

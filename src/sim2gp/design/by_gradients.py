@@ -26,7 +26,7 @@ from sim2gp.design.experiment import (
     trajectory,
 )
 from sim2gp.design.goals import AbstractGoal
-from sim2gp.design.limits import Limits, excess, narrowed
+from sim2gp.design.limits import Limits, all_excess, excess, narrowed
 from sim2gp.design.signals import AbstractSignal
 from sim2gp.design.ways import Ways
 from sim2gp.models.training import adamw, descend
@@ -50,14 +50,10 @@ def ways(
     goal: AbstractGoal,
     limits: Limits,
     informed: Float[Array, "D p"],
-    keys: tuple[Key, Key],
+    trials: Float[Array, "N p"],
+    held_out: Float[Array, "K p"],
 ) -> Ways:
     """Programs of JAX; they begin to be compiled here."""
-    p = informed.shape[1]
-    trials, held_out = (
-        jax.random.normal(k, (count, p))
-        for k, count in zip(keys, (TRIALS, CHECKED), strict=True)
-    )
     nothing = jnp.zeros((experiment.steps, limits.low.size))
     rough, coarse = _coarser(experiment, signal)
     improve = _climber(rough, coarse, goal, limits, informed, trials)
@@ -226,8 +222,7 @@ def _checked(
 ) -> tuple[Array, Array]:
     """Of plausible machines, and how far each leaves the limits; infinite when lost."""
     states = _states(experiment, U, jax.vmap(experiment.plausible.at)(draws))
-    beyond = jax.vmap(lambda S: excess(limits, S))(states)
-    return states, jnp.where(jnp.isfinite(beyond), beyond, jnp.inf)
+    return states, all_excess(limits, states)
 
 
 sensitivity = eqx.filter_jit(sensitivity_at)

@@ -12,13 +12,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from sim2gp.data.window_slopes import AbstractAsked, HostRun
 from sim2gp.data.windows import Pieces
 from sim2gp.design.experiment import Experiment, about_constants, after, piece
 from sim2gp.design.goals import AbstractGoal
-from sim2gp.design.limits import Limits, excess, narrowed
+from sim2gp.design.limits import Limits, all_excess, narrowed
 from sim2gp.design.signals import AbstractSignal
 from sim2gp.design.ways import Ways
 from sim2gp.inference.gaussian import Gaussian
@@ -30,7 +30,7 @@ from sim2gp.types import Key
 ROUNDS, SAMPLES, ELITES = 10, 24, 6
 SMALL, LARGE = 0.1, 1.0  # coefficients' sd in the first round, from sample to sample
 FRESH = 0.3  # of the best ones' sd, what is new in the next
-GUARDS = 5  # draws that must keep the limits while searching
+TRIALS = 5  # draws that must keep the limits while searching
 CHECKED = 300  # draws that the result is held against
 CHEAP, COST = 10.0, 100.0  # of a half of the box, for each direction asked about; nats
 
@@ -43,18 +43,14 @@ def ways(
     goal: AbstractGoal,
     limits: Limits,
     informed: Float[Array, "D p"],
-    keys: tuple[Key, Key],
+    trials: Float[Array, "N p"],
+    held_out: Float[Array, "K p"],
 ) -> Ways:
     """Loops of the host around its simulator."""
-    p = informed.shape[1]
-    guards, held_out = (
-        np.asarray(jax.random.normal(k, (count, p)))
-        for k, count in zip(keys, (GUARDS, CHECKED), strict=True)
-    )
-    draws = np.asarray(informed)
+    draws, guards, others = map(np.asarray, (informed, trials, held_out))
     return Ways(
         sampled(experiment, signal, goal, limits, draws, guards),
-        lambda U: checked(experiment, limits, np.asarray(U), held_out),
+        lambda U: checked(experiment, limits, np.asarray(U), others),
         lambda U: worth(experiment, goal, draws, np.asarray(U)),
     )
 
@@ -63,26 +59,23 @@ def sensitivity(
     experiment: Experiment, commands: Float[Array, "T m"], periods: int
 ) -> Float[Array, "k p"]:
     """`sensitivity_at`."""
-    U, tt, p = np.asarray(commands), experiment.belief.mean, experiment.belief.mean.size
+    U, tt = np.asarray(commands), experiment.belief.mean
     states = states_of(experiment, U, np.asarray(tt)[None])[0]
     first = np.arange(0, experiment.steps - periods + 1, periods)
-    unit = Gaussian(tt, jnp.eye(p))  # in the parameters themselves
+    unit = Gaussian(tt, jnp.eye(tt.size))  # in the parameters themselves
     n = states.shape[1]
-    asked = _Seen(experiment.system, unit, jnp.zeros(p), jnp.zeros(n))
-    J = _rows(experiment, asked, U, states[first], first, periods, n + p)
-    return jnp.asarray(J[:, -1, :, n:].reshape(-1, p))
+    asked = _Seen(experiment.system, unit, jnp.zeros(n))
+    J = _rows(experiment, asked, U, states[first], first, periods)
+    return jnp.asarray(J[:, -1, :, n:].reshape(-1, tt.size))
 
 
 def states_of(
     experiment: Experiment, U: Float[np.ndarray, "T m"], machines: np.ndarray
 ) -> States:
     """Those at the beginning and after each period, of machines at virtual values."""
-    whole = piece(experiment, jnp.asarray(U), 0, experiment.steps)
-    many = jax.tree.map(
-        lambda x: np.repeat(np.asarray(x)[None], len(machines), 0), whole
-    )
-    asked = _Whole(experiment.system, jnp.asarray(experiment.start))
-    return _run(experiment, asked, many, machines, 1).states[:, :: experiment.substeps]
+    asked, first = _Whole(experiment.system, experiment.start), np.zeros(len(machines))
+    run = _run(experiment, asked, U, machines, first.astype(int), experiment.steps, 1)
+    return run.states[:, :: experiment.substeps]
 
 
 def checked(
@@ -91,8 +84,7 @@ def checked(
     """Of plausible machines, and how far each leaves the limits; infinite when lost."""
     machines = np.stack([np.asarray(experiment.plausible.at(z)) for z in draws])
     states = states_of(experiment, U, machines)
-    beyond = np.asarray(_excess(limits, states))
-    return states, np.where(np.isfinite(beyond), beyond, np.inf)
+    return states, np.asarray(_excess(limits, jnp.asarray(states)))
 
 
 def worth_at(
@@ -105,10 +97,10 @@ def worth_at(
         return -np.inf, experiment.belief.scale
     count, p = experiment.window, z.size
     first = np.arange(0, experiment.steps - count + 2, count)
-    start_sd = jnp.asarray(experiment.start_sd)
-    asked = _Seen(experiment.system, experiment.belief, jnp.asarray(z), start_sd)
+    about = Gaussian(tt, experiment.belief.scale)
+    asked = _Seen(experiment.system, about, jnp.asarray(experiment.start_sd))
     n = states.shape[1]
-    J = _rows(experiment, asked, U, states[first], first, count - 1, n + p)
+    J = _rows(experiment, asked, U, states[first], first, count - 1)
     A = _about(jnp.asarray(J.reshape(len(first), -1, n + p)), n)
     scale = after(experiment.belief, A.reshape(-1, p))
     return float(goal.nats(experiment.belief.scale, scale)), scale
@@ -183,15 +175,14 @@ class _Seen(AbstractAsked):
     """A window from a state ``e``, moved by ``x``: its start, then the constants."""
 
     system: AbstractSystem
-    belief: Gaussian
-    z: Float[Array, " p"]
+    about: Gaussian
     start_sd: Float[Array, " n"]
 
     def __call__(
         self, window: HeldInputs, e: Float[Array, " n"], x: Array
     ) -> tuple[Any, HeldInputs, Any, Any]:
         n = e.size
-        tt = self.belief.at(self.z + x[n:])
+        tt = self.about.at(x[n:])
         params = self.system.record(self.system.parameters.values(tt))
         start = e + self.start_sd * x[:n]
         return params, window, start, jnp.zeros(window.area.shape[1])
@@ -202,14 +193,12 @@ def _rows(
     asked: AbstractAsked,
     U: np.ndarray,
     states: Float[np.ndarray, "W n"],
-    first: np.ndarray,
+    first: Int[np.ndarray, " W"],
     periods: int,
-    k: int,
 ) -> Float[np.ndarray, "W times c k"]:
     """Slopes of what is measured of pieces that begin at states, in noise sd."""
-    parts = [piece(experiment, jnp.asarray(U), int(i), periods) for i in first]
-    many = jax.tree.map(lambda *x: np.stack([np.asarray(one) for one in x]), *parts)
-    J = _run(experiment, asked, many, states, k).slopes()
+    k = states.shape[1] + experiment.belief.mean.size
+    J = _run(experiment, asked, U, states, first, periods, k).slopes()
     J = J[:, :: experiment.substeps, list(experiment.outputs)]
     return np.asarray(J / np.asarray(experiment.noise)[:, None])
 
@@ -217,14 +206,23 @@ def _rows(
 def _run(
     experiment: Experiment,
     asked: AbstractAsked,
-    pieces: HeldInputs,
+    U: np.ndarray,
     e: np.ndarray,
+    first: Int[np.ndarray, " W"],
+    periods: int,
     k: int,
 ) -> HostRun:
+    """Pieces of the experiment that begin at periods ``first``."""
     simulator = simulator_of(experiment.system)
     assert simulator is not None
-    windows = Pieces(pieces.span, pieces.knots, pieces.area)
-    return HostRun(simulator, asked, windows, jnp.asarray(e), k)
+    found = _pieces(experiment, jnp.asarray(U), jnp.asarray(first), periods)
+    return HostRun(simulator, asked, found, jnp.asarray(e), k)
+
+
+@eqx.filter_jit
+def _pieces(experiment: Experiment, U: Array, first: Array, periods: int) -> Pieces:
+    found = jax.vmap(lambda i: piece(experiment, U, i, periods))(first)
+    return Pieces(found.span, found.knots, found.area)
 
 
 @eqx.filter_jit
@@ -232,6 +230,4 @@ def _about(J: Float[Array, "W N q"], n: int) -> Float[Array, "W rows p"]:
     return jax.vmap(lambda one: about_constants(one, n))(J)
 
 
-@eqx.filter_jit
-def _excess(limits: Limits, states: Any) -> Float[Array, " K"]:
-    return jax.vmap(lambda S: excess(limits, S))(states)
+_excess = eqx.filter_jit(all_excess)

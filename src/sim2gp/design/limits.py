@@ -89,14 +89,34 @@ class Limits(eqx.Module):
         )
 
 
+def input_ranges(
+    system: AbstractSystem,
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+    """Limits of the inputs; a servo's target stays within its joint's range, too."""
+    plant = plant_of(system)
+    servos, drives = (getattr(plant, name, {}) for name in ("servos", "drives"))
+    joints = {c.name: c for c in system.physical_states}
+    low, high = [], []
+    for channel in system.actions:
+        a, b = channel.low, channel.high
+        if channel.name in servos:
+            joint = joints.get(drives.get(channel.name, ""))
+            if joint is not None and channel.unit == joint.unit:
+                a, b = max(a, joint.low), min(b, joint.high)
+        low.append(a)
+        high.append(b)
+    return np.asarray(low), np.asarray(high)
+
+
 def servo_rates(system: AbstractSystem) -> dict[str, float]:
     """How fast targets of servos may change where nothing is stated, per second.
 
     A target that jumps drives a servo to its largest torque.
     """
     servos = getattr(plant_of(system), "servos", ())
-    spans = {c.name: c.high - c.low for c in system.actions if c.name in servos}
-    return {name: span / SLOW for name, span in spans.items() if math.isfinite(span)}
+    low, high = input_ranges(system)
+    rates = zip(system.actions, ((high - low) / SLOW).tolist(), strict=True)
+    return {c.name: rate for c, rate in rates if c.name in servos and rate < math.inf}
 
 
 def excess(limits: Limits, states: Float[Array, "T n"]) -> Float[Array, ""]:
@@ -107,6 +127,12 @@ def excess(limits: Limits, states: Float[Array, "T n"]) -> Float[Array, ""]:
         states - limits.state_high[None], limits.state_low[None] - states
     )
     return jnp.max(over / half[None])
+
+
+def all_excess(limits: Limits, states: Float[Array, "K T n"]) -> Float[Array, " K"]:
+    """`excess` of each machine; infinite where its simulation is lost."""
+    beyond = jax.vmap(lambda S: excess(limits, S))(states)
+    return jnp.where(jnp.isfinite(beyond), beyond, jnp.inf)
 
 
 def narrowed(limits: Limits) -> Limits:

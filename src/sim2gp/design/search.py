@@ -74,11 +74,15 @@ def design(
     """
     checks.count("design", draws=draws, starts=starts)
     experiment, goal, limits = jax.tree.map(jnp.asarray, (experiment, goal, limits))
-    search, drawn, *others = jax.random.split(key, 4)
-    informed = jax.random.normal(drawn, (draws, experiment.belief.mean.size))
+    by, p = _by(experiment), experiment.belief.mean.size
+    search, *others = jax.random.split(key, 4)
+    informed, trials, held_out = (
+        jax.random.normal(k, (count, p))
+        for k, count in zip(others, (draws, by.TRIALS, by.CHECKED), strict=True)
+    )
     informed = informed.at[0].set(0.0)
-    about = experiment, signal, goal, limits, informed, tuple(others)
-    improve, check, told = _by(experiment).ways(*about)
+    about = experiment, signal, goal, limits, informed, trials, held_out
+    improve, check, told = by.ways(*about)
 
     def one(key: Key) -> Designed:
         U = signal.commands(jnp.asarray(improve(key), float), limits)

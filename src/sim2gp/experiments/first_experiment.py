@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sim2gp.design import Limits, Multisine
-from sim2gp.design.limits import servo_rates
+from sim2gp.design.limits import input_ranges, servo_rates
 from sim2gp.systems import MuJoCo
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import Key, in_float64
@@ -51,7 +51,7 @@ def safe_excitation(system: AbstractSystem, *, key: Key, until: float) -> Excita
 
     No other one is tried after ``until`` (of `time.monotonic`, s).
     """
-    low, high = _ranges(system)
+    low, high = input_ranges(system)
     open_ = [
         c.name
         for c, a, b in zip(system.actions, low, high, strict=True)
@@ -80,24 +80,6 @@ def safe_excitation(system: AbstractSystem, *, key: Key, until: float) -> Excita
             words = f"a sum of sines, at most {share:.0%} of the way to each limit"
             return Excitation(words, commands, states[0])
     return Excitation(f"no experiment: with the smallest commands tried, {why}")
-
-
-def _ranges(
-    system: AbstractSystem,
-) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """Limits of the inputs; a servo's target stays within its joint's range, too."""
-    joints = {c.name: c for c in system.physical_states}
-    servos = system.servos if isinstance(system, MuJoCo) else ()
-    low, high = [], []
-    for channel in system.actions:
-        a, b = channel.low, channel.high
-        if channel.name in servos and isinstance(system, MuJoCo):
-            joint = joints.get(system.drives.get(channel.name, ""))
-            if joint is not None and channel.unit == joint.unit:
-                a, b = max(a, joint.low), min(b, joint.high)
-        low.append(a)
-        high.append(b)
-    return np.asarray(low), np.asarray(high)
 
 
 def _start(

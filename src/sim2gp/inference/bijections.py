@@ -44,7 +44,7 @@ def constrain(kind: str, t: AnyArray, low: Any, high: Any) -> AnyArray:
 
 def slopes(kind: str, t: AnyArray, low: Any, high: Any) -> tuple[AnyArray, AnyArray]:
     """First derivative of `constrain` in ``t``, and the second over the first."""
-    xp, one = library(t), np.ones((), t.dtype)
+    xp = library(t)
     sigmoid = expit if xp is np else jax.nn.sigmoid
     up, down = sigmoid(t), sigmoid(-t)
     if kind == "bounded":
@@ -56,7 +56,7 @@ def slopes(kind: str, t: AnyArray, low: Any, high: Any) -> tuple[AnyArray, AnyAr
         return up, down
     if kind == "log":
         limit = np.floor(np.log(np.finfo(t.dtype).max))
-        held = xp.where(xp.abs(t) < limit, one, 0.0 * one)
+        held = (xp.abs(t) < limit).astype(t.dtype)
         return held * constrain(kind, t, low, high), held
     return xp.ones_like(t), xp.zeros_like(t)
 

@@ -10,8 +10,6 @@ the posterior is:
 """
 
 from abc import abstractmethod
-from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -61,8 +59,11 @@ class ParameterPrior(AbstractPrior):
     def rows(self, z: Float[AnyArray, " p"]) -> Float[AnyArray, "q p1"]:
         if not self.table.measurements:
             return prior_rows(z)
-        measured = _like(z, _measured, self.table, self.gaussian, z)
-        return library(z).concatenate([prior_rows(z), measured])
+        xp = library(z)
+        # Of NumPy's, compiled: a fit of the host asks again and again.
+        f = eqx.filter_jit(_measured) if xp is np else _measured
+        measured = xp.asarray(f(self.table, self.gaussian, z))
+        return xp.concatenate([prior_rows(z), measured])
 
     def curvature(
         self, z: Float[AnyArray, " p"], gradient: Float[AnyArray, " p"]
@@ -96,11 +97,6 @@ class ParameterPrior(AbstractPrior):
             gtol=1e-12,
         )
         return self.linearised(self.gaussian.at(jnp.asarray(found.x)))
-
-
-def _like(z: AnyArray, f: Callable[..., Array], *args: Any) -> Any:
-    """What ``f`` finds, as an array of the kind of ``z``; of NumPy's, compiled."""
-    return np.asarray(eqx.filter_jit(f)(*args)) if library(z) is np else f(*args)
 
 
 def _measured(table: Parameters, gaussian: Gaussian, z: Array) -> Array:

@@ -97,7 +97,7 @@ def time_column(columns: Mapping[str, Values], where: str) -> Match:
     """The column of time and its unit, by name and how it grows (E103, E116)."""
     grow = [name for name, x in columns.items() if _grows(x)]
     named = [name for name in grow if TIME & set(words_of(name))]
-    rows = min((len(x) for x in columns.values()), default=0)
+    rows = min((len(x) for x in columns.values()), default=3)
     if rows < 3:
         raise InputError(
             "E116",

@@ -86,20 +86,14 @@ class Engine(AbstractSimulator):
     ) -> Float[np.ndarray, "B n"]:
         h = np.round(h, 12)  # rows that are equally long differ by rounding
         out, good = untouched(theta, s, a, h)
-        values, which = _distinct(theta[good])
-        index = np.flatnonzero(good)
+        index = np.flatnonzero(good & (h > 0.0))
         with self._lock:
-            for first in range(0, len(values), COPIES):
-                models = self._models(values[first : first + COPIES])
-                here = (which >= first) & (which < first + COPIES)
-                for span in np.unique(h[index[here]]):
-                    mine = here & (h[index] == span)
-                    if span > 0.0:
-                        at = index[mine]
-                        chosen = [models[k - first] for k in which[mine]]
-                        out[at] = self._rolled(
-                            chosen, models, s[at], a[at], float(span)
-                        )
+            for rows, models, which in self._blocks(theta[index]):
+                here = index[rows]
+                for span in np.unique(h[here]):
+                    mine = h[here] == span
+                    at, chosen = here[mine], [models[k] for k in which[mine]]
+                    out[at] = self._rolled(chosen, models, s[at], a[at], float(span))
         return out
 
     def substeps(self, span: Float[np.ndarray, "*r"]) -> Int[np.ndarray, "*r"]:
@@ -142,14 +136,11 @@ class Engine(AbstractSimulator):
         inputs = np.take_along_axis(u, order[..., None], axis=1)
         inputs = inputs[:, : moving.sum(1).max()]
         control = np.repeat(inputs, count, axis=1)
-        h, (values, which) = length / count, _distinct(theta)
         states = np.empty((*inputs.shape[:2], x0.shape[1]))
         with self._lock:
-            for first in range(0, len(values), COPIES):
-                models = self._models(values[first : first + COPIES])
-                at = np.flatnonzero((which >= first) & (which < first + COPIES))
-                chosen = [models[k - first] for k in which[at]]
-                found = self._stepped(chosen, models, x0[at], control[at], h)
+            for at, models, which in self._blocks(theta):
+                args = [models[k] for k in which], models, x0[at], control[at]
+                found = self._stepped(*args, length / count)
                 states[at] = found[:, count - 1 :: count]
         whole = np.concatenate([x0[:, None], states], axis=1)
         return whole[np.arange(len(u))[:, None], np.cumsum(moving, axis=1)]
@@ -227,6 +218,19 @@ class Engine(AbstractSimulator):
                 found = Model(at(theta), tree, numbers_of(model), changes)
                 self._known[key] = found
             return self._known[key]
+
+    def _blocks(
+        self, theta: Float[np.ndarray, "B p"]
+    ) -> Iterator[tuple[Int[np.ndarray, " b"], list[Any], Int[np.ndarray, " b"]]]:
+        """Rows whose models exist at the same time, those models, and whose is which.
+
+        Call it under the lock: the next block's models are the same copies.
+        """
+        values, which = _distinct(theta)
+        for first in range(0, len(values), COPIES):
+            models = self._models(values[first : first + COPIES])
+            rows = np.flatnonzero((which >= first) & (which < first + COPIES))
+            yield rows, models, which[rows] - first
 
     def _models(self, values: Float[np.ndarray, "U p"]) -> list[Any]:
         """A model for each vector of values; copies are used again."""
