@@ -17,8 +17,7 @@ import pytest
 
 import servo_arm
 from sim2gp.data.split_log import cut
-from sim2gp.data.window_slopes import HostRun
-from sim2gp.data.windows_likelihood import _About
+from sim2gp.data.window_slopes import Asked, HostRun, about
 from sim2gp.project import load_project
 from sim2gp.systems import Coulomb, Drag, MuJoCo, Spring, Viscous
 from sim2gp.systems.assemble import free_parts
@@ -207,8 +206,9 @@ def test_the_likelihood_of_logs_has_the_slopes_of_its_own_simulation(tmp_path, f
 
     def run(x: np.ndarray) -> HostRun:
         tt = prior.mean + prior.scale @ (z + x[n:])
-        asked = _About(system, tt, prior.scale)
-        return HostRun(simulator, asked, cuts, jnp.asarray(e + x[:n]), k)
+        start = cuts.start + cuts.start_sd * (e + x[:n])
+        asked = about(tt, start, prior.scale, cuts.start_sd)
+        return HostRun(simulator, system, cuts, asked)
 
     slopes = run(np.zeros(k)).slopes()
     late = [n + i for i, name in enumerate(names) if name.endswith(".delay")]
@@ -226,10 +226,10 @@ def test_forces_on_joints_act_on_the_host_as_in_jax(tmp_path):
     """Windows moved by the simulator and its kicks, and step by step by `flow`."""
     plain, cuts = arm_and_windows(tmp_path)
     system = free_parts(plain, FORCES)
-    prior, e = system.parameters.prior(), jnp.zeros(cuts.start.shape)
+    prior = system.parameters.prior()
     tt = prior.mean + 0.5 * jnp.diag(prior.scale)
-    asked = _About(system, tt, prior.scale)
-    run = HostRun(simulator_of(system), asked, cuts, e, e.shape[1] + tt.size)
+    asked = Asked.at(np.asarray(tt), cuts.start)
+    run = HostRun(simulator_of(system), system, cuts, asked)
     params = system.record(system.values(tt))
     expected = cuts.each(lambda one: simulate(system, params, one, one.start))
     assert np.allclose(run.states, expected, rtol=0.0, atol=1e-8)

@@ -1,57 +1,61 @@
-"""Windows of a machine and their derivatives, also where the simulator is not JAX.
+"""Windows that a simulator on the host moves, and their derivatives.
 
-What a caller asks of each window is an `AbstractAsked`: constants, inputs and start, as
-functions of a vector ``x``. JAX simulates and differentiates that in one program. A
-simulator on the host is asked once for all windows, after a program that finds its
-arguments and their derivatives and holds no callback, so that JAX keeps it in its
-cache.
+What is asked of each window is affine in a vector ``x`` about zero: its constants, its
+start, and what is added to its inputs. All is NumPy: to trace and compile these few
+derivatives would take longer than a fit asks for them.
 """
 
-from abc import abstractmethod
-from typing import Any
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from equinox import AbstractVar
 from jaxtyping import Array, Float
 
 from sim2gp.data.windows import Pieces, Windows
 from sim2gp.inference.linearized import value_and_jacobian
 from sim2gp.systems.base import AbstractSystem
+from sim2gp.systems.host import OnHost, names_on_host, numbers_on_host
+from sim2gp.systems.machine import Machine
 from sim2gp.systems.plants.external import AbstractSimulator, Arguments
-from sim2gp.systems.simulate import (
-    HeldInputs,
-    blur_of,
-    inputs_by_delay,
-    inputs_of,
-    simulate,
-)
+from sim2gp.systems.simulate import blur_of, inputs_by_delay, inputs_of
 from sim2gp.types import AnyArray
 
 
-class AbstractAsked(eqx.Module):
-    """The simulation of one window, as a function of a vector ``x`` about zero."""
+class Asked(NamedTuple):
+    """Windows at ``x = 0``, and how they move with it.
 
-    system: AbstractVar[AbstractSystem]
+    Virtual constants ``tt`` (of all windows, or of each) and start states, with their
+    slopes, and the slopes of what every input has added.
+    """
 
-    @abstractmethod
-    def __call__(
-        self, window: Windows, e: Float[Array, " n"], x: Float[Array, " k"]
-    ) -> tuple[Any, HeldInputs, Float[Array, " n"], Float[Array, " m"]]:
-        """Constants of the machine, held inputs, start, and what is added to inputs."""
+    tt: Float[np.ndarray, "*W p"]
+    start: Float[np.ndarray, "W n"]
+    tt_by: Float[np.ndarray, "p k"]
+    start_by: Float[np.ndarray, "*W n k"]
+    added_by: Float[np.ndarray, "m k"] | None = None
+
+    @classmethod
+    def at(
+        cls, tt: Float[np.ndarray, "*W p"], start: Float[np.ndarray, "W n"]
+    ) -> "Asked":
+        """Windows that do not move."""
+        none = np.zeros((tt.shape[-1], 0)), np.zeros((start.shape[1], 0))
+        return cls(tt, start, *none)
 
 
-def states_and_slopes(
-    asked: AbstractAsked, window: Windows, e: Float[Array, " n"], k: int
-) -> tuple[Float[Array, "L n"], Float[Array, "L n k"]]:
-    """States of one window, and their derivatives in ``x``, by JAX."""
-
-    def states(x: Array) -> Array:
-        return simulate(asked.system, *asked(window, e, x))
-
-    return value_and_jacobian(states, jnp.zeros(k))
+def about(
+    tt: Float[AnyArray, " p"],
+    start: Float[AnyArray, "W n"],
+    scale: Float[AnyArray, "p p"],
+    start_sd: Float[AnyArray, "*W n"],
+) -> Asked:
+    """Windows at ``start + start_sd x[:n]`` and ``tt + scale x[n:]``."""
+    tt, start, scale, sd = map(np.asarray, (tt, start, scale, start_sd))
+    n, p = start.shape[1], tt.size
+    tt_by = np.concatenate([np.zeros((p, n)), scale], axis=1)
+    return Asked(tt, start, tt_by, sd[..., None] * np.eye(n, n + p))
 
 
 class HostRun:
@@ -66,49 +70,60 @@ class HostRun:
     def __init__(
         self,
         simulator: AbstractSimulator,
-        asked: AbstractAsked,
+        system: AbstractSystem,
         windows: Pieces,
-        e: Float[Array, "W n"],
-        k: int,
+        asked: Asked,
     ) -> None:
-        late = _delays(asked, windows, e, k)
-        arriving = _inputs(asked.system, windows, np.asarray(late))
-        found = _arguments(asked, windows, e, arriving, k)
-        # Of the host's own kind, in its order: it works along the rows.
-        found = jax.tree.map(np.asarray, found)
-        (at, origin), (self._along, self._origin_by) = found
+        names = names_on_host(simulator, system)
+        given, by = _given_by(names, system, windows, asked)
+        self.inputs, by_delay = _inputs(system, windows, given.delays)
+        inputs, of_inputs = self.inputs, by_delay[..., None] * by.delays[:, None]
+        if asked.added_by is not None:
+            of_inputs += asked.added_by
+        if isinstance(system, Machine) and names.altering:
+            found = map(np.asarray, _altered(system, given.altering, inputs))
+            inputs, by_input, by_altering = found
+            of_inputs = by_input[..., None] * of_inputs
+            of_inputs += by_altering @ by.altering[:, None]
+        span = np.asarray(windows.span)
+        at = Arguments(given.theta, asked.start + given.offset, inputs, span)
+        start_by = asked.start_by + by.offset
+        self._along = Arguments(by.theta, start_by, of_inputs, span)
+        self._offset_by = by.offset[:, None]
         self._simulator, self._run = simulator, simulator.rolled(at)
-        self.states = self._run.at_rows + origin
-        self.inputs = arriving[0]
+        self.states = self._run.at_rows - given.offset[:, None]
 
     def slopes(self) -> Float[np.ndarray, "W L n k"]:
         """Derivatives of the states in ``x``."""
         found = self._simulator.linearised(self._run, self._along)
-        found += self._origin_by
+        found -= self._offset_by
         return found
 
 
-@eqx.filter_jit
-def _delays(
-    asked: AbstractAsked, windows: Pieces, e: Array, k: int
-) -> Float[Array, "W m"]:
-    """By how much the inputs of each window are late, s."""
-
-    def one(window: Any, e: Array) -> Array:
-        return asked.system.delays(asked(window, e, jnp.zeros(k))[0])
-
-    found: Array = windows.each(one, e)
-    return found
+def _given_by(
+    names: OnHost, system: AbstractSystem, windows: Pieces, asked: Asked
+) -> tuple[OnHost, OnHost]:
+    """The constants of each window that have these names, and their slopes."""
+    which = np.zeros(len(asked.start), int)
+    if isinstance(windows, Windows):
+        which = np.asarray(windows.configuration)
+    tt, of_each = asked.tt, np.arange(len(which))
+    if tt.ndim == 1:
+        which, of_each = np.unique(which, return_inverse=True)
+        tt = np.tile(tt, (which.size, 1))
+    machines = zip(tt, which.tolist(), strict=True)
+    numbers = [numbers_on_host(names, system, *machine) for machine in machines]
+    given, by_tt = (
+        OnHost(*(np.stack(kind)[of_each] for kind in zip(*rows, strict=True)))
+        for rows in zip(*numbers, strict=True)
+    )
+    return given, OnHost(*(J @ asked.tt_by for J in by_tt))
 
 
 def _inputs(
     system: AbstractSystem, windows: Pieces, late: Float[np.ndarray, "W m"]
 ) -> tuple[Float[np.ndarray, "W L m"], Float[np.ndarray, "W L m"]]:
-    """The inputs that arrive, and their derivatives in their delays.
-
-    They are found here because JAX would take longer to trace the derivative, along
-    each of ``x``, than all of a fit takes to ask for it.
-    """
+    """The inputs that arrive, and their derivatives in their delays."""
     if not late.size:  # a machine without inputs
         none = np.zeros((*windows.span.shape, 0))
         return none, none
@@ -121,26 +136,17 @@ def _inputs(
 
 
 @eqx.filter_jit
-def _arguments(
-    asked: AbstractAsked,
-    windows: Pieces,
-    e: Array,
-    arriving: tuple[AnyArray, AnyArray],
-    k: int,
-) -> Any:
-    """What the plant is given and what its states are offset by; both by ``x``."""
+def _altered(
+    machine: Machine,
+    constants: Float[AnyArray, "W r"],
+    inputs: Float[AnyArray, "W L m"],
+) -> tuple[Array, Array, Array]:
+    """What becomes of the inputs, and its slopes in each of them and the constants."""
 
-    def one(window: Any, e: Array, u: Array, by_delay: Array) -> Any:
-        def arguments(x: Array) -> Any:
-            params, held, x0, added = asked(window, e, x)
-            # `leave` adds to a state what does not depend on it.
-            origin = asked.system.leave(params, jnp.zeros((1, x0.size)))
-            late = asked.system.delays(params)
-            later = late - jax.lax.stop_gradient(late)  # zero, with a derivative
-            inputs = u + by_delay * later[None] + added[None]
-            theta, x0, inputs = asked.system.enter(params, x0, inputs)
-            return Arguments(theta, x0, inputs, held.span), origin
+    def one(c: Array, a: Array) -> tuple[Array, Array, Array]:
+        value, by_c = value_and_jacobian(lambda c: machine.altered(c, a), c)
+        each = (jnp.ones_like(a),)  # an input alters no other
+        _, by_a = jax.jvp(lambda a: machine.altered(c, a), (a,), each)
+        return value, by_a, by_c
 
-        return value_and_jacobian(arguments, jnp.zeros(k))
-
-    return windows.each(one, e, *arriving)
+    return jax.vmap(jax.vmap(one, (None, 0)))(constants, inputs)

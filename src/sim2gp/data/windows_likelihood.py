@@ -14,7 +14,7 @@ if off). ``window = 0`` is the paper's one-step likelihood: two rows, and ``S0 =
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sim2gp.compilation import compile_async
-from sim2gp.data.window_slopes import AbstractAsked, HostRun
+from sim2gp.data.window_slopes import HostRun, about
 from sim2gp.data.windows import Windows
 from sim2gp.inference.arrowhead import Blocks, Noise, eliminate
 from sim2gp.inference.estimate import Estimate
@@ -33,7 +33,6 @@ from sim2gp.inference.linalg import library
 from sim2gp.inference.linearized import jacobian_by_columns, value_and_jacobian
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.host import simulator_of
-from sim2gp.systems.plants.external import AbstractSimulator
 from sim2gp.systems.simulate import inputs_of, simulate
 from sim2gp.types import AnyArray, in_float64
 
@@ -43,14 +42,15 @@ class WindowsLikelihood(AbstractLikelihood):
 
     system: AbstractSystem
     windows: Windows
-    counts: Float[Array, "W c"]
-    floor: Float[Array, " c"]
+    counts: Float[AnyArray, "W c"]
+    floor: Float[AnyArray, " c"]
 
     @in_float64
     def __init__(self, system: AbstractSystem, windows: Windows) -> None:
-        self.system, self.windows = system, jax.tree.map(jnp.asarray, windows)
+        keep = jax.device_put if simulator_of(system) is None else np.asarray
+        self.system, self.windows = system, jax.tree.map(keep, windows)
         counts = np.sum(windows.mask, axis=1, dtype=float)
-        self.counts, self.floor = jnp.asarray(counts), self.windows.floor
+        self.counts, self.floor = keep(counts), self.windows.floor
 
     @property
     def n_nuisances(self) -> int:
@@ -58,11 +58,7 @@ class WindowsLikelihood(AbstractLikelihood):
 
     @property
     def on_host(self) -> bool:
-        return self._simulator is not None
-
-    @property
-    def _simulator(self) -> AbstractSimulator | None:
-        return simulator_of(self.system)
+        return simulator_of(self.system) is not None
 
     def some(self, which: Int[np.ndarray, " w"]) -> "WindowsLikelihood":
         """The likelihood of some of the windows, by number."""
@@ -106,13 +102,9 @@ class WindowsLikelihood(AbstractLikelihood):
         e: Float[np.ndarray, "W n"],
         scale: Float[np.ndarray, "p p"],
     ) -> Trial:
-        simulator = self._simulator
-        if simulator is None:
+        if not self.on_host:
             return super().trial(tt, e, scale)
-        asked = _About(self.system, *map(jnp.asarray, (tt, scale)))
-        k = e.shape[1] + scale.shape[1]
-        run = HostRun(simulator, asked, self.windows, jnp.asarray(e), k)
-        windows = jax.tree.map(np.asarray, self.windows)
+        run, windows = self.run(tt, e, scale), self.windows
         outputs = list(windows.outputs)
         r = _residual(windows, run.states)
 
@@ -130,6 +122,19 @@ class WindowsLikelihood(AbstractLikelihood):
 
         return Trial(np.sum(r**2, axis=1), blocks)
 
+    def run(
+        self,
+        tt: Float[np.ndarray, " p"],
+        e: Float[np.ndarray, "W n"],
+        scale: Float[np.ndarray, "p p"],
+    ) -> HostRun:
+        """All windows on the host, with slopes in starts and constants, whitened."""
+        simulator, windows = simulator_of(self.system), self.windows
+        assert simulator is not None
+        start = windows.start + windows.start_sd * e
+        asked = about(tt, start, scale, windows.start_sd)
+        return HostRun(simulator, self.system, windows, asked)
+
     def first_noise(self) -> Noise:
         """The measurements' sd about each window's mean."""
         counts, floor = np.asarray(self.counts), np.asarray(self.floor)
@@ -137,24 +142,7 @@ class WindowsLikelihood(AbstractLikelihood):
         mean = np.where(mask, y, 0.0).sum(axis=1) / np.maximum(counts, 1)
         squares = np.where(mask, (y - mean[:, None]) ** 2, 0.0).sum(axis=(0, 1))
         sd = np.sqrt(squares / np.maximum(counts.sum(axis=0), 1)) + floor
-        return Noise(jnp.asarray(sd), jnp.ones(len(y)))
-
-
-class _About(AbstractAsked):
-    """A window at start ``e + x[:n]`` and constants ``tt + scale x[n:]``."""
-
-    system: AbstractSystem
-    tt: Float[Array, " p"]
-    scale: Float[Array, "p p"]
-
-    def __call__(
-        self, window: Windows, e: Array, x: Array
-    ) -> tuple[Any, Windows, Any, Any]:
-        n = e.size
-        tt = self.tt + self.scale @ x[n:]
-        params = self.system.record(self.system.values(tt, window.configuration))
-        x0 = window.start + window.start_sd * (e + x[:n])
-        return params, window, x0, jnp.zeros(window.area.shape[1])
+        return Noise(*jax.device_put((sd, np.ones(len(y)))))
 
 
 def _residual(
@@ -190,10 +178,8 @@ def linearise(
 ) -> Linearised:
     """The windows' simulation at virtual values ``tt``, and its derivatives."""
     e, tt = jnp.asarray(fitted.nuisances), jnp.asarray(tt, float)
-    if (simulator := simulator_of(likelihood.system)) is not None:
-        asked = _About(likelihood.system, tt, fitted.prior.scale)
-        k = e.shape[1] + tt.size
-        run = HostRun(simulator, asked, likelihood.windows, e, k)
+    if likelihood.on_host:
+        run = likelihood.run(*map(np.asarray, (tt, e, fitted.prior.scale)))
         return _rows(likelihood.windows, run)
     return _linearise(likelihood, e, tt, fitted.prior.scale)
 
@@ -210,11 +196,10 @@ def compile_linearise(system: AbstractSystem, windows: Windows) -> None:
 
 def _rows(windows: Windows, run: HostRun) -> Linearised:
     """Rows of windows that were simulated on the host; the start's columns go last."""
-    windows = jax.tree.map(np.asarray, windows)
     J = run.slopes()[:, :, list(windows.outputs)]
     J = np.roll(np.where(windows.mask[..., None], J, 0.0), -run.states.shape[-1], -1)
     found = _residual(windows, run.states), J, run.states, run.inputs
-    return Linearised(*map(jnp.asarray, found))
+    return Linearised(*jax.device_put(found))
 
 
 @compile_async

@@ -6,7 +6,6 @@ something new. Every motion is simulated with its slopes, as a fit simulates log
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -14,17 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sim2gp.data.window_slopes import AbstractAsked, HostRun
+from sim2gp.data.window_slopes import Asked, HostRun, about
 from sim2gp.data.windows import Pieces
 from sim2gp.design.experiment import Experiment, about_constants, after, piece
 from sim2gp.design.goals import AbstractGoal
 from sim2gp.design.limits import Limits, all_excess, narrowed
 from sim2gp.design.signals import AbstractSignal
 from sim2gp.design.ways import Ways
-from sim2gp.inference.gaussian import Gaussian
-from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.host import simulator_of
-from sim2gp.systems.simulate import HeldInputs
 from sim2gp.types import Key
 
 ROUNDS, SAMPLES, ELITES = 10, 24, 6
@@ -62,10 +58,9 @@ def sensitivity(
     U, tt = np.asarray(commands), experiment.belief.mean
     states = states_of(experiment, U, np.asarray(tt)[None])[0]
     first = np.arange(0, experiment.steps - periods + 1, periods)
-    unit = Gaussian(tt, jnp.eye(tt.size))  # in the parameters themselves
     n = states.shape[1]
-    asked = _Seen(experiment.system, unit, jnp.zeros(n))
-    J = _rows(experiment, asked, U, states[first], first, periods)
+    asked = about(tt, states[first], np.eye(tt.size), np.zeros(n))
+    J = _rows(experiment, asked, U, first, periods)
     return jnp.asarray(J[:, -1, :, n:].reshape(-1, tt.size))
 
 
@@ -73,8 +68,9 @@ def states_of(
     experiment: Experiment, U: Float[np.ndarray, "T m"], machines: np.ndarray
 ) -> States:
     """Those at the beginning and after each period, of machines at virtual values."""
-    asked, first = _Whole(experiment.system, experiment.start), np.zeros(len(machines))
-    run = _run(experiment, asked, U, machines, first.astype(int), experiment.steps, 1)
+    first, start = np.zeros(len(machines), int), np.asarray(experiment.start)
+    asked = Asked.at(machines, np.tile(start, (len(machines), 1)))
+    run = _run(experiment, asked, U, first, experiment.steps)
     return run.states[:, :: experiment.substeps]
 
 
@@ -97,10 +93,9 @@ def worth_at(
         return -np.inf, experiment.belief.scale
     count, p = experiment.window, z.size
     first = np.arange(0, experiment.steps - count + 2, count)
-    about = Gaussian(tt, experiment.belief.scale)
-    asked = _Seen(experiment.system, about, jnp.asarray(experiment.start_sd))
-    n = states.shape[1]
-    J = _rows(experiment, asked, U, states[first], first, count - 1)
+    scale, n = experiment.belief.scale, states.shape[1]
+    asked = about(tt, states[first], scale, experiment.start_sd)
+    J = _rows(experiment, asked, U, first, count - 1)
     A = _about(jnp.asarray(J.reshape(len(first), -1, n + p)), n)
     scale = after(experiment.belief, A.reshape(-1, p))
     return float(goal.nats(experiment.belief.scale, scale)), scale
@@ -158,65 +153,31 @@ def sampled(
     return improved
 
 
-class _Whole(AbstractAsked):
-    """The whole experiment, of a machine at virtual values ``e``."""
-
-    system: AbstractSystem
-    start: Float[Array, " n"]
-
-    def __call__(
-        self, window: HeldInputs, e: Float[Array, " p"], x: Array
-    ) -> tuple[Any, HeldInputs, Any, Any]:
-        params = self.system.record(self.system.parameters.values(e))
-        return params, window, self.start, jnp.zeros(window.area.shape[1])
-
-
-class _Seen(AbstractAsked):
-    """A window from a state ``e``, moved by ``x``: its start, then the constants."""
-
-    system: AbstractSystem
-    about: Gaussian
-    start_sd: Float[Array, " n"]
-
-    def __call__(
-        self, window: HeldInputs, e: Float[Array, " n"], x: Array
-    ) -> tuple[Any, HeldInputs, Any, Any]:
-        n = e.size
-        tt = self.about.at(x[n:])
-        params = self.system.record(self.system.parameters.values(tt))
-        start = e + self.start_sd * x[:n]
-        return params, window, start, jnp.zeros(window.area.shape[1])
-
-
 def _rows(
     experiment: Experiment,
-    asked: AbstractAsked,
+    asked: Asked,
     U: np.ndarray,
-    states: Float[np.ndarray, "W n"],
     first: Int[np.ndarray, " W"],
     periods: int,
 ) -> Float[np.ndarray, "W times c k"]:
     """Slopes of what is measured of pieces that begin at states, in noise sd."""
-    k = states.shape[1] + experiment.belief.mean.size
-    J = _run(experiment, asked, U, states, first, periods, k).slopes()
+    J = _run(experiment, asked, U, first, periods).slopes()
     J = J[:, :: experiment.substeps, list(experiment.outputs)]
     return np.asarray(J / np.asarray(experiment.noise)[:, None])
 
 
 def _run(
     experiment: Experiment,
-    asked: AbstractAsked,
+    asked: Asked,
     U: np.ndarray,
-    e: np.ndarray,
     first: Int[np.ndarray, " W"],
     periods: int,
-    k: int,
 ) -> HostRun:
     """Pieces of the experiment that begin at periods ``first``."""
     simulator = simulator_of(experiment.system)
     assert simulator is not None
     found = _pieces(experiment, jnp.asarray(U), jnp.asarray(first), periods)
-    return HostRun(simulator, asked, found, jnp.asarray(e), k)
+    return HostRun(simulator, experiment.system, found, asked)
 
 
 @eqx.filter_jit

@@ -55,8 +55,8 @@ def fit_windows(
     checks.same_shape("fit_windows", (p,), prior=prior.mean)
     likelihood = WindowsLikelihood(system, windows)
     if warm_start is None:
-        first = drawn_starts(jnp.zeros((1, p)), starts, key)
-        e, noise = jnp.zeros(windows.start.shape), likelihood.first_noise()
+        first = drawn_starts(np.zeros((1, p)), starts, key)
+        e, noise = np.zeros(windows.start.shape), likelihood.first_noise()
         rounds = NOISE_ROUNDS
     else:
         z = jnp.linalg.solve(prior.scale, warm_start.posterior.mean - prior.mean)
@@ -64,7 +64,7 @@ def fit_windows(
         e, noise, rounds = warm_start.nuisances, warm_start.noise, WARM_ROUNDS
     begin = first, e, noise, rounds, FREEDOM if robust else np.inf
     # By way of NumPy: JAX compiles again for numbers whose type it calls weak.
-    begin = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)), begin)
+    begin = jax.device_put(jax.tree.map(np.asarray, begin))
     first, e, noise, needed, freedom = begin
     about = ParameterPrior(prior, system.parameters)
     same: dict[str, Any] = {"freedom": freedom, "needed": needed, "report": report}

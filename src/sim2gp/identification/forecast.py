@@ -19,9 +19,9 @@ variance is raised by (m + 1) / (m - 1).
 """
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from statistics import NormalDist
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -31,16 +31,14 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp.compilation import compile_async
 from sim2gp.data.grid import PERIOD, Grid
-from sim2gp.data.window_slopes import (
-    AbstractAsked,
-    HostRun,
-    states_and_slopes,
-)
+from sim2gp.data.window_slopes import Asked, HostRun
 from sim2gp.data.windows import Windows
 from sim2gp.inference.gaussian import LOG_2PI, Gaussian
+from sim2gp.inference.linearized import value_and_jacobian
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.host import simulator_of
 from sim2gp.systems.plants.external import AbstractSimulator
+from sim2gp.systems.simulate import simulate
 from sim2gp.types import AnyArray, in_float64
 
 _BATCH = 64  # windows at a time: bounds the memory of sensitivities
@@ -85,19 +83,21 @@ def forecast(
     """Simulate every window from its start at the posterior mean, to some samples.
 
     Batches of one size, the last one filled up: all forecasts of a run share one
-    compilation, and memory is bounded however long the logs are.
+    compilation, and memory is bounded however long the logs are. What a simulator on
+    the host compiles is small, so there a batch need not be full.
     """
     windows, W = grid.windows, len(grid.windows)
     simulator, passed = simulator_of(system), np.union1d(_passed(grid), rows)
     places = np.searchsorted(passed, rows)
+    size = _BATCH if simulator is None else math.ceil(W / math.ceil(W / _BATCH))
     parts = []
-    for first in range(0, W, _BATCH):
-        which = np.minimum(np.arange(first, first + _BATCH), W - 1)
+    for first in range(0, W, size):
+        which = np.minimum(np.arange(first, first + size), W - 1)
         some = _some(grid, which, passed)
         if simulator is not None:
             found = _forecast_on_host(simulator, system, posterior, some)
         else:
-            found = _forecast(system, posterior, some)
+            found = _forecast(system, posterior, jax.device_put(some))
         parts.append([np.asarray(x)[: W - first, places] for x in found])
     mean, by_start, by_input, by_constants = map(
         np.concatenate, zip(*parts, strict=True)
@@ -116,7 +116,8 @@ def compile_forecast(system: AbstractSystem, grid: Grid) -> None:
     if simulator_of(system) is not None:
         return  # its programs are small
     first = _some(grid, np.zeros(_BATCH, int), _passed(grid))
-    _forecast.compile_for(system, system.parameters.prior(), first)
+    arrays = jax.device_put(first)
+    _forecast.compile_for(system, system.parameters.prior(), arrays)
 
 
 @compile_async
@@ -124,12 +125,18 @@ def _forecast(
     system: AbstractSystem, posterior: Gaussian, windows: Windows
 ) -> tuple[Array, Array, Array, Array]:
     """Outputs at all rows, their slopes in start and input, variance by constants."""
-    asked, k = _From(system, posterior), _directions(posterior, windows)
+    n, m = windows.start.shape[1], windows.area.shape[2]
 
-    def one(window: Windows, e: Array) -> tuple[Array, Array, Array, Array]:
-        return _parts(window, *states_and_slopes(asked, window, e, k))
+    def one(window: Windows) -> tuple[Array, Array, Array, Array]:
+        def states(x: Array) -> Array:
+            tt = posterior.mean + posterior.scale @ x[n + m :]
+            params = system.record(system.values(tt, window.configuration))
+            return simulate(system, params, window, window.start + x[:n], x[n : n + m])
 
-    found: tuple[Array, Array, Array, Array] = windows.each(one, windows.start)
+        x = jnp.zeros(n + m + posterior.scale.shape[1])
+        return _parts(window, *value_and_jacobian(states, x))
+
+    found: tuple[Array, Array, Array, Array] = windows.each(one)
     return found
 
 
@@ -139,29 +146,14 @@ def _forecast_on_host(
     posterior: Gaussian,
     windows: Windows,
 ) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
-    asked, k = _From(system, posterior), _directions(posterior, windows)
-    run = HostRun(simulator, asked, windows, windows.start, k)
-    return _parts(windows, run.states, run.slopes())
-
-
-class _From(AbstractAsked):
-    """A window from its start, moved by ``x``: start, inputs, constants in their sd."""
-
-    system: AbstractSystem
-    posterior: Gaussian
-
-    def __call__(
-        self, window: Windows, e: Array, x: Array
-    ) -> tuple[Any, Windows, Any, Any]:
-        n, m = window.start.size, window.area.shape[1]
-        tt = self.posterior.mean + self.posterior.scale @ x[n + m :]
-        params = self.system.record(self.system.values(tt, window.configuration))
-        return params, window, e + x[:n], x[n : n + m]
-
-
-def _directions(posterior: Gaussian, windows: Windows) -> int:
+    mean, scale = np.asarray(posterior.mean), np.asarray(posterior.scale)
     n, m = windows.start.shape[1], windows.area.shape[2]
-    return n + m + int(posterior.scale.shape[1])
+    by_start, by_input, by_constants = np.split(
+        np.eye(n + m + scale.shape[1]), [n, n + m]
+    )
+    asked = Asked(mean, windows.start, scale @ by_constants, by_start, by_input)
+    run = HostRun(simulator, system, windows, asked)
+    return _parts(windows, run.states, run.slopes())
 
 
 def _parts(
@@ -183,17 +175,16 @@ def _passed(grid: Grid) -> Int[np.ndarray, " L"]:
 
 
 def _some(grid: Grid, which: np.ndarray, rows: np.ndarray) -> Windows:
-    """Some of the windows, as JAX arrays, in steps from one of ``rows`` to the next."""
+    """Some of the windows, in steps from one of ``rows`` to the next."""
     chosen = grid.windows.some(which)
     new = np.diff(which, prepend=-1) > 0  # what fills a batch up does not move
     span = new[:, None] * PERIOD * np.diff(rows, prepend=0)
-    thin = eqx.tree_at(
+    thin: Windows = eqx.tree_at(
         lambda w: (w.span, w.y, w.mask),
         chosen,
         (span, chosen.y[:, rows], chosen.mask[:, rows]),
     )
-    arrays: Windows = jax.tree.map(jnp.asarray, thin)
-    return arrays
+    return thin
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ from sim2gp.inference.levenberg_marquardt import (
     multi_start,
 )
 from sim2gp.inference.likelihood import AbstractLikelihood
+from sim2gp.inference.linalg import library
 from sim2gp.inference.parameters import Parameters
 from sim2gp.inference.prior import AbstractPrior, ParameterPrior
 from sim2gp.types import AnyArray, AnyScalar, Key, Scalar, in_float64
@@ -81,11 +82,12 @@ class Estimate(eqx.Module):
 
 
 def drawn_starts(
-    first: Float[Array, "k p"], count: int, key: Key
-) -> Float[Array, "count p"]:
+    first: Float[AnyArray, "k p"], count: int, key: Key
+) -> Float[AnyArray, "count p"]:
     """Whitened starts: these first, the others drawn about the prior's mean."""
-    k, p = first.shape
-    return jnp.concatenate([first, SPREAD * jax.random.normal(key, (count - k, p))])
+    (k, p), xp = first.shape, library(first)
+    drawn = xp.asarray(jax.random.normal(key, (count - k, p)))
+    return xp.concatenate([first, SPREAD * drawn])
 
 
 def estimate(
@@ -110,7 +112,7 @@ def estimate(
     """
     if nuisances is None:
         shape = len(likelihood.counts), likelihood.n_nuisances
-        nuisances = jnp.zeros(shape)
+        nuisances = jax.device_put(np.zeros(shape))
     if noise is None:
         noise = likelihood.first_noise()
     start = starts, nuisances, noise
@@ -140,7 +142,7 @@ def _estimate_on_host(
 
     def about(found: Progress) -> Estimate:
         args = found.noise, of_prior.gaussian, counts, found.steps, found.away
-        return jax.tree.map(jnp.asarray, _about(found.found, *args))
+        return jax.device_put(_about(found.found, *args))
 
     damping = min(best.damping, AGAIN_DAMPING)
     begin = best.found, noise, update

@@ -312,8 +312,11 @@ class Parameters(eqx.Module):
 
     def prior(self) -> Gaussian:
         """The independent Gaussian over virtual values; call it under `in_float64`."""
-        mean = jnp.asarray([p.mean for p in self.free], float)
-        return Gaussian(mean, jnp.diag(jnp.asarray([p.sd for p in self.free], float)))
+        mean = np.asarray([p.mean for p in self.free], float)
+        sd = np.asarray([p.sd for p in self.free], float)
+        # Put on the device as it is: to convert or to make it, JAX would compile.
+        prior: Gaussian = jax.device_put(Gaussian(mean, np.diag(sd)))
+        return prior
 
     def nominal(self) -> dict[str, float]:
         """Published values; the prior median where none was published."""

@@ -56,6 +56,7 @@ class Gain(AbstractActuator):
     magnitude: float = eqx.field(static=True, default=1.0)
     tie: str = eqx.field(static=True, default="")
     what: ClassVar[str] = "gain"
+    neutral: ClassVar[float] = 1.0
     meaning: ClassVar[str] = "gain of the input"
 
     def unit(self, plant: AbstractPlant) -> str:
@@ -74,6 +75,7 @@ class Offset(AbstractActuator):
     magnitude: float = eqx.field(static=True, default=0.0)
     tie: str = eqx.field(static=True, default="")
     what: ClassVar[str] = "offset"
+    neutral: ClassVar[float] = 0.0
     meaning: ClassVar[str] = "offset of the input"
 
     def unit(self, plant: AbstractPlant) -> str:
@@ -97,6 +99,7 @@ class Delay(AbstractActuator):
     magnitude: float = eqx.field(static=True, default=0.0)
     tie: str = eqx.field(static=True, default="")
     what: ClassVar[str] = "delay"
+    neutral: ClassVar[float] = 0.0
     meaning: ClassVar[str] = "delay of the input"
 
     def __check_init__(self) -> None:

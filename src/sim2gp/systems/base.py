@@ -159,20 +159,6 @@ class AbstractSystem(eqx.Module):
         ``held`` are the held inputs, newest first; the last was held for ever before.
         """
 
-    @abc.abstractmethod
-    def enter(
-        self, params: Any, x0: Float[Array, " n"], inputs: Float[Array, "L m"]
-    ) -> tuple[Any, Float[Array, " n"], Float[Array, "L m"]]:
-        """What a simulator on the host is given (`sim2gp.systems.host`).
-
-        Constants of the plant and magnitudes of effects on its joints, the start, and
-        the inputs of each step. With `leave`, `flow` of the system is the simulator's.
-        """
-
-    @abc.abstractmethod
-    def leave(self, params: Any, states: Float[Array, "L n"]) -> Float[Array, "L n"]:
-        """The plant's states as the system says them: each with the same added."""
-
     @property
     def physical_states(self) -> tuple[Channel, ...]:
         """The states that `flow` takes on, without the carried past actions."""
@@ -286,16 +272,6 @@ class AbstractPlant(AbstractSystem):
     ) -> Float[Array, "count m"]:
         """The newest input."""
         return jnp.broadcast_to(held[:1], (count, held.shape[1]))
-
-    def enter(
-        self, params: Any, x0: Float[Array, " n"], inputs: Float[Array, "L m"]
-    ) -> tuple[Any, Float[Array, " n"], Float[Array, "L m"]]:
-        """Constants, start and inputs of the plant itself."""
-        return params, x0, inputs
-
-    def leave(self, params: Any, states: Float[Array, "L n"]) -> Float[Array, "L n"]:
-        """States of the plant as the system's."""
-        return states
 
 
 class AbstractODE(AbstractPlant):

@@ -5,7 +5,8 @@ itself (`sim2gp.data.window_slopes`). Forces on the joints of such a machine are
 around each of its steps, as in `sim2gp.systems.effects.kicks`.
 """
 
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -36,6 +37,64 @@ def simulator_of(system: AbstractSystem) -> AbstractSimulator | None:
     return WithForces(engine, plant, effects) if effects else engine
 
 
+class OnHost(NamedTuple):
+    """What a simulator on the host needs of a machine's constants: names, or numbers.
+
+    theta: of the simulator.
+    offset: the plant's states minus the system's.
+    delays: of the inputs, s.
+    altering: of what alters the inputs that arrive, for `Machine.altered`.
+    """
+
+    theta: Any
+    offset: Any
+    delays: Any
+    altering: Any
+
+
+def names_on_host(simulator: AbstractSimulator, system: AbstractSystem) -> OnHost:
+    """Names of constants, empty for zero (E145 for a lag)."""
+    plant = plant_of(system)
+    altering: tuple[str, ...] = ()
+    offset: dict[str, str] = {}
+    delays: dict[str, str] = {}
+    if isinstance(system, Machine):
+        offset = {sensor.where: sensor.name for sensor in system.sensors}
+        delays, altering = system.delaying, system.altering
+    return OnHost(
+        simulator.names,
+        tuple(offset.get(channel.name, "") for channel in plant.states),
+        tuple(delays.get(channel.name, "") for channel in plant.actions),
+        altering,
+    )
+
+
+def numbers_on_host(
+    names: OnHost, system: AbstractSystem, tt: Float[np.ndarray, " p"], variant: int
+) -> tuple[OnHost, OnHost]:
+    """The constants at virtual values, (q,) of each kind, and their slopes, (q, p)."""
+    table, known = system.parameters, {"": 0.0} | dict(system.parameters.fixed)
+    column: Callable[[str], str] = str
+    if system.variants:
+        column = system.variants[variant].column
+        known |= {column(x): value for x, value in system.variants[variant].fixed}
+    theta, (slope, _) = table.constrain(tt), table.slopes(tt)
+    places = {name: i for i, name in enumerate(table.names)}
+
+    def numbers(names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+        x, J = np.zeros(len(names)), np.zeros((len(names), tt.size))
+        for k, name in enumerate(map(column, names)):
+            if name in places:
+                i = places[name]
+                x[k], J[k, i] = theta[i], slope[i]
+            else:
+                x[k] = known[name]
+        return x, J
+
+    found = [numbers(of_kind) for of_kind in names]
+    return OnHost(*(x for x, _ in found)), OnHost(*(J for _, J in found))
+
+
 class WithForces(AbstractSimulator):
     """A simulator whose steps lie between half kicks of its joints' velocities."""
 
@@ -46,6 +105,7 @@ class WithForces(AbstractSimulator):
         effects: tuple[AbstractJointEffect, ...],
     ) -> None:
         self.engine, self.differences = engine, engine.differences
+        self.names = (*engine.names, *(effect.name for effect in effects))
         self._kicks = _Kicks(plant, effects), _Kicks(plant, effects[::-1])
         self._count = len(effects)
 

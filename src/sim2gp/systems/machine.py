@@ -16,7 +16,6 @@ from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -231,33 +230,27 @@ class Machine(AbstractSystem):
         offset = self._offset(params).astype(s.dtype)
         return self._moved(params, s + offset, a, h) - offset
 
-    def enter(
-        self,
-        params: MachineParams,
-        x0: Float[Array, " n"],
-        inputs: Float[Array, "L m"],
-    ) -> tuple[Any, Float[Array, " n"], Float[Array, "L m"]]:
-        inputs = jax.vmap(lambda a: self._through(params, a))(inputs)
-        if self.sensors:
-            x0 = x0 + self._offset(params).astype(x0.dtype)
-        theta, acting = params.plant, [x for _, x in self.acting(params)]
-        if acting:  # of a plant with equations the effects are inside them
-            theta = jnp.concatenate([theta, jnp.stack(acting)])
-        return theta, x0, inputs
+    def altered(self, constants: Float[Array, " r"], a: Action) -> Action:
+        """The plant's input where ``a`` arrives, by the constants named `altering`.
 
-    def leave(
-        self, params: MachineParams, states: Float[Array, "L n"]
-    ) -> Float[Array, "L n"]:
-        if not self.sensors:
-            return states
-        return states - self._offset(params).astype(states.dtype)[None]
+        Each entry depends on the same one of ``a`` alone.
+        """
+        parts = dict(zip(self.altering, constants, strict=True))
+        return self._through(MachineParams(None, parts), a)
+
+    @property
+    def altering(self) -> tuple[str, ...]:
+        """Names of the constants that alter inputs."""
+        effects = (e for e in self.effects if isinstance(e, AbstractInputEffect))
+        parts = (*self._of(Gain), *self._of(Offset), *effects)
+        return tuple(dict.fromkeys(part.name for part in parts))
 
     def _through(self, params: MachineParams, a: Action) -> Action:
         """The input behind the actuators' gains, offsets and effects."""
-        if self._has(Gain):
-            a = self._each(params, Gain, 1.0) * a
-        if self._has(Offset):
-            a = a + self._each(params, Offset, 0.0)
+        if self._of(Gain):
+            a = self._each(params, Gain) * a
+        if self._of(Offset):
+            a = a + self._each(params, Offset)
         for effect in self.effects:
             if isinstance(effect, AbstractInputEffect):
                 i = index_of(effect.where, self.actions)
@@ -272,6 +265,13 @@ class Machine(AbstractSystem):
 
     def delays(self, params: MachineParams) -> Float[Array, " m"]:
         """Delay of each input; a lag is none (E145 over windows of logs)."""
+        if not self.delaying:
+            return self.plant.delays(params.plant)
+        return self._each(params, Delay)
+
+    @property
+    def delaying(self) -> dict[str, str]:
+        """Names of the constants that delay inputs, by input (E145 for a lag)."""
         for part in self.actuators:
             if isinstance(part, Lag):
                 raise InputError(
@@ -280,15 +280,13 @@ class Machine(AbstractSystem):
                     expected="one-step data; a delay over windows",
                     fix=f"use a delay of {part.where}",
                 )
-        if not self._has(Delay):
-            return self.plant.delays(params.plant)
-        return self._each(params, Delay, 0.0)
+        return {part.where: part.name for part in self._of(Delay)}
 
     def mean_inputs(
         self, params: MachineParams, held: Float[Array, "past m"], dt: float, count: int
     ) -> Float[Array, "count m"]:
-        if self._has(Delay):
-            means = delayed_means(held, dt, self._each(params, Delay, 0.0), count)
+        if self._of(Delay):
+            means = delayed_means(held, dt, self._each(params, Delay), count)
         else:
             means = jnp.broadcast_to(held[:1], (count, held.shape[1]))
         for part in self.actuators:
@@ -313,19 +311,18 @@ class Machine(AbstractSystem):
             return self.plant.flow_with(params.plant, acting, s, a, h)
         return kicked(self.plant, params.plant, acting, s, a, h)
 
-    def _has(self, kind: type[AbstractActuator]) -> bool:
-        return any(isinstance(part, kind) for part in self.actuators)
+    def _of(self, kind: type[Gain | Offset | Delay]) -> list[AbstractActuator]:
+        """The actuators of one kind that do something, or may."""
+        nothing = (kind.neutral, kind.neutral)
+        of_kind = (part for part in self.actuators if isinstance(part, kind))
+        return [part for part in of_kind if self._range(part.name) != nothing]
 
     def _each(
-        self, params: MachineParams, kind: type[AbstractActuator], neutral: float
+        self, params: MachineParams, kind: type[Gain | Offset | Delay]
     ) -> Float[Array, " m"]:
         """The constants of one kind of actuator, of each input."""
-        found = {
-            part.where: params.parts[part.name]
-            for part in self.actuators
-            if isinstance(part, kind)
-        }
-        none = jnp.full_like(next(iter(found.values())), neutral)
+        found = {part.where: params.parts[part.name] for part in self._of(kind)}
+        none = jnp.full_like(next(iter(found.values())), kind.neutral)
         return jnp.stack([found.get(channel.name, none) for channel in self.actions])
 
     def _range(self, name: str) -> tuple[float, float]:

@@ -47,8 +47,8 @@ class Engine(AbstractSimulator):
         _check_centres(model, constants)
         self.model = model
         self.constants = tuple(tuple(group) for group in constants)
-        names = [group[0].path for group in self.constants]
-        self.differences = Differences.of(table, names)
+        self.names = tuple(group[0].path for group in self.constants)
+        self.differences = Differences.of(table, self.names)
         self._derive = any(c.quantity in DERIVED for g in self.constants for c in g)
         self._copies: list[Any] = []
         self._held: list[bytes] = []

@@ -69,7 +69,6 @@ class MuJoCo(AbstractPlant):
     parameters: Parameters = eqx.field(static=True)
     channels: tuple[Channel, ...] = eqx.field(static=True)
     inputs: tuple[Channel, ...] = eqx.field(static=True)
-    names: tuple[str, ...] = eqx.field(static=True)
     source: Path | None = eqx.field(static=True)
 
     def __init__(
@@ -90,7 +89,6 @@ class MuJoCo(AbstractPlant):
         priors = dict(priors or {})
         table = Parameters(tuple(_prior(g[0], model, priors) for g in groups))
         self.parameters = table.replace(**_described(table, priors))
-        self.names = tuple(group[0].path for group in groups)
         self.channels = _states(model)
         self.inputs = _inputs(model)
         self.engine = Engine(model, groups, self.parameters)
@@ -106,6 +104,11 @@ class MuJoCo(AbstractPlant):
     @property
     def actions(self) -> tuple[Channel, ...]:
         return self.inputs
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Those of the engine's constants, in their order."""
+        return self.engine.names
 
     @property
     def drives(self) -> dict[str, str]:

@@ -95,8 +95,12 @@ class Rolled(NamedTuple):
 
 
 class AbstractSimulator(abc.ABC):
-    """A simulator on the host; two are equal only if they are the same object."""
+    """A simulator on the host; two are equal only if they are the same object.
 
+    ``names`` are those of its constants ``theta``, in their order.
+    """
+
+    names: tuple[str, ...]
     differences: Differences
 
     @abc.abstractmethod
