@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 LIMIT = 1200.0  # s, of one command
-MAIN = ["-c", "from sim2gp.cli import main; main()"]
+MAIN = ["-c", "from sim2gp.cli import entry; entry()"]
 
 
 def timed(

@@ -27,6 +27,7 @@ SUMMARY = {
     "warnings": ["W110 period varies"],
 }
 START = [sys.executable, "-c"]
+ENTRY = "from sim2gp.cli import entry; entry()"
 CALL = "import sys; from sim2gp.cli import main; raise SystemExit(main(sys.argv[1:]))"
 
 
@@ -308,3 +309,27 @@ def test_signals_clean_up(sign: str, code: int, here: Path) -> None:
         assert "interrupted" in child.stderr.read()
     assert child.returncode == code
     assert os.listdir(here) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "stream"),
+    [(["--version"], 0, "stdout"), (["identify", "none.toml"], 2, "stderr")],
+)
+def test_the_process_ends_with_its_command(
+    here: Path, words: list[str], code: int, stream: str
+) -> None:
+    """All that was said is said, the code is the command's, and nothing is waited for.
+
+    A thread that never ends stands for those of XLA.
+    """
+    endless = (
+        "import threading; threading.Thread(target=threading.Event().wait).start()"
+    )
+    done = subprocess.run(
+        [*START, f"{endless}\n{ENTRY}", *words],
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == code
+    assert getattr(done, stream).strip()

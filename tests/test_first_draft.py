@@ -174,7 +174,7 @@ def test_ctrl_c_ends_init_while_it_tries_readings(tmp_path: Path) -> None:
     arm_and_log(tmp_path, LINKS, limited=False, seconds=10.0)
     call = (
         "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "from sim2gp.cli import main; raise SystemExit(main())"
+        "from sim2gp.cli import entry; entry()"
     )
     words = ["init", str(tmp_path / "arm.xml"), str(tmp_path / "run.csv")]
     (tmp_path / "run").mkdir()

@@ -25,7 +25,7 @@ CHILD = """
 import os, signal, sys, threading, time
 from types import ModuleType
 import jax, jax.numpy as jnp
-from sim2gp.cli import main
+from sim2gp.cli import entry
 from sim2gp.runs import new_run
 # A shell that runs the tests in the background has it ignored.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -47,7 +47,7 @@ if __name__ == "__main__":
         sys.modules[name] = ModuleType(name)
     sys.modules[name].run = run
     sys.argv = ["sim2gp", "demo"]
-    raise SystemExit(main())
+    entry()
 """
 RUNS = """
 def work():
@@ -347,7 +347,7 @@ def test_random_times_of_real_commands(command: str, tmp_path: Path) -> None:
         project_in(tmp_path)
     call = (
         "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "from sim2gp.cli import main; raise SystemExit(main())"
+        "from sim2gp.cli import entry; entry()"
     )
     arguments = ["-c", call, *words]
     (tmp_path / "whole").mkdir()

@@ -123,7 +123,7 @@ def test_an_identification_needs_nothing_of_posix(tmp_path: Path) -> None:
         log = simulated(seconds=1.3, seed=seed, noise=5e-4)
         write(log, tmp_path / "logs" / f"{seed}.csv")
     project_in(tmp_path)
-    call = "from sim2gp.cli import main; raise SystemExit(main())"
+    call = "from sim2gp.cli import entry; entry()"
     for words in (["identify", "machine.toml", "--quick"], ["report", "runs/machine"]):
         done = elsewhere(tmp_path, ["-c", call, *words])
         assert done.returncode == 0, done.stderr

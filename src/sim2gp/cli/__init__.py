@@ -14,14 +14,14 @@ import traceback
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Union
+from typing import Annotated, Any, NoReturn, Union
 
 import tyro
 from tyro.conf import subcommand
 
 from sim2gp.cli.arguments import check_arguments, usage_error
 from sim2gp.cli.commands import COMMANDS, Common
-from sim2gp.cli.interrupts import DONE, interruptible
+from sim2gp.cli.interrupts import DONE, interruptible, leave
 from sim2gp.errors import InputError, Sim2GPError, Sim2GPWarning
 from sim2gp.runs import DiskError, Progress, RunOwned
 from sim2gp.runs.plain import to_json
@@ -29,6 +29,11 @@ from sim2gp.runs.show import print_summary
 from sim2gp.runs.store import disk_error
 
 OK, BUG, INPUT, DISK, OWNED = 0, 1, 2, 74, 75
+
+
+def entry() -> NoReturn:
+    """The command of the process itself, which ends with it."""
+    leave(main())
 
 
 def main(argv: Sequence[str] | None = None) -> int:

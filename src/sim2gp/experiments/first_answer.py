@@ -40,13 +40,10 @@ class FirstAnswer:
     def __call__(self, at: Descent, estimate: Callable[[], Estimate]) -> None:
         seconds = time.perf_counter() - self._started
         left = f"{at.step_sd:.2g} sd to go" if at.step_sd < 1e3 else "far to go"
-        if at.steps == 1:  # of a noise as large as the data
-            left = "the noise is not known yet"
         cost = float(at.at.cost)
         note = f"posterior, step {at.steps}: cost {cost:.6g}, {left}, {seconds:.0f} s"
         self.task.advance(note, 0)
-        # At its first step the noise is as large as the data: no answer yet.
-        if not self._written and at.steps > 1 and at.step_sd <= SOON:
+        if not self._written and at.step_sd <= SOON:
             self.write(estimate())
             self.task.advance(f"first answer in {self.folder}", 0)
 

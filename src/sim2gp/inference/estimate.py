@@ -142,7 +142,8 @@ def _estimate_on_host(
 
     def about(found: Progress) -> Estimate:
         args = found.noise, of_prior.gaussian, counts, found.steps, found.away
-        return jax.device_put(_about(found.found, *args))
+        known: Estimate = jax.device_put(_about(found.found, *args))
+        return known
 
     damping = min(best.damping, AGAIN_DAMPING)
     begin = best.found, noise, update

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sim2gp.errors import InputError
-from sim2gp.inference.linalg import solve_triangular, triangular
+from sim2gp.inference.linalg import library, solve_triangular, triangular
 from sim2gp.types import AnyArray, Key, Scalar
 
 LOG_2PI = 1.8378770664093453
@@ -47,9 +47,10 @@ class Gaussian(eqx.Module):
         cov = self.scale @ self.scale.T
         return 0.5 * (cov + cov.T)
 
-    def sd(self) -> Float[Array, " n"]:
+    def sd(self) -> Float[AnyArray, " n"]:
         """Standard deviation of each coordinate."""
-        return jnp.sqrt(jnp.sum(self.scale**2, axis=1))
+        xp = library(self.scale)
+        return xp.sqrt(xp.sum(self.scale**2, axis=1))
 
     def triangular(self) -> Float[Array, "n n"]:
         """The lower-triangular scale with non-negative diagonal (by QR, not Cholesky).

@@ -82,7 +82,9 @@ def descend(
     linearisation goes on to promise more. It ends early at ``most`` steps, and at once
     where the start has no finite cost.
     """
-    change = np.inf if update else 0.0
+    change = 0.0
+    if update is not None:
+        here, noise, change = _rested(update, here, noise)
     sd, refused = float(here.newton_step_sd()), 0
     yield Progress(here, noise, 1, sd, damping, sd)
     for count in range(2, (most or MOST_STEPS) + 1):

@@ -88,7 +88,9 @@ def _made(
     for i, (path, each) in enumerate(zip(paths, sources, strict=True)):
         _hand_over(Path(folder), i, path.suffix.lower(), each)
     # In that folder MuJoCo leaves its log.
-    done = in_child(_CHILD, [str(seconds), folder, form, count], folder, 2 * seconds)
+    arguments = [str(seconds), folder, form, count]
+    blind = dict(os.environ) | {"MUJOCO_GL": "disable"}  # MuJoCo seeks no window system
+    done = in_child(_CHILD, arguments, folder, 2 * seconds, blind)
     where = str(paths[0])
     if done is None:
         raise _died(where, f"no answer in {2 * seconds} s")
