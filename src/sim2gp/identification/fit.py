@@ -55,7 +55,8 @@ def fit_windows(
     checks.same_shape("fit_windows", (p,), prior=prior.mean)
     likelihood = WindowsLikelihood(system, windows)
     if warm_start is None:
-        first = drawn_starts(np.zeros((1, p)), starts, key)
+        zeros = np.zeros if likelihood.on_host else jnp.zeros
+        first = drawn_starts(zeros((1, p)), starts, key)
         e, noise = np.zeros(windows.start.shape), likelihood.first_noise()
         rounds = NOISE_ROUNDS
     else:

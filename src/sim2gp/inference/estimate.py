@@ -19,11 +19,10 @@ from jaxtyping import Array, Float, Int
 from sim2gp.inference.arrowhead import Noise, eliminate
 from sim2gp.inference.convergence import Convergence, converged
 from sim2gp.inference.gaussian import Gaussian
-from sim2gp.inference.host_descent import Progress, best_start, descend
+from sim2gp.inference.host_descent import Progress, search
 from sim2gp.inference.laplace import Laplace, expected_noise, laplace, log_normaliser
 from sim2gp.inference.least_squares import posterior
 from sim2gp.inference.levenberg_marquardt import (
-    AGAIN_DAMPING,
     Point,
     evaluate,
     multi_start,
@@ -86,7 +85,10 @@ def drawn_starts(
 ) -> Float[AnyArray, "count p"]:
     """Whitened starts: these first, the others drawn about the prior's mean."""
     (k, p), xp = first.shape, library(first)
-    drawn = xp.asarray(jax.random.normal(key, (count - k, p)))
+    if xp is np:  # which asks for no program
+        normal = np.random.default_rng(np.asarray(jax.random.key_data(key))).normal
+        return np.concatenate([first, SPREAD * normal(size=(count - k, p))])
+    drawn = jax.random.normal(key, (count - k, p))
     return xp.concatenate([first, SPREAD * drawn])
 
 
@@ -138,16 +140,12 @@ def _estimate_on_host(
     def update(found: Laplace, noise: Noise) -> Noise:
         return expected_noise(noise, *found.squares(), counts, floor, freedom)
 
-    best = best_start(likelihood, of_prior, starts, e, noise)
-
     def about(found: Progress) -> Estimate:
         args = found.noise, of_prior.gaussian, counts, found.steps, found.away
         known: Estimate = jax.device_put(_about(found.found, *args))
         return known
 
-    damping = min(best.damping, AGAIN_DAMPING)
-    begin = best.found, noise, update
-    for found in descend(likelihood, of_prior, *begin, damping=damping):
+    for found in search(likelihood, of_prior, starts, e, noise, update):
         if report is not None:
             report(found, partial(about, found))
     return about(found)

@@ -18,6 +18,7 @@ from sim2gp.inference.arrowhead import Noise
 from sim2gp.inference.convergence import NEAR
 from sim2gp.inference.laplace import Laplace, laplace
 from sim2gp.inference.levenberg_marquardt import (
+    AGAIN_DAMPING,
     FIRST_DAMPING,
     MOST_DAMPING,
     Point,
@@ -148,23 +149,42 @@ def _change(new: Noise, old: Noise) -> float:
     return float(np.max(np.abs(np.log(new.sd / old.sd))))
 
 
-def best_start(
+def search(
     likelihood: AbstractLikelihood,
     prior: AbstractPrior,
     starts: Float[np.ndarray, "starts p"],
     e: Starts,
     noise: Noise,
-) -> Progress:
-    """Of roughly finished descents from each start, the one of least cost."""
-    found: list[Progress] = []
-    for z in starts:
-        if np.isnan(z).any():
-            continue
+    update: Update,
+) -> Iterator[Progress]:
+    """Each step that is kept on the way to the MAP; the last one yielded is there.
+
+    The first start is followed to its end before the others are tried: its posterior is
+    an answer already. Another is followed only where it begins better: where it is
+    roughly finished, with the first noise, it is elsewhere and its cost is less.
+    """
+
+    def rough(z: Vector) -> Progress:
         begin = likelihood, prior, begin_at(likelihood, prior, z, e, noise), noise
         *_, last = descend(*begin, None, until=ROUGH, most=FIRST_STEPS)
-        found.append(last)
-    finite = [x for x in found if np.isfinite(x.at.cost)]
-    return min(finite or found, key=lambda x: float(x.at.cost))
+        return last
+
+    def finished(begun: Progress) -> Iterator[Progress]:
+        damping = min(begun.damping, AGAIN_DAMPING)
+        begin = begun.found, noise, update
+        return descend(likelihood, prior, *begin, damping=damping)
+
+    first, *others = [z for z in starts if not np.isnan(z).any()]
+    best = begun = rough(first)
+    yield from finished(begun)
+    for other in map(rough, others):
+        better = np.isfinite(other.at.cost) and not best.at.cost <= other.at.cost
+        # Two that are roughly finished at the same place differ by a little.
+        same = _largest(best.found.R @ (other.at.z - best.at.z)) <= 2.0 * ROUGH
+        if better and not same:
+            best = other
+    if best is not begun:
+        yield from finished(best)
 
 
 def _tried(
