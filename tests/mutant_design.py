@@ -134,8 +134,8 @@ DESIGN = (
     Mutant(
         "search by samples: windows begin one late",
         SAMPLES,
-        "states[first], first, count - 1)",
-        "states[first], first + 1, count - 1)",
+        "asked, U, first, count - 1)",
+        "asked, U, first + 1, count - 1)",
         ("test_design_mujoco.py", "of_the_definition"),
     ),
     Mutant(

@@ -94,7 +94,8 @@ def arrays(
     the physical ones wherever the posterior is narrow.
     """
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
-    unit = np.asarray(posterior.scale) / np.asarray(posterior.sd())[:, None]
+    scale = np.asarray(posterior.scale)
+    unit = scale / np.linalg.norm(scale, axis=1, keepdims=True)
     return {
         "parameters/prior_samples": _physical(parameters, prior, rng, count),
         "parameters/samples": _physical(parameters, posterior, rng, count),

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int
 from sim2gp.inference.arrowhead import Noise, eliminate
 from sim2gp.inference.convergence import Convergence, converged
 from sim2gp.inference.gaussian import Gaussian
-from sim2gp.inference.host_descent import Progress, search
+from sim2gp.inference.host_descent import SMALL, Progress, search
 from sim2gp.inference.laplace import Laplace, expected_noise, laplace, log_normaliser
 from sim2gp.inference.least_squares import posterior
 from sim2gp.inference.levenberg_marquardt import (
@@ -103,6 +103,7 @@ def estimate(
     freedom: float | Scalar = jnp.inf,
     needed: Int[Array, ""] | None = None,
     report: Report | None = None,
+    until: float = SMALL,
 ) -> Estimate:
     """Descend from each of the whitened ``starts``, then ``rounds`` of EM.
 
@@ -110,7 +111,7 @@ def estimate(
     likelihood's own first noise without. Rounds beyond those ``needed``, and starts
     that are no number, are compiled and not taken. A simulator on the host learns the
     noise in turns with its steps until both rest, and says to ``report`` after each of
-    them where it stands. What did not converge is reported by `Convergence.check`.
+    them where it stands; it rests where Newton's step is ``until`` posterior sd. What did not converge is reported by `Convergence.check`.
     """
     if nuisances is None:
         shape = len(likelihood.counts), likelihood.n_nuisances
@@ -119,7 +120,7 @@ def estimate(
         noise = likelihood.first_noise()
     start = starts, nuisances, noise
     if likelihood.on_host:
-        return _estimate_on_host(likelihood, prior, start, freedom, report)
+        return _estimate_on_host(likelihood, prior, start, freedom, report, until)
     return _estimate(likelihood, prior, *start, freedom, needed, rounds)
 
 
@@ -131,6 +132,7 @@ def _estimate_on_host(
     start: tuple[Float[Array, "starts p"], Float[Array, "W n"], Noise],
     freedom: float | Scalar,
     report: Report | None,
+    until: float,
 ) -> Estimate:
     """The same in NumPy: tracing and compiling would take longer than the descent."""
     of_numpy = (likelihood.counts, likelihood.floor, freedom, start, prior)
@@ -145,7 +147,7 @@ def _estimate_on_host(
         known: Estimate = jax.device_put(_about(found.found, *args))
         return known
 
-    for found in search(likelihood, of_prior, starts, e, noise, update):
+    for found in search(likelihood, of_prior, starts, e, noise, update, until):
         if report is not None:
             report(found, partial(about, found))
     return about(found)

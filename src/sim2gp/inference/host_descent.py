@@ -156,6 +156,7 @@ def search(
     e: Starts,
     noise: Noise,
     update: Update,
+    until: float,
 ) -> Iterator[Progress]:
     """Each step that is kept on the way to the MAP; the last one yielded is there.
 
@@ -172,7 +173,7 @@ def search(
     def finished(begun: Progress) -> Iterator[Progress]:
         damping = min(begun.damping, AGAIN_DAMPING)
         begin = begun.found, noise, update
-        return descend(likelihood, prior, *begin, damping=damping)
+        return descend(likelihood, prior, *begin, until=until, damping=damping)
 
     first, *others = [z for z in starts if not np.isnan(z).any()]
     best = begun = rough(first)

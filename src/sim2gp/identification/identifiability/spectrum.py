@@ -109,7 +109,7 @@ def spectrum(
         tt,
         np.asarray(posterior.mean),
         np.asarray(posterior.scale),
-        np.asarray(posterior.sd()),
+        np.linalg.norm(np.asarray(posterior.scale), axis=1),
         theta,
         slope,
         A,
