@@ -110,8 +110,9 @@ def estimate(
     ``nuisances`` and ``noise`` are those of another fit to begin with; zeros and the
     likelihood's own first noise without. Rounds beyond those ``needed``, and starts
     that are no number, are compiled and not taken. A simulator on the host learns the
-    noise in turns with its steps until both rest, and says to ``report`` after each of
-    them where it stands; it rests where Newton's step is ``until`` posterior sd. What did not converge is reported by `Convergence.check`.
+    noise in turns with its steps until both rest, the step at ``until`` posterior sd,
+    and says to ``report`` after each of them where it stands. What did not converge is
+    reported by `Convergence.check`.
     """
     if nuisances is None:
         shape = len(likelihood.counts), likelihood.n_nuisances
