@@ -11,7 +11,7 @@ from sim2gp.errors import DeadParameters, NotFinite
 from sim2gp.inference.arrowhead import Blocks, Noise
 from sim2gp.inference.estimate import estimate
 from sim2gp.inference.gaussian import Gaussian
-from sim2gp.inference.host_descent import begin_at, descend
+from sim2gp.inference.host_descent import SMALL, begin_at, descend, search
 from sim2gp.inference.laplace import expected_noise, laplace, log_normaliser
 from sim2gp.inference.least_squares import factor
 from sim2gp.inference.levenberg_marquardt import point, step
@@ -153,3 +153,30 @@ def test_a_refused_step_is_not_linearised() -> None:
     assert abs(1e3 * float(kept[-1].at.z[0])) < 1e-2
     costs = [float(x.at.cost) for x in kept]
     assert costs == sorted(costs, reverse=True)
+
+
+class TwoWells(Arctangent):
+    """Two minima, at 2 without a misfit and at about -1.96 with one."""
+
+    def trial(self, tt, e, scale) -> Trial:
+        z = tt[0]
+        r = np.asarray([2.5 * (z**2 - 4.0), z - 2.0])
+        J = np.asarray([[5.0 * z], [1.0]]) @ scale
+        return Trial(np.sum(r**2)[None, None], lambda: factor(J, r)[None, None])
+
+
+@pytest.mark.parametrize(
+    ("starts", "descents", "where"),
+    [((-2.5, 2.5), 2, 2.0), ((2.5, -2.5), 1, 2.0), ((-2.2, -2.5), 1, -1.96)],
+)
+def test_another_start_is_followed_where_it_is_better_and_elsewhere(
+    starts: tuple[float, ...], descents: int, where: float
+) -> None:
+    likelihood = TwoWells(jnp.ones((1, 1)), jnp.zeros(1), [])
+    prior = ParameterPrior(Gaussian(np.zeros(1), 10.0 * np.eye(1)), UNBOUNDED)
+    noise = numpy_of(likelihood.first_noise())
+    whitened = 0.1 * np.asarray(starts)[:, None]
+    e = np.zeros((1, 0))
+    steps = list(search(likelihood, prior, whitened, e, noise, lambda _, n: n, SMALL))
+    assert sum(at.steps == 1 for at in steps) == descents
+    assert abs(10.0 * float(steps[-1].at.z[0]) - where) < 0.1
