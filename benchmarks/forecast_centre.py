@@ -15,7 +15,8 @@ import numpy as np
 
 from sim2gp.data.grid import CURVE, evaluation_windows, steps_of
 from sim2gp.data.windows_likelihood import WindowsLikelihood
-from sim2gp.experiments.prediction import channels, cut_logs, predicted, recordings
+from sim2gp.experiments.prediction import channels, predicted, recordings
+from sim2gp.experiments.training_windows import cut_logs
 from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.intervals.discrepancy import corrected_windows
 from sim2gp.project import load_project

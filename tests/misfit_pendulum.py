@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sim2gp.identification.diagnose import Misfit, misfit
+from sim2gp.identification.misfit.tests import Misfit, misfit
 
 DT, SUBSTEPS, HOLD, LENGTH, NOISE = 0.05, 5, 4, 250, 0.04
 

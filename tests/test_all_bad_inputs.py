@@ -43,7 +43,7 @@ def refused(
     words: list[str], capsys: pytest.CaptureFixture[str], patch: pytest.MonkeyPatch
 ) -> str:
     """The line that a command says which stops at its input, and compiles nothing."""
-    patch.setattr("sim2gp.experiments.identify.compile_forecast", compiled)
+    patch.setattr("sim2gp.experiments.identify.fit_windows", compiled)
     before = contents(Path.cwd())
     assert main(words) == 2
     said = capsys.readouterr()

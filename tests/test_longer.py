@@ -11,7 +11,7 @@ from linear_system import linear
 from sim2gp.data.logs import Log
 from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.experiments.longer import TIMES, Longer, advice, lengthened
-from sim2gp.experiments.prediction import cut_logs
+from sim2gp.experiments.training_windows import cut_logs
 from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.intervals.discrepancy import corrected_windows
 from sim2gp.identification.intervals.scatter import Corrected

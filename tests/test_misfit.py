@@ -6,8 +6,13 @@ from scipy import signal, stats
 
 from misfit_pendulum import alarms
 from sim2gp.errors import NotFinite
-from sim2gp.identification.diagnose import Misfit, misfit
-from sim2gp.identification.misfit.tests import LAGS, ljung_box, ljung_box_tail
+from sim2gp.identification.misfit.tests import (
+    LAGS,
+    Misfit,
+    ljung_box,
+    ljung_box_tail,
+    misfit,
+)
 
 NO_HAT = 0  # columns of a fit that could move nothing
 

@@ -18,13 +18,13 @@ from sim2gp.data.windows_likelihood import (
     compile_linearise,
     linearise,
 )
-from sim2gp.identification.diagnose import Misfit, misfit
 from sim2gp.identification.misfit.residuals import (
     earlier,
     encoded,
     misfit_of_transitions,
     misfit_of_windows,
 )
+from sim2gp.identification.misfit.tests import Misfit, misfit
 from sim2gp.inference.arrowhead import Noise
 from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian

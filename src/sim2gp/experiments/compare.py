@@ -37,8 +37,9 @@ from sim2gp.experiments import scoring
 from sim2gp.experiments.baselines import regression_errors
 from sim2gp.experiments.compare_summary import Held, summarise
 from sim2gp.experiments.evaluate import check_horizon, windows_for
-from sim2gp.experiments.prediction import channels, cut_logs, recordings, subset
+from sim2gp.experiments.prediction import channels, recordings, subset
 from sim2gp.experiments.record import command, provenance
+from sim2gp.experiments.training_windows import cut_logs
 from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.forecast import inflation_of
 from sim2gp.inference.estimate import Estimate

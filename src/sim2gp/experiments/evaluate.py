@@ -27,7 +27,6 @@ from sim2gp.experiments.motion import film
 from sim2gp.experiments.prediction import (
     Judged,
     channels,
-    cut_logs,
     drawn,
     joined,
     judged,
@@ -39,6 +38,7 @@ from sim2gp.experiments.prediction import (
     units,
 )
 from sim2gp.experiments.record import command, provenance
+from sim2gp.experiments.training_windows import cut_logs
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.project import Project
 from sim2gp.runs import Progress, new_run

@@ -16,8 +16,8 @@ from sim2gp.data.logs import Budget
 from sim2gp.errors import InputError
 from sim2gp.experiments.explain_words import candidate_rows, headline, table
 from sim2gp.experiments.identified import PROJECT, project_of, stood
-from sim2gp.experiments.prediction import cut_logs
 from sim2gp.experiments.record import command, provenance
+from sim2gp.experiments.training_windows import cut_logs
 from sim2gp.identification.missing_physics.data import (
     AbstractData,
     OneStepData,

@@ -1,4 +1,4 @@
-"""What identify and evaluate share: windows of a project's logs, scores, traces.
+"""What identify and evaluate share: forecasts, scores, traces.
 
 A forecast is judged at the last sample of its window, errors pooled over windows as a
 root mean square, next to those of two predictors without mechanics
@@ -14,45 +14,15 @@ from jaxtyping import Bool, Float, Int
 
 from sim2gp.data.grid import CURVE, PERIOD, Grid, steps_of
 from sim2gp.data.logs import Log
-from sim2gp.data.split_log import cut
 from sim2gp.data.windows import Windows
 from sim2gp.experiments.baselines import compared, loss_sentence
 from sim2gp.identification.forecast import Band, Forecast, forecast
 from sim2gp.inference.gaussian import Gaussian
-from sim2gp.project import Project
 from sim2gp.systems.base import AbstractSystem
 
 TRACE = 0.5  # s, the windows that are drawn
 _FINEST = 5  # grid samples from one point of a curve to the next
 Picture = dict[str, tuple[np.ndarray, ...]]
-
-
-def cut_logs(
-    project: Project, logs: Sequence[Log], times: float = 1.0
-) -> tuple[Windows, np.ndarray]:
-    """Training windows as `cut_places` makes them, and the log of each."""
-    windows, places = cut_places(project, logs, times)
-    return windows, np.asarray([k for k, _ in places])
-
-
-def cut_places(
-    project: Project, logs: Sequence[Log], times: float = 1.0
-) -> tuple[Windows, list[tuple[int, int]]]:
-    """Training windows as the project states them, and log and first row of each.
-
-    Or so many ``times`` as long.
-    """
-    stated = project.spec.likelihood
-    names = [channel.name for channel in project.system.physical_states]
-    measured = [n for n in names if any(n in log.channels for log in logs)]
-    return cut(
-        logs,
-        project.system,
-        window=times * stated.window,
-        start_sd=_each(stated.start_sd, names),
-        floor=_each(stated.noise_floor, measured),
-        start=stated.start,
-    )
 
 
 def recordings(logs: Sequence[Log]) -> list[str]:
@@ -348,13 +318,6 @@ def _flat(x: np.ndarray) -> np.ndarray:
     """Windows one after the other, each followed by a NaN."""
     gap = np.full((len(x), 1), np.nan)
     return np.concatenate([x, gap], axis=1).ravel()
-
-
-def _each(
-    value: float | dict[str, float] | None, names: Sequence[str]
-) -> dict[str, float] | None:
-    """A single number holds for every channel."""
-    return dict.fromkeys(names, value) if isinstance(value, float) else value
 
 
 def _mean(x: np.ndarray, valid: np.ndarray) -> np.ndarray:

@@ -26,19 +26,16 @@ from sim2gp.identification.identifiability.spectrum import (
     spectrum,
 )
 from sim2gp.identification.identifiability.table import add_plain, parameter_table
-from sim2gp.identification.misfit.tests import Misfit, misfit
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.parameters import Parameters
 from sim2gp.types import Key, in_float64
 
 __all__ = [
     "FisherAt",
-    "Misfit",
     "Spectrum",
     "arrays",
     "base_parameters",
     "directions",
-    "misfit",
     "parameter_table",
     "prior_conflicts",
     "spectrum",

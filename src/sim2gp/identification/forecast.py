@@ -88,6 +88,8 @@ def forecast(
     """
     windows, W = grid.windows, len(grid.windows)
     simulator, passed = simulator_of(system), np.union1d(_passed(grid), rows)
+    if simulator is not None:  # a compiled program serves all horizons
+        passed = passed[passed <= rows.max(initial=0)]
     places = np.searchsorted(passed, rows)
     size = _BATCH if simulator is None else math.ceil(W / math.ceil(W / _BATCH))
     parts = []

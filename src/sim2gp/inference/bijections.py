@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
-from scipy.special import expit
 
 from sim2gp.inference.linalg import library
 from sim2gp.types import AnyArray
@@ -28,7 +27,7 @@ _EDGE = 1e-13  # closest approach to a bound when a physical value is mapped bac
 def constrain(kind: str, t: AnyArray, low: Any, high: Any) -> AnyArray:
     """Physical values of virtual ones under one kind of map, inside ``[low, high]``."""
     xp, huge = library(t), np.asarray(np.finfo(t.dtype).max, t.dtype)
-    sigmoid = expit if xp is np else jax.nn.sigmoid
+    sigmoid = _sigmoid if xp is np else jax.nn.sigmoid
     if kind == "bounded":
         return xp.clip(low + (high - low) * sigmoid(t), low, high)
     if kind == "log_bounded":
@@ -45,7 +44,7 @@ def constrain(kind: str, t: AnyArray, low: Any, high: Any) -> AnyArray:
 def slopes(kind: str, t: AnyArray, low: Any, high: Any) -> tuple[AnyArray, AnyArray]:
     """First derivative of `constrain` in ``t``, and the second over the first."""
     xp = library(t)
-    sigmoid = expit if xp is np else jax.nn.sigmoid
+    sigmoid = _sigmoid if xp is np else jax.nn.sigmoid
     up, down = sigmoid(t), sigmoid(-t)
     if kind == "bounded":
         return (high - low) * up * down, down - up
@@ -59,6 +58,11 @@ def slopes(kind: str, t: AnyArray, low: Any, high: Any) -> tuple[AnyArray, AnyAr
         held = (xp.abs(t) < limit).astype(t.dtype)
         return held * constrain(kind, t, low, high), held
     return xp.ones_like(t), xp.zeros_like(t)
+
+
+def _sigmoid(t: np.ndarray) -> np.ndarray:
+    """To a few units in the last place, also where it is small."""
+    return np.exp(-np.logaddexp(0.0, -t))
 
 
 def unconstrain(kind: str, theta: Array, low: Any, high: Any) -> Array:

@@ -1,0 +1,45 @@
+"""The windows of a project's logs that its machine is fitted to."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sim2gp.data.logs import Log
+from sim2gp.data.split_log import cut
+from sim2gp.data.windows import Windows
+from sim2gp.project import Project
+
+
+def cut_logs(
+    project: Project, logs: Sequence[Log], times: float = 1.0
+) -> tuple[Windows, np.ndarray]:
+    """Training windows as `cut_places` makes them, and the log of each."""
+    windows, places = cut_places(project, logs, times)
+    return windows, np.asarray([k for k, _ in places])
+
+
+def cut_places(
+    project: Project, logs: Sequence[Log], times: float = 1.0
+) -> tuple[Windows, list[tuple[int, int]]]:
+    """Training windows as the project states them, and log and first row of each.
+
+    Or so many ``times`` as long.
+    """
+    stated = project.spec.likelihood
+    names = [channel.name for channel in project.system.physical_states]
+    measured = [n for n in names if any(n in log.channels for log in logs)]
+    return cut(
+        logs,
+        project.system,
+        window=times * stated.window,
+        start_sd=_each(stated.start_sd, names),
+        floor=_each(stated.noise_floor, measured),
+        start=stated.start,
+    )
+
+
+def _each(
+    value: float | dict[str, float] | None, names: Sequence[str]
+) -> dict[str, float] | None:
+    """A single number holds for every channel."""
+    return dict.fromkeys(names, value) if isinstance(value, float) else value
