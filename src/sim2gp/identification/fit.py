@@ -14,7 +14,6 @@ from sim2gp.errors import NotConverged
 from sim2gp.inference.arrowhead import Noise
 from sim2gp.inference.estimate import Estimate, Report, drawn_starts, estimate
 from sim2gp.inference.gaussian import Gaussian
-from sim2gp.inference.host_descent import ROUGH
 from sim2gp.inference.prior import ParameterPrior
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import Key, in_float64
@@ -22,8 +21,10 @@ from sim2gp.types import Key, in_float64
 NOISE_ROUNDS = 8  # fewer leave noise and starts of real logs short of a fixed point
 WARM_ROUNDS = 3  # of a fit that begins with the noise of another one
 #: Share of the windows that a fit on the host begins with, how few they may be, and of
-#: how many rows: of fewer, all windows are as fast.
+#: how many rows: of fewer, all windows are as fast. So near to its MAP, in posterior
+#: sd, that part comes: all windows have another one.
 SHARE, LEAST, MANY = 0.2, 2, 500
+NEAR = 1.0
 FREEDOM = 4.0  # degrees of freedom of the Student-t weight
 
 
@@ -74,7 +75,7 @@ def fit_windows(
     some = _some(likelihood) if warm_start is None else None
     if some is not None:
         part = likelihood.some(some)
-        found = estimate(part, about, starts=first, until=ROUGH, **same)
+        found = estimate(part, about, starts=first, until=NEAR, **same)
         first, e = found.z()[None], e.at[some].set(found.nuisances)
         noise = Noise(found.noise.sd, jnp.ones(len(windows)))
     from_here = {"starts": first, "nuisances": e, "noise": noise}

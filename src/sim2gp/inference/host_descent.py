@@ -165,27 +165,33 @@ def search(
     roughly finished, with the first noise, it is elsewhere and its cost is less.
     """
 
-    def rough(z: Vector) -> Progress:
-        begin = likelihood, prior, begin_at(likelihood, prior, z, e, noise), noise
-        *_, last = descend(*begin, None, until=ROUGH, most=FIRST_STEPS)
-        return last
+    def begun(z: Vector) -> Laplace:
+        return begin_at(likelihood, prior, z, e, noise)
 
-    def finished(begun: Progress) -> Iterator[Progress]:
-        damping = min(begun.damping, AGAIN_DAMPING)
-        begin = begun.found, noise, update
+    def roughly(z: Vector) -> Iterator[Progress]:
+        begin = begun(z), noise, None
+        return descend(likelihood, prior, *begin, until=ROUGH, most=FIRST_STEPS)
+
+    def finished(here: Laplace, damping: float = AGAIN_DAMPING) -> Iterator[Progress]:
+        begin, damping = (here, noise, update), min(damping, AGAIN_DAMPING)
         return descend(likelihood, prior, *begin, until=until, damping=damping)
 
     first, *others = [z for z in starts if not np.isnan(z).any()]
-    best = begun = rough(first)
-    yield from finished(begun)
-    for other in map(rough, others):
-        better = np.isfinite(other.at.cost) and not best.at.cost <= other.at.cost
-        # Two that are roughly finished at the same place differ by a little.
-        same = _largest(best.found.R @ (other.at.z - best.at.z)) <= 2.0 * ROUGH
-        if better and not same:
-            best = other
-    if best is not begun:
-        yield from finished(best)
+    if not others:  # nothing to compare
+        yield from finished(begun(first))
+        return
+    *_, best = roughly(first)
+    followed = best
+    yield from finished(best.found, best.damping)
+    for z in others:
+        for other in roughly(z):
+            if _largest(best.found.R @ (other.at.z - best.at.z)) <= 2.0 * ROUGH:
+                break  # it goes where the best one is
+        else:
+            cost = other.at.cost
+            best = other if np.isfinite(cost) and not best.at.cost <= cost else best
+    if best is not followed:
+        yield from finished(best.found, best.damping)
 
 
 def _tried(
