@@ -7,8 +7,8 @@ For each seed the arm's dampings, armatures, dry frictions and four masses are d
 within a factor of about two of its file, a log is recorded by C MuJoCo (200 Hz,
 encoders of 1e-3 rad), and both identify these 22 constants from it, each as a whole
 command on one core. This program learns one delay of all drives as well, mujoco.sysid
-is told it; ``told`` is this program where it is told it, too. Needs `mujoco[sysid]`.
-Cold: without anything compiled before.
+is told it; ``told`` is this program where it is told it, too. Windows are as long as
+`init` has them. Needs `mujoco[sysid]`. Cold: without anything compiled before.
 """
 
 import argparse
@@ -28,6 +28,7 @@ sys.path.insert(0, str(ROOT / "tests"))
 from commands import MAIN, timed  # noqa: E402
 
 import servo_arm  # noqa: E402
+from sim2gp.project.draft_text import window_of  # noqa: E402
 
 #: What is open, and how far the truth lies from the file, in log units.
 OPEN = (
@@ -116,7 +117,8 @@ def write(folder: Path, seconds: float, seed: int, delay: float) -> None:
         delay=delay,
         values=truth(seed),
     )
-    project = servo_arm.project_text(["log.csv"], constants=OPEN)
+    window = window_of(seconds)
+    project = servo_arm.project_text(["log.csv"], constants=OPEN, window=window)
     (folder / "arm.toml").write_text(project)
     told = project.replace("{low = 0.0, high = 0.03}\ntie = true", f"{delay}")
     (folder / "told.toml").write_text(told)
@@ -151,13 +153,18 @@ def _ours(folder: Path, name: str, seed: int, cache: str | None) -> dict[str, An
         timed(folder, run, cache=cache, one_core=True, watched=first)
     )
     summary = json.loads((folder / name / "summary.json").read_text())
+    steps = summary["convergence"]["steps"]
+    return out | judged(seed, summary) | {"steps": steps}
+
+
+def judged(seed: int, summary: dict[str, Any]) -> dict[str, Any]:
+    """A run's median relative error, and how many intervals hold the truth."""
     found = {
         path: (entry["mean"], entry["q025"], entry["q975"])
         for path, entry in summary["parameters"].items()
         if path in OPEN
     }
-    steps = summary["convergence"]["steps"]
-    return out | _judged(seed, found) | {"steps": steps}
+    return _judged(seed, found)
 
 
 def _judged(seed: int, found: dict[str, tuple[float, float, float]]) -> dict[str, Any]:

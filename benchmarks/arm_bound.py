@@ -30,6 +30,7 @@ from sim2gp.data.split_log import cut  # noqa: E402
 from sim2gp.data.windows_likelihood import WindowsLikelihood, information_at  # noqa: E402
 from sim2gp.inference.arrowhead import Noise  # noqa: E402
 from sim2gp.project import load_project  # noqa: E402
+from sim2gp.project.draft_text import window_of  # noqa: E402
 from sim2gp.types import in_float64  # noqa: E402
 
 HALF = 0.6744897501960817  # of an sd: what half of all normal errors exceed
@@ -80,7 +81,7 @@ def table(rows: list[dict[str, Any]]) -> str:
     lines = ["| log | windows | delay learned | delay told |", "|---|---|---|---|"]
     for seconds, window in dict.fromkeys((r["seconds"], r["window"]) for r in rows):
         mine = [r for r in rows if (r["seconds"], r["window"]) == (seconds, window)]
-        cut_ = "the whole log" if window == seconds else f"{window:.0f} s"
+        cut_ = "the whole log" if window == seconds else f"{window:g} s"
         middle = (
             statistics.median(r[name] for r in mine) for name in ("learned", "told")
         )
@@ -99,7 +100,7 @@ def main() -> None:
         {"seconds": seconds, "window": window, "seed": seed}
         | errors(seconds, seed, window)
         for seconds in (5.0, 30.0)
-        for window in (1.0, seconds)
+        for window in (window_of(seconds), seconds)
         for seed in range(given.seeds)
     ]
     given.out.mkdir(exist_ok=True)

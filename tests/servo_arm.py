@@ -80,7 +80,11 @@ def _body(k: int, link: tuple[Any, ...], place: np.ndarray, limited: bool) -> st
 
 
 def project_text(
-    logs: Sequence[str], *, constants: Sequence[str], delay: bool = True
+    logs: Sequence[str],
+    *,
+    constants: Sequence[str],
+    delay: bool = True,
+    window: float = 1.0,
 ) -> str:
     """A project of the arm for these logs; one delay of all drives is open."""
     names = "\n".join(f'{n} = "{n}"' for n in NAMES)
@@ -92,7 +96,7 @@ def project_text(
     )
     opened = "".join(f'[parameters."{path}"]\n' for path in constants)
     return (
-        f'system = "arm.xml"\n{opened}[likelihood]\nwindow = 1.0\n{late}[[logs]]\n'
+        f'system = "arm.xml"\n{opened}[likelihood]\nwindow = {window}\n{late}[[logs]]\n'
         f'files = {list(logs)}\ntime = "time"\n[logs.columns]\n{names}\n{drives}\n'
     )
 

@@ -1,5 +1,6 @@
 """The words of a first project file: what was found, and the reason of each guess."""
 
+import math
 import os
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -18,7 +19,8 @@ from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.mujoco.constants import constants_of
 
 DELAY = 0.04  # s, the longest that a draft lets an input be late
-WINDOW = 1.0  # s, of windows of an arm with servos
+#: Shortest and longest windows of an arm with servos, s (`benchmarks/arm_windows.py`).
+WINDOWS = 1.0, 5.0
 LISTED = 40  # constants that are named in the file
 _GAINS = ("kp", "kv")
 
@@ -64,7 +66,7 @@ def draft_text(c: Contents) -> str:
     rows += _constants(c, file)
     rows += ["", *(_logs(c) if c.files else _wanted(c.system))]
     if isinstance(c.system, MuJoCo) and c.system.servos:
-        rows += ["", *_window(c.longest if c.files else WINDOW)]
+        rows += ["", *_window(c.longest if c.files else math.inf)]
     rows += ["", "# Inputs act late on most machines; delay = 0.0 takes that out."]
     delay = f"delay = {{low = 0.0, high = {DELAY}}}"
     if isinstance(c.system, MuJoCo) and len(c.system.actions) > 1:
@@ -185,9 +187,15 @@ def _unit(unit: str) -> str:
     return "the model's unit" if unit == "1" else unit
 
 
+def window_of(longest: float) -> float:
+    """Length of the windows of an arm with servos, of its longest log; both in s."""
+    low, high = WINDOWS
+    return int(1e3 * min(max(low, 0.5 * longest), high, longest)) / 1e3
+
+
 def _window(longest: float) -> list[str]:
     """A servo hides masses and friction for some tenths of a second."""
-    window = min(WINDOW, int(1e3 * longest) / 1e3)
+    window = window_of(longest)
     return [
         "# Servos hide masses and friction in short windows: of a six-axis arm,",
         "# .2, .5, 1, 2.5 and 5 s left median errors of .14, .089, .023, .027, .029.",
