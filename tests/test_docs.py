@@ -369,6 +369,7 @@ def test_the_architecture_is_that_of_the_tree() -> None:
         ("mjcf_table", "docs/your_robot.md"),
         ("arm_and_sysid", "docs/your_robot.md"),
         ("arm_bound", "docs/your_robot.md"),
+        ("arm_windows", "docs/decisions.md"),
     ],
 )
 def test_a_table_is_that_of_its_results(
