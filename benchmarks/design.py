@@ -25,7 +25,7 @@ import numpy as np
 
 from sim2gp.data.logs import Log
 from sim2gp.data.split_log import cut
-from sim2gp.design import (
+from sim2gp.experiment_design import (
     AbstractSignal,
     Everything,
     Experiment,
@@ -38,13 +38,13 @@ from sim2gp.design import (
     search,
     trajectory,
 )
-from sim2gp.design.limits import excess
-from sim2gp.experiments.claims import of_median
+from sim2gp.experiment_design.limits import excess
 from sim2gp.identification.fit import fit_windows
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.parameters import prior_from_moments
 from sim2gp.runs.cells import Cells, Old, add_options
 from sim2gp.runs.workers import cores, spread
+from sim2gp.studies.claims import of_median
 from sim2gp.systems import TwoLink
 from sim2gp.types import in_float64
 

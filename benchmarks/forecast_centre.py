@@ -15,11 +15,11 @@ import numpy as np
 
 from sim2gp.data.grid import CURVE, evaluation_windows, steps_of
 from sim2gp.data.windows_likelihood import WindowsLikelihood
-from sim2gp.experiments.prediction import channels, predicted, recordings
-from sim2gp.experiments.training_windows import cut_logs
 from sim2gp.identification.fit import fit_windows
+from sim2gp.identification.forecasts.prediction import channels, predicted, recordings
 from sim2gp.identification.intervals.discrepancy import corrected_windows
 from sim2gp.project import load_project
+from sim2gp.project.training_windows import cut_logs
 from sim2gp.types import in_float64
 
 EXAMPLES = Path(__file__).parents[1] / "examples"

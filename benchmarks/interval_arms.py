@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sim2gp.data.logs import Log
-from sim2gp.experiments.explain_study import Cogging
+from sim2gp.studies.explain_study import Cogging
 from sim2gp.systems import (
     AbstractEffect,
     AbstractSystem,

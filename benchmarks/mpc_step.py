@@ -16,8 +16,8 @@ import jax
 import numpy as np
 from one_step import EPISODES, STEPS, random_episode
 
+from sim2gp.commands.compare import MODELS
 from sim2gp.data.transitions import Transitions
-from sim2gp.experiments.compare import MODELS
 from sim2gp.models import Sim2GP
 from sim2gp.planning import MPC, MarkovObjective, World
 from sim2gp.planning.episode import oracle_world, world_of

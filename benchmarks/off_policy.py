@@ -29,12 +29,12 @@ from sbx import SAC as Theirs
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sim2gp.data.transitions import Transitions
-from sim2gp.experiments.swingup import Cell, meeting, reference, run_cell
 from sim2gp.planning import SAC, World
 from sim2gp.planning.episode import Purpose, key_for, oracle_world
 from sim2gp.planning.mpc import from_unit
 from sim2gp.planning.sac import Learner, made
 from sim2gp.planning.tasks import MACHINES, Task
+from sim2gp.studies.swingup import Cell, meeting, reference, run_cell
 
 NEAR = 0.9  # of the oracle's return
 EPISODES = 5

@@ -20,7 +20,7 @@ RATIO = 1.02
 
 def main() -> None:
     """Print the table and the verdict."""
-    from sim2gp.experiments.evaluate import leave_one_out
+    from sim2gp.commands.evaluate import leave_one_out
     from sim2gp.project import load_project
     from sim2gp.runs import Progress
 

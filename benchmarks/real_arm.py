@@ -47,7 +47,7 @@ def errors_of(models: list[np.ndarray], logs: list[Any], horizon: float) -> list
 
 def ours(horizon: float, folder: Path) -> dict[str, Any]:
     """Leave one log out by the package's own command."""
-    from sim2gp.experiments.evaluate import leave_one_out
+    from sim2gp.commands.evaluate import leave_one_out
     from sim2gp.project import load_project
     from sim2gp.runs import Progress
 

@@ -28,10 +28,10 @@ import numpy as np
 
 from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.errors import InputError, NotConverged, NotFinite
-from sim2gp.experiments.training_windows import cut_logs
 from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.intervals.discrepancy import corrected_windows
 from sim2gp.project import Project, load_project
+from sim2gp.project.training_windows import cut_logs
 from sim2gp.runs.cells import Cells, add_options
 from sim2gp.runs.workers import cores, spread
 from sim2gp.systems import plant_of

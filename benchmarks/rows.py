@@ -24,10 +24,10 @@ TURNS = 3
 
 def main() -> None:
     """Print rows and warm seconds of both, and the verdict."""
-    from sim2gp.experiments import identify
-    from sim2gp.experiments.training_windows import cut_logs
+    from sim2gp.commands import identify
     from sim2gp.identification.fit import fit_windows
     from sim2gp.project import load_project
+    from sim2gp.project.training_windows import cut_logs
     from sim2gp.runs import Progress
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])

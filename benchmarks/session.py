@@ -36,14 +36,14 @@ from design import (
     stored,
 )
 
+from sim2gp.commands.design import expectation
 from sim2gp.data.logs import Log
-from sim2gp.design import Everything, Free, Multisine, design
-from sim2gp.experiments.claims import of_median
-from sim2gp.experiments.design import expectation
-from sim2gp.experiments.design_verdict import Asked, verdict
+from sim2gp.experiment_design import Everything, Free, Multisine, design
+from sim2gp.experiment_design.verdict import Asked, verdict
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.runs.cells import Cells, Old, add_options
 from sim2gp.runs.workers import cores, spread
+from sim2gp.studies.claims import of_median
 from sim2gp.types import in_float64
 
 SECONDS = 10.0

@@ -15,18 +15,18 @@ from pathlib import Path
 
 import numpy as np
 
-from sim2gp.experiments.claims import interval
-from sim2gp.experiments.swingup import (
+from sim2gp.planning.tasks import SOLVED
+from sim2gp.runs import Progress
+from sim2gp.runs.cells import add_options
+from sim2gp.runs.workers import cores
+from sim2gp.studies.claims import interval
+from sim2gp.studies.swingup import (
     Cell,
     best_seen,
     first_at,
     median_episode,
     study,
 )
-from sim2gp.planning.tasks import SOLVED
-from sim2gp.runs import Progress
-from sim2gp.runs.cells import add_options
-from sim2gp.runs.workers import cores
 
 LEARNERS = ("SIM2GP", "NLM", "RES", "FS", "RES-FS", "SIM2GP with the term")
 CONDITIONS = ("nominal", "mismatch")

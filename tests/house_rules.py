@@ -14,8 +14,9 @@ LAYERS: tuple[frozenset[str], ...] = (
     frozenset({"systems"}),
     frozenset({"belief", "data", "runs"}),
     frozenset({"models", "identification", "planning"}),
-    frozenset({"project", "design", "robot", "report"}),
-    frozenset({"experiments"}),
+    frozenset({"project", "experiment_design", "robot", "reports"}),
+    frozenset({"studies"}),
+    frozenset({"commands"}),
     frozenset({"cli"}),
 )
 #: In the lowest layer modules build on each other; a belief is fitted to data.

@@ -2,10 +2,14 @@
 
 from mutant_list import Mutant
 
-EXPERIMENT, GOALS = "design/experiment.py", "design/goals.py"
-LIMITS, SIGNALS, SEARCH = "design/limits.py", "design/signals.py", "design/search.py"
-CLIMB, SAMPLES = "design/by_gradients.py", "design/by_samples.py"
-RUN, VERDICT = "experiments/design.py", "experiments/design_verdict.py"
+EXPERIMENT, GOALS = "experiment_design/experiment.py", "experiment_design/goals.py"
+LIMITS, SIGNALS, SEARCH = (
+    "experiment_design/limits.py",
+    "experiment_design/signals.py",
+    "experiment_design/search.py",
+)
+CLIMB, SAMPLES = "experiment_design/by_gradients.py", "experiment_design/by_samples.py"
+RUN, VERDICT = "commands/design.py", "experiment_design/verdict.py"
 TOLD = ("test_design.py", "tells_what_the_log")
 GOAL = ("test_design.py", "dense_covariances")
 KEPT = ("test_design.py", "exactly or followed")
@@ -182,7 +186,7 @@ DESIGN = (
     ),
     Mutant(
         "export: the plain posterior leaves without being asked for",
-        "experiments/export.py",
+        "commands/export.py",
         'if posterior == "corrected" else fit.plain',
         'if posterior == "plain" else fit.plain',
         ("test_project_model.py", "as_wide_as_its_report"),

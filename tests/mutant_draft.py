@@ -4,7 +4,7 @@ from mutant_list import Mutant
 
 COLUMNS, READINGS = "project/columns.py", "project/readings.py"
 DRAFT, ZEROS = "project/draft.py", "systems/machine.py"
-TEXT, EXPERIMENT = "project/draft_text.py", "experiments/first_experiment.py"
+TEXT, EXPERIMENT = "project/draft_text.py", "experiment_design/safe_excitation.py"
 ODD = ("test_draft.py", "odd_log")
 SERVOS = ("test_first_draft.py", "servo_arm")
 
@@ -88,7 +88,7 @@ FIRST_DRAFT = (
     ),
     Mutant(
         "first experiment: targets jump",
-        "design/limits.py",
+        "experiment_design/limits.py",
         "((high - low) / SLOW).tolist()",
         "(100.0 * (high - low)).tolist()",
         ("test_design_mujoco.py", "move_slowly"),

@@ -96,7 +96,7 @@ INPUTS = (
     ),
     Mutant(
         "inputs: a run's project may change",
-        "experiments/identified.py",
+        "commands/identification.py",
         "    if now == fitted:",
         "    if True:",
         (TESTS, "changed"),
@@ -180,7 +180,7 @@ INPUTS = (
     ),
     Mutant(
         "project: robust is not passed on",
-        "experiments/explain.py",
+        "commands/explain.py",
         "robust=robust, seed=seed",
         "robust=False, seed=seed",
         ("test_project_keys.py", "accepted_and_ignored"),

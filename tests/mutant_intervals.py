@@ -11,7 +11,7 @@ PULLS, LACKING = (
     "identification/intervals/discrepancy.py",
 )
 HERE, TAILS, LACKS = "test_intervals.py", "test_importance.py", "test_discrepancy.py"
-LONGER = "experiments/longer.py"
+LONGER = "commands/longer.py"
 
 INTERVALS = (
     Mutant(

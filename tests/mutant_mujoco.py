@@ -241,14 +241,14 @@ ON_THE_HOST = (
     ),
     Mutant(
         "apply: what failed is left behind",
-        "experiments/apply.py",
+        "commands/apply.py",
         "path.unlink()",
         "pass",
         ("test_project_model.py", "leaves_nothing"),
     ),
     Mutant(
         "apply: the file may be another one",
-        "experiments/identified.py",
+        "commands/identification.py",
         "    _check_fitted(project.spec.system, project.system.parameters, x)\n",
         "",
         ("test_project_model.py", "changed_in_place"),

@@ -3,7 +3,7 @@
 from mutant_list import Mutant
 
 PLANS = "planning/mpc.py"
-CLAIMS, MAP = "experiments/claims.py", "experiments/mismatch.py"
+CLAIMS, MAP = "studies/claims.py", "studies/mismatch.py"
 
 STUDIES = (
     Mutant(
@@ -92,7 +92,7 @@ STUDIES = (
     ),
     Mutant(
         "past actions of the bare plant",
-        "experiments/swingup.py",
+        "studies/swingup.py",
         "return task, model, model.history",
         "return task, model, system.history",
         ("test_mismatch.py", "wraps"),

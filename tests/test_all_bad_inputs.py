@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-import stub_experiments
+import stub_commands
 from bad_files import THIRD
 from bad_inputs import TEXTS, Case, Input, changed, log
 from bad_logs import FIRST
@@ -43,7 +43,7 @@ def refused(
     words: list[str], capsys: pytest.CaptureFixture[str], patch: pytest.MonkeyPatch
 ) -> str:
     """The line that a command says which stops at its input, and compiles nothing."""
-    patch.setattr("sim2gp.experiments.identify.fit_windows", compiled)
+    patch.setattr("sim2gp.commands.identify.fit_windows", compiled)
     before = contents(Path.cwd())
     assert main(words) == 2
     said = capsys.readouterr()
@@ -61,7 +61,7 @@ def stated(
 ) -> str:
     """The note that a command says which goes on; its fit is left out."""
     with patch.context() as during:
-        stub_experiments.install(during, identify=stub_experiments.identify)
+        stub_commands.install(during, identify=stub_commands.identify)
         assert main(words) == 0
     err = capsys.readouterr().err
     summary = json.loads((Path.cwd() / "runs/project/summary.json").read_text())

@@ -7,13 +7,13 @@ import pytest
 
 from sim2gp.data.grid import evaluation_windows
 from sim2gp.data.logs import Log
-from sim2gp.experiments.baselines import (
+from sim2gp.identification.forecasts.baselines import (
     compared,
     forecast_sentence,
     loss_sentence,
     regression_errors,
 )
-from sim2gp.experiments.prediction import Judged, scores
+from sim2gp.identification.forecasts.prediction import Judged, scores
 from sim2gp.systems import CartPole
 
 UNITS = {"q1": "rad", "q2": "rad"}

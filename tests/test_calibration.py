@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from sim2gp.data.logs import Log
-from sim2gp.experiments.calibration import (
+from sim2gp.identification.forecasts.calibration import (
     LEVELS,
     blocks_of,
     calibration,
     half_widths,
 )
-from sim2gp.experiments.prediction import Judged
+from sim2gp.identification.forecasts.prediction import Judged
 
 HORIZON = 0.5  # s; windows start every 0.1 s, so that five of them overlap
 NAMES = ("q1", "q2")

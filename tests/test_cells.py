@@ -12,9 +12,9 @@ import pytest
 
 from sim2gp.cli import main
 from sim2gp.errors import InputError
-from sim2gp.experiments import swingup
-from sim2gp.experiments.swingup import Cell
 from sim2gp.runs import Progress
+from sim2gp.studies import swingup
+from sim2gp.studies.swingup import Cell
 
 ORACLE = {"hang_return": 50.0, "oracle_return": 150.0, "redrawn": 0, "returns": [150.0]}
 CELL = Cell("furuta", "nominal", "SIM2GP", 3, 2)
@@ -274,7 +274,7 @@ def test_the_source_is_all_that_is_imported() -> None:
     from sim2gp.runs.sources import SHOWN, source_of
 
     code = (
-        "import sys, sim2gp.experiments.swingup\n"
+        "import sys, sim2gp.studies.swingup\n"
         "print(*(m for m in sys.modules if m.split('.')[0] == 'sim2gp'))\n"
     )
     loaded = subprocess.run(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from sim2gp.experiments import claims
+from sim2gp.studies import claims
 
 
 def rng() -> np.random.Generator:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import stub_experiments
+import stub_commands
 from sim2gp.cli import main
 from sim2gp.cli.commands import COMMANDS
 from sim2gp.errors import InputError, NotConverged, Sim2GPWarning
@@ -77,7 +77,7 @@ def test_json_is_alone_on_stdout(
         print("a library talks")
         progress.say("working")
 
-    stub_experiments.install(monkeypatch, demo=demo(chatty))
+    stub_commands.install(monkeypatch, demo=demo(chatty))
     asked = ["--seed", "7", "--machine=cartpole", "--log-to=jsonl"]
     assert main(["demo", "--json", *asked]) == 0
     said = capsys.readouterr()
@@ -93,7 +93,7 @@ def test_tables_for_people(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    stub_experiments.install(monkeypatch, demo=demo(lambda out, progress: None))
+    stub_commands.install(monkeypatch, demo=demo(lambda out, progress: None))
     assert main(["demo", "--quiet"]) == 0
     said = capsys.readouterr()
     assert said.err == ""
@@ -126,7 +126,7 @@ def test_exit_codes(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    stub_experiments.install(monkeypatch, demo=raising(error))
+    stub_commands.install(monkeypatch, demo=raising(error))
     assert main(["demo"]) == code
     said = capsys.readouterr()
     assert said.out == ""
@@ -144,7 +144,7 @@ def test_failed_claims_are_not_a_success(
     def selftest(*, seed: int, progress: Progress) -> dict[str, Any]:
         return {"passed": seed == 1}
 
-    stub_experiments.install(monkeypatch, selftest=selftest)
+    stub_commands.install(monkeypatch, selftest=selftest)
     assert main(["selftest", "--seed", "1", "--quiet"]) == 0
     assert main(["selftest", "--quiet"]) == 1
 
@@ -157,7 +157,7 @@ def test_our_warnings_are_one_line_each(
     def careful(out: Path, progress: Progress) -> None:
         warnings.warn("W200 take care", Sim2GPWarning, stacklevel=1)
 
-    stub_experiments.install(monkeypatch, demo=demo(careful))
+    stub_commands.install(monkeypatch, demo=demo(careful))
     assert main(["demo"]) == 0
     assert capsys.readouterr().err.startswith("W200 take care\n")
 
@@ -242,7 +242,7 @@ def test_identify_of_a_small_project(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    stub_experiments.install(monkeypatch, identify=stub_experiments.identify)
+    stub_commands.install(monkeypatch, identify=stub_commands.identify)
     t = 0.01 * np.arange(200)
     table = np.stack([t, np.sin(t), np.sin(t * t)], axis=1)
     np.savetxt("a.csv", table, delimiter=",", header="time,x,u", comments="")
@@ -296,7 +296,7 @@ def test_signals_clean_up(sign: str, code: int, here: Path) -> None:
         "        run.write_text('half', 'x')\n"
         "        progress.say('ready')\n"
         "        time.sleep(60)\n"
-        "for name in ('sim2gp.experiments', 'sim2gp.experiments.demo'):\n"
+        "for name in ('sim2gp.commands', 'sim2gp.commands.demo'):\n"
         "    sys.modules[name] = ModuleType(name)\n"
         "sys.modules[name].run = run\n"
         "raise SystemExit(main(['demo']))\n"

@@ -11,8 +11,8 @@ import scipy.integrate
 
 import machines
 from sim2gp.cli import main
+from sim2gp.commands import compare
 from sim2gp.errors import InputError
-from sim2gp.experiments import compare
 from sim2gp.models import ResidualFunctionSpace
 from sim2gp.project import load_project
 from sim2gp.runs import Progress, load_run

@@ -24,9 +24,9 @@ from sim2gp import design as d
 from sim2gp.data.logs import Log
 from sim2gp.data.split_log import cut
 from sim2gp.data.windows_likelihood import WindowsLikelihood, information_at
-from sim2gp.design import by_gradients
-from sim2gp.design.limits import excess, kept
 from sim2gp.errors import InputError
+from sim2gp.experiment_design import by_gradients
+from sim2gp.experiment_design.limits import excess, kept
 from sim2gp.inference.arrowhead import Noise
 from simulated_logs import pendulum
 

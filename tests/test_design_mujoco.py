@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from sim2gp import design as d
-from sim2gp.design import by_samples, search
-from sim2gp.design.experiment import sensitivity_at
-from sim2gp.design.limits import excess, servo_rates
+from sim2gp.experiment_design import by_samples, search
+from sim2gp.experiment_design.experiment import sensitivity_at
+from sim2gp.experiment_design.limits import excess, servo_rates
 from sim2gp.inference.prior import ParameterPrior
 from sim2gp.systems import Delay, Machine, MuJoCo, Spring
 from sim2gp.systems.assemble import free_parts

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from sim2gp.cli import main
-from sim2gp.design import Everything, Limits, Named, by_gradients
-from sim2gp.experiments import identify
-from sim2gp.experiments.design import goal_of, setting
-from sim2gp.experiments.design_verdict import Asked, foretold, verdict
+from sim2gp.commands import identify
+from sim2gp.commands.design import goal_of, setting
+from sim2gp.experiment_design import Everything, Limits, Named, by_gradients
+from sim2gp.experiment_design.verdict import Asked, foretold, verdict
 from sim2gp.project import load_project
 from sim2gp.runs import Progress, load_run
 from test_identify import folder, project_in

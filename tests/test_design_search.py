@@ -18,9 +18,9 @@ from design_cases import (
     limits,
 )
 from sim2gp import design as d
-from sim2gp.design import by_gradients, search
-from sim2gp.design.limits import excess
 from sim2gp.errors import InputError
+from sim2gp.experiment_design import by_gradients, search
+from sim2gp.experiment_design.limits import excess
 from sim2gp.inference.gaussian import Gaussian
 
 pytestmark = pytest.mark.usefixtures("float64")

@@ -15,7 +15,6 @@ import scipy.stats
 from descents import estimate_of
 from sim2gp.data.split_log import cut
 from sim2gp.data.windows_likelihood import WindowsLikelihood
-from sim2gp.experiments.told_intervals import lacking_table, told_intervals
 from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.intervals import scatter as intervals
 from sim2gp.identification.intervals.discrepancy import _with, corrected_windows
@@ -26,6 +25,7 @@ from sim2gp.identification.intervals.scatter import (
     Corrected,
     corrected,
 )
+from sim2gp.identification.intervals.words import lacking_table, told_intervals
 from sim2gp.inference.arrowhead import Noise
 from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian

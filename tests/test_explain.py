@@ -10,8 +10,6 @@ import pytest
 
 from descents import estimate_of
 from sim2gp import systems as sy
-from sim2gp.experiments import explain_study as study
-from sim2gp.experiments.explain_words import candidate_rows, headline, table
 from sim2gp.identification.missing_physics.data import OneStepData
 from sim2gp.identification.missing_physics.explain import explain
 from sim2gp.identification.missing_physics.score import (
@@ -22,8 +20,10 @@ from sim2gp.identification.missing_physics.score import (
     widened,
 )
 from sim2gp.identification.missing_physics.search import Refitted, Search, search
+from sim2gp.identification.missing_physics.words import candidate_rows, headline, table
 from sim2gp.inference.arrowhead import Noise
 from sim2gp.planning.tasks import MACHINES
+from sim2gp.studies import explain_study as study
 from sim2gp.types import in_float64
 
 

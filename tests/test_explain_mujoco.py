@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sim2gp.experiments import explain, identify
+from sim2gp.commands import explain, identify
 from sim2gp.project import load_project
 from sim2gp.runs import Progress
 from sim2gp.systems import Candidate, candidates

@@ -8,15 +8,15 @@ import jax
 import numpy as np
 import pytest
 
-import stub_experiments
+import stub_commands
 from sim2gp import systems as sy
 from sim2gp.cli import main
+from sim2gp.commands import explain, identify
 from sim2gp.data.logs import Budget
 from sim2gp.errors import InputError
-from sim2gp.experiments import explain, identify
-from sim2gp.experiments import explain_study as study
 from sim2gp.project import load_project
 from sim2gp.runs import Progress, load_run, new_run
+from sim2gp.studies import explain_study as study
 from simulated_logs import simulated
 from test_identify import project_in, write
 
@@ -141,7 +141,7 @@ def test_the_command_line_hands_on(
         assert budget == Budget()
         return {"path": str(path), "add": add, "out": str(out), "answer": "missing"}
 
-    stub_experiments.install(monkeypatch, explain=told)
+    stub_commands.install(monkeypatch, explain=told)
     assert main(["explain", str(run), "--add", "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert said["add"] is True

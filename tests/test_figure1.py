@@ -8,9 +8,10 @@ import pytest
 
 from sim2gp import report
 from sim2gp.errors import NotConverged
-from sim2gp.experiments import two_link, two_link_study
-from sim2gp.experiments.two_link_study import DT, NOISE, Study
 from sim2gp.runs import Progress, load_run
+from sim2gp.studies import figure1 as two_link
+from sim2gp.studies import two_link_study
+from sim2gp.studies.two_link_study import DT, NOISE, Study
 from sim2gp.systems import UniformRodArm
 
 QUIET = Progress(quiet=True)

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from sim2gp.errors import InputError
-from sim2gp.experiments import figure2, swingup
-from sim2gp.experiments.swingup import CONDITIONS, METHODS, TRAINED, Cell
 from sim2gp.planning import MPC, SAC
 from sim2gp.planning.tasks import MACHINES
-from sim2gp.report import figure2 as drawn
+from sim2gp.reports import figure2 as drawn
 from sim2gp.runs import Progress
 from sim2gp.runs.cells import Cells
+from sim2gp.studies import figure2, swingup
+from sim2gp.studies.swingup import CONDITIONS, METHODS, TRAINED, Cell
 
 ORACLE = {"hang_return": 50.0, "oracle_return": 150.0, "redrawn": 1, "returns": [150.0]}
 

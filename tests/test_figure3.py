@@ -12,14 +12,14 @@ import scipy.stats
 
 from sim2gp.belief import AbstractBelief
 from sim2gp.errors import InputError
-from sim2gp.experiments import exploring, figure3
-from sim2gp.experiments.exploring import METHODS, Cell, HeldOut
-from sim2gp.experiments.swingup import CONDITIONS, meeting
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.planning.tasks import MACHINES
-from sim2gp.report import figure3 as drawn
+from sim2gp.reports import figure3 as drawn
 from sim2gp.runs import Progress
 from sim2gp.runs.cells import Cells
+from sim2gp.studies import exploring, figure3
+from sim2gp.studies.exploring import METHODS, Cell, HeldOut
+from sim2gp.studies.swingup import CONDITIONS, meeting
 
 
 def test_transitions_needed_by_hand():

@@ -9,20 +9,20 @@ import jax
 import numpy as np
 import pytest
 
+from sim2gp.commands import folds
+from sim2gp.commands.folds import fold, held_out
 from sim2gp.data.grid import evaluation_windows
 from sim2gp.data.logs import Log
 from sim2gp.data.split_log import cut
-from sim2gp.experiments import folds
-from sim2gp.experiments.folds import fold, held_out
-from sim2gp.experiments.motion import film
-from sim2gp.experiments.prediction import (
+from sim2gp.identification.forecasts.forecast import Band, Forecast
+from sim2gp.identification.forecasts.prediction import (
     drawn,
     predicted,
     rows_for,
     trace_arrays,
 )
-from sim2gp.identification.forecast import Band, Forecast
 from sim2gp.project import load_project
+from sim2gp.reports.motion import film
 from sim2gp.systems import CartPole
 from sim2gp.types import in_float64
 

@@ -12,7 +12,7 @@ from oracles import log_protocol as protocol
 from oracles import plain_least_squares as plain
 from sim2gp.data.grid import CURVE, evaluation_windows, slopes, steps_of
 from sim2gp.data.logs import Log
-from sim2gp.identification.forecast import (
+from sim2gp.identification.forecasts.forecast import (
     Band,
     _forecast,
     compile_forecast,

@@ -7,18 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sim2gp.commands import apply, design, evaluate, explain, identify
+from sim2gp.commands.identification import restored
 from sim2gp.data.logs import Log
 from sim2gp.errors import InputError
-from sim2gp.experiments import (
-    apply,
-    design,
-    design_verdict,
-    evaluate,
-    explain,
-    identify,
-)
-from sim2gp.experiments.configurations import told
-from sim2gp.experiments.identified import restored
+from sim2gp.experiment_design import verdict as design_verdict
+from sim2gp.identification.configurations import told
 from sim2gp.project import load_project
 from sim2gp.runs import Progress, load_run
 from sim2gp.systems import Furuta, Variant

@@ -11,10 +11,10 @@ import pytest
 
 import sim2gp.inference.host_descent as host
 from sim2gp.cli import main
+from sim2gp.commands.first_answer import FirstAnswer
 from sim2gp.data.logs import Log
 from sim2gp.data.split_log import cut
 from sim2gp.errors import NotConverged
-from sim2gp.experiments.first_answer import FirstAnswer
 from sim2gp.identification import fit
 from sim2gp.identification.fit import fit_windows
 from sim2gp.inference.arrowhead import Noise

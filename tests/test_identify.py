@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from sim2gp.cli import main
+from sim2gp.commands import evaluate, identify, longer
+from sim2gp.commands.identification import restored
+from sim2gp.commands.longer import Longer
 from sim2gp.data.logs import Log
 from sim2gp.errors import InputError
-from sim2gp.experiments import evaluate, identify, longer
-from sim2gp.experiments.identified import restored
-from sim2gp.experiments.longer import Longer
 from sim2gp.project import load_project
 from sim2gp.runs import Progress, load_run
 from sim2gp.systems import Furuta, Machine

@@ -43,7 +43,7 @@ def run(*, out, progress, **options):
         run.write_text("half", "x")
         work()
 if __name__ == "__main__":
-    for name in ("sim2gp.experiments", "sim2gp.experiments.demo"):
+    for name in ("sim2gp.commands", "sim2gp.commands.demo"):
         sys.modules[name] = ModuleType(name)
     sys.modules[name].run = run
     sys.argv = ["sim2gp", "demo"]

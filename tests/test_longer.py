@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from linear_system import linear
+from sim2gp.commands.longer import TIMES, Longer, advice, lengthened
 from sim2gp.data.logs import Log
 from sim2gp.data.windows_likelihood import WindowsLikelihood
-from sim2gp.experiments.longer import TIMES, Longer, advice, lengthened
-from sim2gp.experiments.training_windows import cut_logs
 from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.intervals.discrepancy import corrected_windows
 from sim2gp.identification.intervals.scatter import Corrected
 from sim2gp.identification.misfit.residuals import misfit_of_windows
 from sim2gp.project import Project, load_project
+from sim2gp.project.training_windows import cut_logs
 
 RATE, NOISE, WINDOW = 10.0, 0.02, 0.5  # Hz, m, s
 ROWS, KEY = 400, jax.random.key(0)

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from sim2gp.errors import InputError
-from sim2gp.experiments import mismatch, swingup
-from sim2gp.experiments.swingup import CONDITIONS, METHODS, WITH_TERM, Cell
 from sim2gp.models import PointEstimate
 from sim2gp.planning.tasks import MACHINES, furuta_swingup
 from sim2gp.runs import Progress
+from sim2gp.studies import mismatch, swingup
+from sim2gp.studies.swingup import CONDITIONS, METHODS, WITH_TERM, Cell
 from sim2gp.systems import Delay, Furuta
 from sim2gp.systems.effects.strengths import effect
 from sim2gp.systems.machine import Machine

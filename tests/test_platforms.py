@@ -53,7 +53,7 @@ COMMANDS = """
 import importlib, sys
 from pathlib import Path
 import pytest
-import report_example, stub_experiments
+import report_example, stub_commands
 import sim2gp
 from sim2gp.cli import main
 from sim2gp.runs import load_run, new_run
@@ -69,7 +69,7 @@ for path in sorted(folder.rglob("*.py")):
     parts = path.relative_to(folder.parent).with_suffix("").parts
     importlib.import_module(".".join(p for p in parts if p != "__init__"))
 assert main(["--help"]) == 0
-stub_experiments.install(pytest.MonkeyPatch(), identify=stub_experiments.identify)
+stub_commands.install(pytest.MonkeyPatch(), identify=stub_commands.identify)
 for _ in range(2):
     assert main(["identify", "arm.toml", "--out", "run"]) == 0
 assert load_run("run").summary["n_transitions"] == 199

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from sim2gp.cli import main
+from sim2gp.commands import apply
+from sim2gp.commands.design import setting
+from sim2gp.commands.identification import restored
 from sim2gp.errors import InputError
-from sim2gp.experiments import apply
-from sim2gp.experiments.design import setting
-from sim2gp.experiments.design_verdict import Asked
-from sim2gp.experiments.identified import restored
+from sim2gp.experiment_design.verdict import Asked
 from sim2gp.project import load_project
 from sim2gp.runs import load_run, new_run
 from sim2gp.systems.mujoco.load import compiled_all

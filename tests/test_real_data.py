@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sim2gp.experiments import compare
+from sim2gp.commands import compare
 from sim2gp.project import load_project
 from sim2gp.runs import Progress
 

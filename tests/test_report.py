@@ -13,7 +13,7 @@ import pytest
 from report_example import Run, a_film, full_run
 from sim2gp import report
 from sim2gp.errors import InputError
-from sim2gp.report import markup
+from sim2gp.reports import markup
 from sim2gp.runs import store
 from sim2gp.systems.mujoco.film import BYTES
 
@@ -309,7 +309,7 @@ def test_redraw_of_something_else_is_the_users_fault(tmp_path: Path) -> None:
 
 def test_importing_the_report_draws_nothing_yet() -> None:
     code = (
-        "import sys, sim2gp.report; "
+        "import sys, sim2gp.reports; "
         "sys.exit(any(m.split('.')[0] in ('matplotlib', 'PIL') for m in sys.modules))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

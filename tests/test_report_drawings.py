@@ -9,7 +9,7 @@ import pytest
 from report_example import swing_up, two_data_sets
 from sim2gp import report
 from sim2gp.errors import InputError
-from sim2gp.report import densities, scenes, svg
+from sim2gp.reports import densities, scenes, svg
 
 
 def test_a_density_integrates_its_draws_and_respects_its_bounds() -> None:

@@ -7,8 +7,9 @@ import pytest
 import scipy.integrate
 import scipy.stats
 
-from sim2gp.experiments import compare, scoring
-from sim2gp.experiments.scoring import Paired
+from sim2gp.commands import compare
+from sim2gp.identification.forecasts import scoring
+from sim2gp.identification.forecasts.scoring import Paired
 
 
 @pytest.mark.parametrize("error", [-2.0, -0.1, 0.0, 0.7, 9.0])

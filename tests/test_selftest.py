@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sim2gp.commands import selftest
+from sim2gp.commands import selftest_checks as checks
+from sim2gp.commands.selftest import CHECKS, Check
 from sim2gp.errors import NotConverged
-from sim2gp.experiments import selftest
-from sim2gp.experiments import selftest_checks as checks
-from sim2gp.experiments.selftest import CHECKS, Check
 from sim2gp.runs import Progress
 
 QUIET = Progress(quiet=True)

@@ -16,11 +16,11 @@ from mass_task import GainModel, mass_task, single
 from sim2gp import checks
 from sim2gp import systems as sy
 from sim2gp.data.grid import evaluation_windows
-from sim2gp.design.goals import Everything
-from sim2gp.design.search import design
-from sim2gp.design.signals import Free
-from sim2gp.design.signals import Multisine as Sines
 from sim2gp.errors import InputError
+from sim2gp.experiment_design.goals import Everything
+from sim2gp.experiment_design.search import design
+from sim2gp.experiment_design.signals import Free
+from sim2gp.experiment_design.signals import Multisine as Sines
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.linear_measurements import LinearMeasurement
 from sim2gp.inference.parameters import Parameter, Parameters, prior_from_moments

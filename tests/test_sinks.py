@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sim2gp.commands.demo import _told
 from sim2gp.errors import InputError
-from sim2gp.experiments.demo import _told
 from sim2gp.models import PointEstimate, Sim2GP
 from sim2gp.planning.episode import Trajectory
 from sim2gp.planning.loop import Episode

@@ -10,8 +10,8 @@ from PIL import Image
 
 from report_example import a_film
 from sim2gp import report
-from sim2gp.report import scenes
-from sim2gp.report.skeleton import camera_for, figure_entry, overlaid, skeleton
+from sim2gp.reports import scenes
+from sim2gp.reports.skeleton import camera_for, figure_entry, overlaid, skeleton
 
 ARM = """
 <mujoco><worldbody>
@@ -256,7 +256,7 @@ def test_no_back_end_is_no_picture_and_no_noise(
 def test_mujoco_sees_the_machine_where_the_figure_is(text: str) -> None:
     """Every joint of the figure lies on the machine that MuJoCo drew."""
     mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is absent")
-    from sim2gp.experiments.motion import _frames
+    from sim2gp.reports.motion import _frames
     from sim2gp.systems.mujoco.figure import figure_of
 
     model = mujoco.MjModel.from_xml_string(text)

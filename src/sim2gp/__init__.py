@@ -57,7 +57,7 @@ _CONTENTS = {
     "psal": "planning.loop",
     "optimism": "planning.loop",
     "load_run": "runs",
-    "show": "report",
+    "show": "reports",
     "InputError": "errors",
     "Sim2GPError": "errors",
 }

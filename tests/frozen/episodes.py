@@ -15,7 +15,7 @@ if __name__ == "__main__":
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from frozen.cases import VALUES
-from sim2gp.experiments import exploring, swingup
+from sim2gp.studies import exploring, swingup
 
 RECORD = VALUES / "episodes.json"
 SEEDS = range(10)

@@ -14,7 +14,7 @@ import pytest
 import sim2gp as sg
 from frozen.recordings import check_same, figures
 from sim2gp.cli import main
-from sim2gp.experiments.identified import restored
+from sim2gp.commands.identification import restored
 
 GOLDEN = Path(__file__).parent / "golden"
 pytestmark = pytest.mark.skipif(

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from sim2gp.cli.arguments import numbers, pairs, usage_error
-from sim2gp.cli.late import FIGURES, budget, experiment, read_project, run_directory
+from sim2gp.cli.late import FIGURES, budget, function, read_project, run_directory
 from sim2gp.cli.options import Chosen, Common, Reads, Wide, Writes
 from sim2gp.runs import Progress, load_run
 from sim2gp.runs.store import check_absent
@@ -36,7 +36,7 @@ class Demo(Writes):
     """Write each episode's numbers, as they come, beside the run directory."""
 
     def run(self, progress: Progress) -> dict[str, Any]:
-        return experiment("demo")(
+        return function("commands.demo")(
             out=run_directory(self.out, "demo"),
             machine=self.machine,
             seed=self.seed,
@@ -74,7 +74,7 @@ class Init(Common):
     def run(self, progress: Progress) -> dict[str, Any]:
         out = self.out or Path(Path(self.model).stem + ".toml")
         check_absent(out)
-        return experiment("first")(
+        return function("commands.init")(
             self.model,
             self.logs,
             out=out,
@@ -108,7 +108,7 @@ class Identify(Reads):
     def run(self, progress: Progress) -> dict[str, Any]:
         out = run_directory(self.out, self.project.stem)
         read = read_project(self.project, self)
-        return experiment("identify")(
+        return function("commands.identify")(
             *read,
             out=out,
             seed=self.seed,
@@ -145,16 +145,16 @@ class Evaluate(Reads, Chosen):
                     expected = "a project file alone: its own logs are left out"
                     raise usage_error("too much", f"--{option}", expected, fix)
             read = read_project(self.run_or_project, self)
-            return experiment("evaluate", "leave_one_out")(*read, **how)
+            return function("commands.evaluate", "leave_one_out")(*read, **how)
         load_run(self.run_or_project)  # a folder that is no run fails before the work
         if not self.logs:
             expected, fix = "--logs FILE...", "name the logs to predict"
             raise usage_error("no logs", "no --logs", expected, fix)
-        fit = experiment("identified", "restored")(self.run_or_project)
+        fit = function("commands.identification", "restored")(self.run_or_project)
         fit = fit.within(budget(self.budget))
         tested = fit.read(self.logs, self.configuration, strict=self.strict)
         how |= {"configuration": self.configuration, "files": self.logs}
-        return experiment("evaluate")(fit, tested, **how)
+        return function("commands.evaluate")(fit, tested, **how)
 
 
 @dataclass(kw_only=True)
@@ -169,7 +169,7 @@ class Explain(Reads):
     def run(self, progress: Progress) -> dict[str, Any]:
         out = run_directory(self.out, f"explain-{self.path.name}")
         load_run(self.path)  # a folder that is no run fails before the work
-        return experiment("explain")(
+        return function("commands.explain")(
             self.path,
             add=self.add,
             out=out,
@@ -193,7 +193,7 @@ class Compare(Reads):
     def run(self, progress: Progress) -> dict[str, Any]:
         out = run_directory(self.out, f"compare-{self.project.stem}")
         read = read_project(self.project, self, alike=True)
-        return experiment("compare")(
+        return function("commands.compare")(
             *read,
             horizons=self.horizon,
             out=out,
@@ -238,8 +238,8 @@ class Design(Writes, Chosen):
             source = import_module("sim2gp.project").load_project(source)
         else:
             load_run(source)  # a folder that is no run fails early
-            source = experiment("identified", "restored")(source)
-        asked = import_module("sim2gp.experiments.design_verdict").Asked(
+            source = function("commands.identification", "restored")(source)
+        asked = import_module("sim2gp.experiment_design.verdict").Asked(
             seconds=self.seconds,
             kind=self.kind,
             about=self.about,
@@ -252,7 +252,7 @@ class Design(Writes, Chosen):
             starts=self.starts,
             configuration=self.configuration,
         )
-        return experiment("design")(
+        return function("commands.design")(
             source, asked, out=out, seed=self.seed, progress=progress
         )
 
@@ -271,7 +271,7 @@ class Apply(Wide):
     """Change the model's file itself."""
 
     def run(self, progress: Progress) -> dict[str, Any]:
-        return experiment("apply")(
+        return function("commands.apply")(
             self.path,
             out=self.out,
             model=self.model,
@@ -296,8 +296,8 @@ class Export(Writes, Wide):
     def run(self, progress: Progress) -> dict[str, Any]:
         out = run_directory(self.out, f"export-{self.path.name}")
         load_run(self.path)  # a folder that is no run fails before the work
-        fit = experiment("identified", "restored")(self.path)
-        return experiment("export")(
+        fit = function("commands.identification", "restored")(self.path)
+        return function("commands.export")(
             fit,
             draws=self.draws,
             out=out,
@@ -317,7 +317,7 @@ class Report(Common):
 
     def run(self, progress: Progress) -> dict[str, Any]:
         summary = load_run(self.path).summary
-        redraw = import_module("sim2gp.report").redraw
+        redraw = import_module("sim2gp.reports").redraw
         progress.say(f"report: {redraw(self.path)}")
         return summary
 
@@ -330,7 +330,7 @@ class Selftest(Common):
     """Draws the problems."""
 
     def run(self, progress: Progress) -> dict[str, Any]:
-        return experiment("selftest")(seed=self.seed, progress=progress)
+        return function("commands.selftest")(seed=self.seed, progress=progress)
 
 
 @dataclass(kw_only=True)
@@ -375,7 +375,7 @@ class Reproduce(Writes):
             more["workers"] = self.workers or cores()
         if FIGURES[self.figure] in ("figure2", "figure3"):  # of two figures each
             more["figure"] = self.figure
-        return experiment(FIGURES[self.figure])(
+        return function(f"studies.{FIGURES[self.figure]}")(
             out=run_directory(self.out, self.figure),
             seed=self.seed,
             quick=self.quick,

@@ -12,9 +12,9 @@ from typing import Any
 from sim2gp.cli.options import Reads
 from sim2gp.runs.store import check_target
 
-#: Figure, and the module of `sim2gp.experiments` that makes it.
+#: Figure, and the module of `sim2gp.studies` that makes it.
 FIGURES = {
-    "fig1": "two_link",
+    "fig1": "figure1",
     "fig2": "figure2",
     "fig3": "figure3",
     "fig4": "figure2",
@@ -42,9 +42,7 @@ def budget(factor: float) -> Any:
     return import_module("sim2gp.data.logs").Budget().times(factor)
 
 
-def experiment(module: str, name: str = "run") -> Callable[..., Any]:
-    """A function of `sim2gp.experiments`, imported when a command runs."""
-    found: Callable[..., Any] = getattr(
-        import_module(f"sim2gp.experiments.{module}"), name
-    )
+def function(module: str, name: str = "run") -> Callable[..., Any]:
+    """A function of a module of ours, imported when a command runs."""
+    found: Callable[..., Any] = getattr(import_module(f"sim2gp.{module}"), name)
     return found

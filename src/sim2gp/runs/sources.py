@@ -11,7 +11,7 @@ from sim2gp.runs.plain import to_json, version
 
 PACKAGE = Path(__file__).parents[1]
 #: Rooms that draw and word results, and do not compute them.
-SHOWN = ("cli", "report")
+SHOWN = ("cli", "reports")
 PACKAGES = ("jax", "jaxlib", "numpy")
 _DOCUMENTED = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
 

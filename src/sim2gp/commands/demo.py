@@ -1,0 +1,271 @@
+"""The demo: swing up a pendulum whose constants are unknown, in a few trials.
+
+For each seed a machine is drawn from the prior, and three learners meet it under the
+same noise: posterior sampling, its point estimate, and the prior mean that never
+learns. Every real interaction counts; scores are those of `sim2gp.planning.tasks`.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from sim2gp.belief import AbstractModel
+from sim2gp.data.one_step import OneStepLikelihood
+from sim2gp.data.transitions import Transitions
+from sim2gp.identification import diagnose
+from sim2gp.identification.misfit.residuals import misfit_of_transitions
+from sim2gp.models import PointEstimate, PriorMean, Sim2GP, Sim2GPBelief
+from sim2gp.planning import MPC
+from sim2gp.planning.loop import Episode, History, psrl
+from sim2gp.planning.oracle import AcceptedTruth, accept_truth
+from sim2gp.planning.tasks import MACHINES, Task, episodes_to_95, hanging_return, score
+from sim2gp.runs import Progress, new_run, sinks
+from sim2gp.runs.provenance import provenance
+from sim2gp.systems.base import AbstractSystem
+from sim2gp.types import Key
+
+LEARNER = "posterior sampling"
+ORACLE_EPISODES = 5
+
+
+@dataclass(frozen=True)
+class SeedRun:
+    """One machine, all learners on it."""
+
+    accepted: AcceptedTruth
+    hang: float
+    histories: dict[str, History]
+
+    @property
+    def oracle(self) -> float:
+        return self.accepted.oracle.oracle_return
+
+    def solved(self, method: str) -> int | None:
+        """`episodes_to_95` of one learner."""
+        return episodes_to_95(self.histories[method].returns, self.hang, self.oracle)
+
+
+def run(
+    *,
+    out: Path,
+    machine: str,
+    seed: int,
+    seeds: int,
+    episodes: int,
+    truth: str,
+    progress: Progress,
+    log_to: str | None = None,
+) -> dict[str, Any]:
+    """Fly ``seeds`` machines and write the run; returns its summary.
+
+    ``log_to`` is one of `sinks.KINDS`: where every episode's numbers go at once.
+    """
+    started = time.perf_counter()
+    make, preset = MACHINES[machine]
+    system = make()
+    model = Sim2GP(system)
+    learners: dict[str, AbstractModel] = {
+        LEARNER: model,
+        "point estimate": PointEstimate(model),
+        "prior mean": PriorMean(model),
+    }
+    parts = 1 + len(learners) * episodes
+    runs = []
+    asked = {"machine": machine, "seed": seed, "seeds": seeds, "episodes": episodes}
+    with (
+        new_run(out, "demo") as writer,
+        sinks.opened(log_to, out, asked | {"truth": truth}) as sink,
+    ):
+        with progress.task("demo", seeds * parts) as task:
+            for s in range(seed, seed + seeds):
+                key = jax.random.key(s)
+                accepted = accept_truth(preset, system, MPC(), key=key, truth=truth)
+                oracle = accepted.oracle.oracle_return
+                task.advance(f"seed {s}: oracle {oracle:.0f}")
+                sink.scalars(0, {f"seed {s}/oracle/return": oracle})
+                told = partial(_told, task.advance, sink, s)
+                histories = _race(accepted.task, learners, episodes, key, told)
+                runs.append(SeedRun(accepted, hanging_return(accepted.task), histories))
+        summary, arrays = _summarise(system, machine, runs, seed, episodes)
+        summary["truth"] = truth
+        summary |= provenance(
+            f"sim2gp demo --machine {machine} --seed {seed} --seeds {seeds} "
+            f"--episodes {episodes} --truth {truth}",
+            started,
+        )
+        from sim2gp.reports import write_report
+
+        writer.write_summary(summary)
+        writer.write_arrays("arrays.npz", arrays)
+        writer.write_text("report.html", write_report(summary, arrays))
+    return summary
+
+
+def _race(
+    task: Task,
+    learners: dict[str, AbstractModel],
+    episodes: int,
+    key: Key,
+    told: Callable[[str], Callable[[Episode], None]],
+) -> dict[str, History]:
+    """Every learner on the same machine, under the same noise."""
+    return {
+        name: psrl(
+            task, learner, MPC(), episodes=episodes, key=key, on_episode=told(name)
+        )
+        for name, learner in learners.items()
+    }
+
+
+def _told(
+    advance: Callable[[str], None], sink: sinks.Sink, seed: int, name: str
+) -> Callable[[Episode], None]:
+    """Who hears of a learner's episodes: the bar, and wherever numbers go."""
+    write = sinks.each_episode(sink, f"seed {seed}/{name}")
+
+    def tell(episode: Episode) -> None:
+        total = float(episode.trajectory.total)
+        advance(f"{name}, episode {episode.index}: return {total:.0f}")
+        write(episode)
+
+    return tell
+
+
+def _summarise(
+    system: AbstractSystem,
+    machine: str,
+    runs: list[SeedRun],
+    seed: int,
+    episodes: int,
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    methods = list(runs[0].histories)
+    returns = {m: np.stack([r.histories[m].returns for r in runs]) for m in methods}
+    solved = {m: [r.solved(m) for r in runs] for m in methods}
+    first, shown = runs[0], runs[0].histories[LEARNER]
+    belief = shown.belief
+    assert isinstance(belief, Sim2GPBelief)
+    table = system.parameters
+    found = diagnose.summary(table, belief.prior, belief.posterior, belief.information)
+    for name, value in first.accepted.task.truth.items():
+        if name in found["parameters"]:
+            found["parameters"][name]["truth"] = float(value)
+    states = [channel.name for channel in system.physical_states]
+    seconds = first.accepted.task.seconds
+    summary: dict[str, Any] = {
+        "command": "demo",
+        "machine": machine,
+        "seed": seed,
+        "seeds": len(runs),
+        "episodes": episodes,
+        "headline": _headline(runs, seconds),
+        "returns": {m: _squeeze(returns[m].tolist()) for m in methods},
+        "oracle_return": _squeeze([r.oracle for r in runs]),
+        "hang_return": _squeeze([r.hang for r in runs]),
+        "redrawn_truths": sum(r.accepted.redrawn for r in runs),
+        "episodes_to_95": {m: _squeeze(solved[m]) for m in methods},
+        "solved_within": {m: _within(solved[m], episodes) for m in methods},
+        "interaction_seconds": {
+            m: _squeeze([None if n is None else n * seconds for n in solved[m]])
+            for m in methods
+        },
+        "noise": dict(zip(states, np.asarray(belief.noise).tolist(), strict=True)),
+        "misfit": _misfit(belief, shown.data),
+        "log_evidence": float(belief.log_evidence),
+        "n_transitions": int(belief.count),
+        **found,
+    }
+    scores = {
+        m: np.asarray(
+            [[score(x, r.hang, r.oracle) for x in r.histories[m].returns] for r in runs]
+        )
+        for m in methods
+    }
+    summary["tables"] = [_score_table(runs, methods, scores)]
+    summary["animation"] = _animation(first.accepted.task, machine, scores[LEARNER][0])
+    arrays = {f"returns/{m}": returns[m] for m in methods}
+    arrays |= {f"scores/{m}": scores[m] for m in methods}
+    # Each episode's last state is left out: time and actions then are T long.
+    arrays["animation/state"] = np.concatenate(shown.state[:, :-1])
+    arrays["animation/action"] = np.concatenate(shown.action)
+    key = jax.random.fold_in(jax.random.key(seed), 1)
+    arrays |= diagnose.arrays(table, belief.prior, belief.posterior, key=key)
+    return summary, arrays
+
+
+def _misfit(belief: Sim2GPBelief, data: Transitions) -> dict[str, Any]:
+    likelihood = OneStepLikelihood(belief.system, data, belief.dt)
+    about = belief.prior, belief.posterior, belief.noise
+    return misfit_of_transitions(likelihood, *about).as_dict()
+
+
+def _animation(task: Task, machine: str, scores: np.ndarray) -> dict[str, Any]:
+    """What the report needs to draw the machine's episodes."""
+    return {
+        "system": machine,
+        "dt": task.dt,
+        "params": {k: float(v) for k, v in task.truth.items()},
+        "title": "the machine, flown by the learned model",
+        "marks": [
+            {"time": e * task.seconds, "text": f"episode {e + 1}, score {s:.2f}"}
+            for e, s in enumerate(scores)
+        ],
+    }
+
+
+def _headline(runs: list[SeedRun], seconds: float) -> str:
+    counts = [r.solved(LEARNER) for r in runs]
+    done = sorted(n for n in counts if n is not None)
+    if not done:
+        return "The learner did not reach 95 % of the oracle's score."
+    middle = done[len(done) // 2]
+    machines = (
+        "The machine was"
+        if len(runs) == 1
+        else f"{len(done)} of {len(runs)} machines were"
+    )
+    return (
+        f"{machines} swung up at 95 % of the oracle's score or better; "
+        f"in episode {middle}{' (median)' if len(runs) > 1 else ''}, that is "
+        f"after {middle * seconds:g} s on the machine."
+    )
+
+
+def _within(solved: list[int | None], episodes: int) -> dict[str, int]:
+    """How many seeds were solved within so many episodes."""
+    return {
+        str(n): sum(1 for s in solved if s is not None and s <= n)
+        for n in range(1, episodes + 1)
+    }
+
+
+def _score_table(
+    runs: list[SeedRun], methods: list[str], scores: dict[str, np.ndarray]
+) -> dict[str, Any]:
+    """Median score of each episode, and how soon the seeds are solved."""
+    episodes = scores[methods[0]].shape[1]
+    rows = []
+    for m in methods:
+        counts = [r.solved(m) for r in runs]
+        soon = [sum(n is not None and n <= k for n in counts) for k in (1, 2, 3)]
+        rows.append(
+            [m, *(f"{x:.2f}" for x in np.median(scores[m], axis=0)), *map(str, soon)]
+        )
+    heads = [f"episode {e + 1}" for e in range(episodes)]
+    return {
+        "title": "Score of each episode (median over machines) and machines solved",
+        "columns": ["method", *heads, "by 1", "by 2", "by 3"],
+        "rows": rows,
+        "note": f"Machines: {len(runs)}; a score of 1 is the oracle's, 0 is hanging; "
+        f"solved means a score of at least 0.95 in any episode so far.",
+    }
+
+
+def _squeeze(values: list[Any]) -> Any:
+    """One seed's value alone, several as a list."""
+    return values[0] if len(values) == 1 else values

@@ -1,0 +1,326 @@
+"""Design: the next experiment on a machine, and what it should tell.
+
+From a finished identification, or from a project file alone, before any log exists. The
+commands keep their limits exactly; the states keep theirs for nearly all machines that
+are plausible: after an identification, for those of its corrected posterior.
+Information is counted from the plain one, because data do not reduce a model's errors.
+"""
+
+import io
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sim2gp.commands.identification import Identified, used
+from sim2gp.errors import InputError
+from sim2gp.experiment_design import (
+    AbstractGoal,
+    AbstractSignal,
+    Designed,
+    Everything,
+    Experiment,
+    Free,
+    Limits,
+    Multisine,
+    Named,
+    Prediction,
+    design,
+    prediction_rows,
+)
+from sim2gp.experiment_design.limits import SLOW, servo_rates
+from sim2gp.experiment_design.verdict import Asked, expected_table, foretold, verdict
+from sim2gp.identification.forecasts.prediction import units
+from sim2gp.identification.identifiability.table import physical_moments
+from sim2gp.inference.parameters import unknown_parameter
+from sim2gp.inference.prior import ParameterPrior
+from sim2gp.models.features import Encoding
+from sim2gp.models.sim2gp import PRIOR_NOISE
+from sim2gp.project import Project
+from sim2gp.runs import Progress, new_run
+from sim2gp.runs.provenance import command, provenance
+from sim2gp.systems import one_variant
+from sim2gp.systems.base import AbstractSystem, index_of
+from sim2gp.types import in_float64
+
+FILE = "trajectory.csv"
+PERIOD = 0.01  # s, of commands and samples, where no log says otherwise
+WINDOW = 0.2  # s, where the likelihood has windows of one step
+LOOSE = 1.0  # rad, m, rad/s or m/s: the sd of a window's start where none is stated
+
+
+def run(
+    source: Project | Identified,
+    asked: Asked,
+    *,
+    out: Path,
+    seed: int,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Choose the commands and write them; returns the summary.
+
+    Raises `InputError`: E145 for an unknown constant, E103 for an unknown channel, E150
+    where the limits admit no motion, E151 for a duration shorter than a step.
+    """
+    started = time.perf_counter()
+    with new_run(out, "design") as writer, progress.task("design", 3) as task:
+        project, experiment, notes = setting(source, asked)
+        stated = {
+            name: (low, high) for name, (low, high) in project.spec.limits.items()
+        }
+        rates = dict(project.spec.rates) | dict(asked.rates)
+        slow = servo_rates(experiment.system)
+        if slow.keys() - rates.keys():
+            notes.append(
+                f"no rate is stated of some targets of servos: they cross their range "
+                f"in {SLOW:g} s or more"
+            )
+        limits = Limits.of(
+            experiment.system,
+            stated | dict(asked.limits),
+            slow | rates,
+            start=np.asarray(experiment.start),
+        )
+        if not limits.stated():
+            notes.append("no limit of any position or velocity is stated")
+        key = jax.random.key(seed)
+        signal = signal_of(asked.kind, experiment)
+        goal = goal_of(asked, experiment, limits, jax.random.fold_in(key, 1))
+        task.advance("limits and goal")
+        found = design(experiment, goal, limits, signal, key=key, starts=asked.starts)
+        task.advance(f"{found.nats:.1f} nats")
+        place = source.path if isinstance(source, Project) else source.run
+        summary = _summarise(place, asked, experiment, goal, found, seed)
+        summary["warnings"] = notes
+        if isinstance(source, Identified):
+            summary |= widths(source)
+        line = command("sim2gp", "design", place, *asked.words().split())
+        line += " " + command("--seed", seed, "--out", out)
+        summary |= provenance(line, started)
+        arrays = _arrays(experiment, limits, found)
+        from sim2gp.reports import write_report
+
+        writer.write_summary(summary)
+        writer.write_arrays("arrays.npz", arrays)
+        writer.write_text(FILE, as_csv(experiment, found))
+        writer.write_text("report.html", write_report(summary, arrays))
+        task.advance("report")
+    return summary
+
+
+@in_float64
+def setting(
+    source: Project | Identified, asked: Asked
+) -> tuple[Project, Experiment, list[str]]:
+    """The machine and what is believed of it; what the user should know of both."""
+    notes: list[str] = []
+    corrected = None
+    if isinstance(source, Project):
+        project, joint = source, source.system
+        prior = ParameterPrior(joint.parameters.prior(), joint.parameters)
+        belief, names = prior.at_mode(), _measured(project)
+        noise, period = _stated_noise(project, names), PERIOD
+        notes.append("no log was used: what is believed is the project's priors")
+    else:
+        project, joint, belief = source.project, source.project.system, source.plain
+        names, noise, period = source.outputs, source.noise, source.period
+        _, corrected = one_variant(joint, source.posterior, asked.configuration)
+    system, belief = one_variant(joint, belief, asked.configuration)
+    states = [channel.name for channel in system.physical_states]
+    period = asked.period or period
+    steps = round(asked.seconds / period)
+    if steps < 2:
+        raise InputError(
+            "E151",
+            "experiment shorter than its steps",
+            where="--seconds",
+            got=f"{asked.seconds:g} s",
+            expected=f"at least two periods of {period:g} s",
+            fix="design some seconds",
+        )
+    stated = project.spec.likelihood
+    window = max(2, round((stated.window or WINDOW) / period))
+    sd = stated.start_sd
+    each = sd if isinstance(sd, dict) else dict.fromkeys(states, sd or LOOSE)
+    experiment = Experiment(
+        system,
+        belief,
+        jnp.asarray(noise, float),
+        _start(asked.start, system),
+        jnp.asarray([each.get(name, LOOSE) for name in states], float),
+        tuple(states.index(name) for name in names),
+        period,
+        steps,
+        min(window, steps),
+        system.window_substep,
+        corrected=corrected,
+    )
+    return project, experiment, notes
+
+
+def widths(fit: Identified) -> dict[str, Any]:
+    """Which of an identification's two posteriors was used for what."""
+    return used(fit.summary, "corrected") | {
+        "posterior": "Limits of the states and the expected motion are those of the "
+        "corrected posterior, information and expected sd those of the plain one"
+    }
+
+
+def signal_of(kind: str, experiment: Experiment) -> AbstractSignal:
+    """The family that the commands are chosen from."""
+    family = {"multisine": Multisine, "free": Free}[kind]
+    return family(experiment.period, experiment.steps)
+
+
+def goal_of(
+    asked: Asked, experiment: Experiment, limits: Limits, key: jax.Array
+) -> AbstractGoal:
+    """What is asked about: all constants, some, or a prediction."""
+    names = experiment.system.parameters.names
+    for name in asked.about:
+        if name not in names:
+            raise unknown_parameter(name, names)
+    if asked.predict:
+        return Prediction(prediction_rows(experiment, limits, asked.predict, key))
+    if asked.about:
+        return Named(tuple(names.index(name) for name in asked.about))
+    return Everything()
+
+
+def _measured(project: Project) -> list[str]:
+    """Channels that the logs of a project measure; all positions where it has none."""
+    states = [channel.name for channel in project.system.physical_states]
+    named = {name for group in project.spec.logs for name in group.columns}
+    measured = [name for name in states if name in named]
+    return measured or [name for name in states if not name.endswith(".velocity")]
+
+
+def _stated_noise(project: Project, names: list[str]) -> list[float]:
+    """As the project states it, or a thousandth of half of each channel's box."""
+    system, floor = project.system, project.spec.likelihood.noise_floor
+    half = np.asarray(Encoding.of(system, {}).half_widths()).tolist()
+    states = [channel.name for channel in system.physical_states]
+    guess = {n: PRIOR_NOISE * h for n, h in zip(states, half, strict=True)}
+    each = floor if isinstance(floor, dict) else {n: floor or guess[n] for n in names}
+    return [each.get(name, guess[name]) for name in names]
+
+
+def _start(given: Mapping[str, float], system: AbstractSystem) -> Any:
+    states = system.physical_states
+    for name in given:
+        index_of(name, states, where="--start")
+    return jnp.asarray([given.get(c.name, 0.0) for c in states], float)
+
+
+@in_float64
+def expectation(experiment: Experiment, found: Designed) -> dict[str, dict[str, Any]]:
+    """Of each constant: unit, mean and sd now, sd expected after, and their ratio.
+
+    All plain but ``corrected_sd``, today's with the model's errors allowed for.
+    """
+    table, belief = experiment.system.parameters, experiment.belief
+    mean = np.asarray(belief.mean)
+    before = physical_moments(table, mean, np.asarray(belief.sd()))
+    wide = experiment.plausible
+    wider = physical_moments(table, np.asarray(wide.mean), np.asarray(wide.sd()))
+    sd = np.sqrt(np.sum(found.scale**2, axis=1))
+    after = physical_moments(table, mean, sd)
+    return {
+        p.name: {
+            "unit": p.unit,
+            "mean": float(before["mean"][j]),
+            "sd": float(before["sd"][j]),
+            "corrected_sd": float(wider["sd"][j]),
+            "expected_sd": float(after["sd"][j]),
+            "of_before": float(after["sd"][j] / before["sd"][j]),
+        }
+        for j, p in enumerate(table.free)
+    }
+
+
+@in_float64
+def _summarise(
+    place: Path,
+    asked: Asked,
+    experiment: Experiment,
+    goal: AbstractGoal,
+    found: Designed,
+    seed: int,
+) -> dict[str, Any]:
+    expected = expectation(experiment, found)
+    ahead: dict[str, float] = {}
+    if not isinstance(goal, Prediction):
+        worth, reason = verdict(asked, expected, found.nats)
+    else:
+        before, after = experiment.belief.scale, jnp.asarray(found.scale)
+        ahead = {
+            "before": float(goal.deviation(before)),
+            "after": float(goal.deviation(after)),
+            "corrected": float(goal.deviation(experiment.plausible.scale)),
+        }
+        worth, reason = foretold(asked, ahead, found.nats)
+    return {
+        "command": "design",
+        "title": f"{place.stem}: the next experiment",
+        "headline": reason,
+        "seed": seed,
+        "trajectory": FILE,
+        "seconds": experiment.period * experiment.steps,
+        "period": experiment.period,
+        "information_nats": found.nats,
+        "worth_running": worth,
+        "expected_sd": expected,
+        "prediction_sd": ahead,
+        "violations": found.violations,
+        "draws_checked": found.checked,
+        "units": units(experiment.system),
+        "tables": [expected_table(expected)],
+    }
+
+
+def _arrays(
+    experiment: Experiment, limits: Limits, found: Designed
+) -> dict[str, np.ndarray]:
+    system = experiment.system
+    arrays = {
+        "design/time": experiment.period * np.arange(experiment.steps + 1),
+        "design/scale": found.scale,
+        "belief/mean": np.asarray(experiment.belief.mean),
+    }
+    for i, channel in enumerate(system.actions):
+        arrays[f"design/command/{channel.name}"] = found.commands[:, i]
+        arrays[f"design/limit/{channel.name}"] = _pair(limits.low, limits.high, i)
+    for i, channel in enumerate(system.physical_states):
+        for name, values in (
+            ("state", found.states),
+            ("low", found.low),
+            ("high", found.high),
+        ):
+            arrays[f"design/{name}/{channel.name}"] = values[:, i]
+        box = _pair(limits.state_low, limits.state_high, i)
+        arrays[f"design/limit/{channel.name}"] = box
+    return arrays
+
+
+def _pair(low: np.ndarray, high: np.ndarray, i: int) -> np.ndarray:
+    return np.asarray([low[i], high[i]], float)
+
+
+def as_csv(experiment: Experiment, found: Designed) -> str:
+    """A row for each period: its time, its commands, and the states expected then.
+
+    Numbers are written in full: what is read back keeps the limits as well.
+    """
+    system = experiment.system
+    inputs = [channel.name for channel in system.actions]
+    states = [f"expected.{channel.name}" for channel in system.physical_states]
+    text = io.StringIO()
+    text.write(",".join(["time", *inputs, *states]) + "\n")
+    for k in range(experiment.steps):
+        row = [experiment.period * k, *found.commands[k], *found.states[k]]
+        text.write(",".join(repr(float(x)) for x in row) + "\n")
+    return text.getvalue()

@@ -1,0 +1,283 @@
+"""Evaluate: how well does a fit predict what it was not shown, and does it know?
+
+`run` holds a finished identification against other logs; `leave_one_out` fits all of a
+project's logs but one and predicts that one, in turn. The protocol is that of
+`sim2gp.data.grid`; the bands are those of `identification.forecasts.forecast`, fitted
+to the training logs alone.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from sim2gp.commands.folds import fold, without
+from sim2gp.commands.identification import Identified, stood
+from sim2gp.data.grid import CURVE, Grid, evaluation_windows, steps_of
+from sim2gp.data.logs import Log, Note, note_lines, shared_rows
+from sim2gp.data.windows import Windows
+from sim2gp.errors import InputError
+from sim2gp.identification.forecasts.baselines import (
+    forecast_sentence,
+    regression_errors,
+)
+from sim2gp.identification.forecasts.calibration import calibration
+from sim2gp.identification.forecasts.prediction import (
+    Judged,
+    channels,
+    drawn,
+    joined,
+    judged,
+    predicted,
+    recordings,
+    rows_for,
+    scores,
+    trace_arrays,
+    units,
+)
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.project import Project
+from sim2gp.project.training_windows import cut_logs
+from sim2gp.reports.motion import film
+from sim2gp.runs import Progress, new_run
+from sim2gp.runs.provenance import command, provenance
+from sim2gp.types import in_float64
+
+
+def run(
+    fit: Identified,
+    tested: Sequence[Log],
+    *,
+    files: Sequence[Path],
+    horizon: float,
+    out: Path,
+    progress: Progress,
+    configuration: str | None = None,
+) -> dict[str, Any]:
+    """Predict logs by an identify run; writes and returns the summary.
+
+    They were read from ``files``, as `Identified.read` does for a ``configuration``.
+    """
+    started = time.perf_counter()
+    check_horizon(horizon)
+    found, system = fit.project, fit.project.system
+    with new_run(out, "evaluate") as writer, progress.task("evaluate", 2) as task:
+        rows, longest = rows_for(horizon), max(horizon, CURVE[-1])
+        grid = windows_for(tested, found, longest, horizon)
+        result = predicted(system, fit.plain, grid, horizon)
+        train = _training(fit)
+        linear = np.full((len(grid.windows), len(rows), len(result.mean[0, 0])), np.nan)
+        if train is not None:
+            known = evaluation_windows(train, system, longest=longest)
+            linear = regression_errors(known, grid, rows)
+        task.advance("forecasts")
+        names = channels(system, grid.windows)
+        whole = judged(rows, grid, result, fit.band, linear)
+        summary, arrays = scores(whole, names, tested, horizon)
+        summary["calibration"], shares = calibration(whole, names, tested, horizon)
+        arrays |= shares
+        picture = drawn(result, fit.band, grid)
+        arrays |= trace_arrays(picture, grid, tested, names)
+        notes = note_lines(tested, shared_rows(train or (), tested))
+        if train is None:
+            notes.append("the training logs were not found: no regression to compare")
+        about, moves = film(
+            system, fit.plain, picture, grid, tested,
+            "Forecasts over what was recorded",
+        )  # fmt: skip
+        if about:
+            summary["animation"] = about
+            arrays |= moves
+        asked = ["--logs", *files, "--horizon", f"{horizon:g}", "--out", out]
+        asked += ["--configuration", configuration] if configuration else []
+        line = command("sim2gp", "evaluate", fit.run, *asked)
+        summary |= {
+            "command": "evaluate",
+            "title": f"{fit.run.name}: prediction of logs it was not fitted to",
+            "warnings": notes,
+        }
+        _write(writer, summary, arrays, found, line, started)
+        task.advance("report")
+    return summary
+
+
+def leave_one_out(
+    project: Project,
+    logs: Sequence[Log],
+    *,
+    horizon: float,
+    out: Path,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Fit all recordings but one, predict that one, in turn; writes the summary."""
+    started = time.perf_counter()
+    check_horizon(horizon)
+    files = list(dict.fromkeys(recordings(logs)))
+    if len(files) < 2:
+        raise InputError(
+            "E160",
+            "one recording cannot be left out",
+            where=project.source.where("logs"),
+            got=f"{len(files)} file",
+            expected="at least two files",
+            fix="record once more, or identify and evaluate RUN --logs",
+        )
+    with new_run(out, "evaluate") as writer, progress.task("logs", len(files)) as task:
+        windows, of = cut_logs(project, logs)
+        grid = windows_for(logs, project, max(horizon, CURVE[-1]), horizon)
+        names = channels(project.system, windows)
+        parts: list[Judged] = []
+        arrays: dict[str, np.ndarray] = {}
+        constants = []
+        for file in files:
+            left = [k for k, source in enumerate(recordings(logs)) if source == file]
+            part, traced, values = _fold(
+                project, logs, windows, of, grid, left, horizon
+            )
+            parts.append(part)
+            arrays |= traced
+            constants.append(values)
+            task.advance(f"without {logs[left[0]].name}")
+        whole = joined(parts)
+        summary, curves = scores(whole, names, logs, horizon)
+        summary["calibration"], shares = calibration(whole, names, logs, horizon)
+        arrays |= shares
+        summary["tables"].append(_constants_table(project, files, logs, constants))
+        summary |= {
+            "command": "evaluate",
+            "title": f"{project.name}: each log predicted by a fit of the others",
+            "folds": len(files),
+            "warnings": note_lines(logs, _repeated(logs, files)),
+        }
+        asked = "--horizon", f"{horizon:g}", "--out", out
+        line = command("sim2gp", "evaluate", project.path, *asked)
+        _write(writer, summary, curves | arrays, project, line, started)
+    return summary
+
+
+def _fold(
+    project: Project,
+    logs: Sequence[Log],
+    windows: Windows,
+    of: np.ndarray,
+    grid: Grid,
+    left: Sequence[int],
+    horizon: float,
+) -> tuple[Judged, dict[str, np.ndarray], np.ndarray]:
+    """One fold: forecasts, traces and constants of the fit without logs ``left``."""
+    part = without(left, logs, of, grid)
+    # One start: the folds are small changes of one problem.
+    key = jax.random.key(0)
+    found = fold(project, windows, grid, part, horizon, key=key, starts=1)
+    picture = drawn(found.forecast, found.band, found.tested)
+    names = channels(project.system, windows)
+    traced = trace_arrays(picture, found.tested, logs, names)
+    return found.judged, traced, _constrain(project.system, found.posterior)
+
+
+@in_float64
+def _constrain(system: Any, posterior: Gaussian) -> np.ndarray:
+    return np.asarray(system.parameters.constrain(posterior.mean))
+
+
+def _constants_table(
+    project: Project,
+    files: Sequence[str],
+    logs: Sequence[Log],
+    values: list[np.ndarray],
+) -> dict[str, Any]:
+    """The constants of every fold: what does not stay put was not determined."""
+    names = {log.source: log.name for log in logs}
+    return {
+        "title": "Constants of each fit (MAP)",
+        "columns": ["without", *project.system.parameters.names],
+        "rows": [
+            [names[file], *(f"{x:.3g}" for x in row)]
+            for file, row in zip(files, values, strict=True)
+        ],
+        "note": "One log fewer should not move a constant that the logs determine.",
+    }
+
+
+def windows_for(
+    logs: Sequence[Log], project: Project, longest: float, horizon: float
+) -> Grid:
+    """Evaluation windows; E116 where no log is as long as the horizon."""
+    if max(log.duration for log in logs) > horizon + CURVE[0]:
+        grid = evaluation_windows(logs, project.system, longest=longest)
+        if np.asarray(grid.windows.mask)[:, steps_of(horizon)].any():
+            return grid
+    raise InputError(
+        "E116",
+        "no window to predict",
+        got=f"{max(log.duration for log in logs):.3g} s",
+        expected=f"an unmasked stretch longer than the horizon of {horizon:g} s",
+        fix="shorten --horizon, or record longer",
+    )
+
+
+def _repeated(logs: Sequence[Log], files: Sequence[str]) -> list[Note]:
+    """Rows that a fold both learns from and is judged by (W128)."""
+    sets = [[log for log in logs if log.source == file] for file in files]
+    notes: list[Note] = []
+    for i, tested in enumerate(sets):
+        others = [log for group in sets[:i] + sets[i + 1 :] for log in group]
+        notes += shared_rows(others, tested)
+    return notes
+
+
+def _training(fit: Identified) -> tuple[Log, ...] | None:
+    """The logs that a run was fitted to, where they still stand."""
+    try:
+        return replace(fit.project, path=stood(fit.run, fit.summary)).load_logs()
+    except InputError:
+        return None
+
+
+def check_horizon(horizon: float) -> None:
+    """E160 for a horizon that is not some seconds."""
+    if not 0.0 < horizon <= 60.0:
+        raise InputError(
+            "E160",
+            "horizon out of range",
+            where="--horizon",
+            got=f"{horizon:g} s",
+            expected="more than 0 and at most 60 s",
+            fix="choose some tenths of a second",
+        )
+
+
+def _write(
+    writer: Any,
+    summary: dict[str, Any],
+    arrays: dict[str, np.ndarray],
+    project: Project,
+    line: str,
+    started: float,
+) -> None:
+    """Headline, report and files of a run."""
+    unit = units(project.system)
+    summary["headline"] = forecast_sentence(
+        f"Open-loop error at {summary['horizon']:g} s",
+        summary["open_loop_rmse"],
+        summary["trivial"],
+        unit,
+        summary["coverage90"],
+    )
+    if summary["losses"]:
+        summary["headline"] += f" {summary['losses']}"
+    summary["units"] = unit
+    summary["trace_note"] = (
+        "Forecasts of half a second from causal starts, of logs that the fit has not "
+        "seen; they know the recorded inputs and nothing else of the future."
+    )
+    summary |= provenance(line, started)
+    from sim2gp.reports import write_report
+
+    writer.write_summary(summary)
+    writer.write_arrays("arrays.npz", arrays)
+    writer.write_text("report.html", write_report(summary, arrays))

@@ -1,0 +1,37 @@
+"""Export: draws of an identified machine, for whatever trains on many machines.
+
+Row ``i`` of all ``draws/NAME`` is one machine, in physical units; of a MuJoCo model it
+is also the file ``variant_00i.xml``. Draws are as wide as the report's intervals.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from sim2gp.commands.identification import Identified, Width, used
+from sim2gp.robot.export import write_model
+from sim2gp.runs import Progress
+from sim2gp.systems import one_variant
+
+
+def run(
+    fit: Identified,
+    *,
+    draws: int,
+    out: Path,
+    seed: int,
+    progress: Progress,
+    configuration: str | None = None,
+    posterior: Width = "corrected",
+) -> dict[str, Any]:
+    """Write ``draws`` of the posterior that is asked for; returns the summary.
+
+    Raises `InputError` E152 for a machine in several configurations and none named.
+    """
+    known = fit.posterior if posterior == "corrected" else fit.plain
+    system, own = one_variant(fit.project.system, known, configuration)
+    progress.say(f"drawing {draws} machines from the {posterior} posterior")
+    about = {"run": fit.run.name, **used(fit.summary, posterior)}
+    key = jax.random.key(seed)
+    return write_model(own, out, system, draws=draws, key=key, about=about)

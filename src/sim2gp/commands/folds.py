@@ -1,0 +1,133 @@
+"""A fit of some of the windows, held against data that it has not seen.
+
+`evaluate` leaves one recording out after the other; `identify` leaves out one, so that
+its report can show forecasts of data that no constant was fitted to. Windows are
+masked, not removed: fits of all and of some share one compilation.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool
+
+from sim2gp.data.grid import CURVE, PERIOD, Grid, steps_of
+from sim2gp.data.logs import Log
+from sim2gp.data.windows import Windows
+from sim2gp.identification.fit import fit_windows
+from sim2gp.identification.forecasts.baselines import regression_errors
+from sim2gp.identification.forecasts.forecast import Band, Forecast, fit_band
+from sim2gp.identification.forecasts.prediction import (
+    Judged,
+    judged,
+    predicted,
+    recordings,
+    rows_for,
+    subset,
+)
+from sim2gp.inference.estimate import Estimate
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.project import Project
+from sim2gp.types import Key
+
+LAST = 0.25  # of a single recording, the share at its end that is held out
+
+
+class Part(NamedTuple):
+    """What a fit may see, and what it is judged by; of training and forecast windows.
+
+    The band is made of the windows ``known`` up to ``until`` (s, on the log's clock),
+    which lie in ``recordings`` recordings.
+    """
+
+    train: Bool[np.ndarray, " W"]
+    known: Bool[np.ndarray, " V"]
+    test: Bool[np.ndarray, " V"]
+    recordings: int
+    words: str
+    until: float = math.inf
+
+
+class Fold(NamedTuple):
+    """A fit of a part of the windows and its forecasts of the others."""
+
+    posterior: Gaussian
+    band: Band
+    judged: Judged
+    tested: Grid
+    forecast: Forecast  # of what is tested
+
+
+def without(
+    left: Sequence[int], logs: Sequence[Log], of: np.ndarray, grid: Grid
+) -> Part:
+    """All but the logs with these indices."""
+    test = np.isin(grid.log, left)
+    others = {log.source for k, log in enumerate(logs) if k not in left}
+    return Part(~np.isin(of, left), ~test, test, len(others), logs[left[0]].name)
+
+
+def held_out(
+    logs: Sequence[Log],
+    windows: Windows,
+    places: Sequence[tuple[int, int]],
+    grid: Grid,
+) -> Part | None:
+    """The last recording, or the last quarter of the only one; None if too short."""
+    files = recordings(logs)
+    if len(set(files)) > 1:
+        last = [k for k, source in enumerate(files) if source == files[-1]]
+        found = without(last, logs, np.asarray([k for k, _ in places]), grid)
+    else:
+        first, end = float(logs[0].time[0]), float(logs[-1].time[-1])
+        split = end - LAST * (end - first)
+        since = np.asarray([logs[k].time[row] for k, row in places])
+        train = since + np.asarray(windows.span).sum(axis=1) <= split
+        known, test = grid.since + CURVE[0] <= split, grid.since >= split
+        words = f"the last {100 * LAST:.0f} % of {logs[0].name}"
+        found = Part(train, known, test, 1, words, split)
+    seen = np.asarray(windows.mask)[found.train].any()
+    judged_by = np.asarray(grid.windows.mask)[found.test, rows_for(CURVE[0])[0]].any()
+    return found if seen and found.known.any() and judged_by else None
+
+
+def fold(
+    project: Project,
+    windows: Windows,
+    grid: Grid,
+    part: Part,
+    horizon: float,
+    *,
+    key: Key,
+    starts: int,
+    warm_start: Estimate | None = None,
+) -> Fold:
+    """The fit of what ``part`` may see, begun at ``warm_start``, judged by the rest.
+
+    Raises as `sim2gp.identification.fit.fit_windows` does.
+    """
+    rows = rows_for(horizon)
+    mask = np.asarray(windows.mask) & part.train[:, None, None]
+    kept = eqx.tree_at(lambda w: w.mask, windows, mask)
+    robust = project.spec.likelihood.robust
+    posterior = fit_windows(
+        project.system,
+        kept,
+        key=key,
+        robust=robust,
+        starts=starts,
+        warm_start=warm_start,
+    ).posterior
+    result = predicted(project.system, posterior, grid, horizon)
+    train, tested = subset(grid, part.known), subset(grid, part.test)
+    curve = np.asarray([steps_of(h) for h in CURVE])
+    before = train.since[:, None] + PERIOD * curve <= part.until
+    seen = result.of(part.known).at(curve)
+    seen = eqx.tree_at(lambda f: f.valid, seen, seen.valid & before[..., None])
+    band = fit_band(seen, train, part.recordings)
+    linear = regression_errors(train, tested, rows)
+    result = result.of(part.test)
+    found = judged(rows, tested, result, band, linear)
+    return Fold(posterior, band, found, tested, result)

@@ -1,0 +1,249 @@
+"""What identify says once the posterior is known: forecasts, intervals, words."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from sim2gp.commands.identification import physical
+from sim2gp.commands.unseen import Unseen, unseen
+from sim2gp.data.clock import clock_warnings
+from sim2gp.data.grid import CURVE, Grid
+from sim2gp.data.logs import Log, note_lines
+from sim2gp.data.windows import Windows
+from sim2gp.data.windows_likelihood import WindowsLikelihood, information_at
+from sim2gp.identification import diagnose
+from sim2gp.identification.configurations import told
+from sim2gp.identification.exact_posterior.importance import check_windows
+from sim2gp.identification.exact_posterior.nuts import sample_windows
+from sim2gp.identification.forecasts.forecast import Band, fit_band
+from sim2gp.identification.forecasts.prediction import (
+    Picture,
+    channels,
+    drawn,
+    predicted,
+    recordings,
+    rows_for,
+    thinned,
+    trace_arrays,
+    units,
+)
+from sim2gp.identification.intervals.discrepancy import (
+    corrected_windows,
+)
+from sim2gp.identification.intervals.scatter import Corrected
+from sim2gp.identification.intervals.words import lacking_table, told_intervals
+from sim2gp.identification.misfit.residuals import misfit_of_windows
+from sim2gp.inference.estimate import Estimate
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.parameters import Parameters
+from sim2gp.project import Project
+from sim2gp.reports.motion import film
+from sim2gp.systems.host import simulator_of
+
+#: Forecasts to draw: of whom, and what and where they are.
+Drawn = tuple[Gaussian, Picture, Grid]
+_SHORTEST = 4  # windows: a film of fewer held-out ones is not worth watching
+
+
+def found(
+    project: Project,
+    logs: Sequence[Log],
+    cuts: tuple[Windows, list[tuple[int, int]]],
+    grid: Grid,
+    fitted: Estimate,
+    seed: int,
+    held_out: bool,
+) -> tuple[dict[str, Any], dict[str, np.ndarray], Corrected]:
+    """The run's summary and arrays, and the corrected intervals."""
+    table, (windows, places) = project.system.parameters, cuts
+    band, own = _own_forecasts(project, fitted.posterior, grid, logs)
+    known = fitted.with_measurements(table)
+    likelihood = WindowsLikelihood(project.system, windows)
+    of = np.asarray([k for k, _ in places])
+    honest = corrected_windows(likelihood, known, of)
+    summary = _summarise(project, logs, likelihood, known, honest, band, seed)
+    arrays = _stored(table, known, honest.posterior, band, seed)
+    other = unseen(project, logs, windows, places, grid, known) if held_out else None
+    said, drawings = _drawings(project, logs, own, other)
+    return summary | said, arrays | drawings, honest
+
+
+def _own_forecasts(
+    project: Project, posterior: Gaussian, grid: Grid, logs: Sequence[Log]
+) -> tuple[Band, Drawn]:
+    """Of the logs that were fitted: the band made of them, and what is drawn.
+
+    Windows that overlap say little more of the band, and a simulator on the host takes
+    as long for them as for the fit.
+    """
+    if simulator_of(project.system) is not None:
+        grid = thinned(grid)
+    found = predicted(project.system, posterior, grid, CURVE[0])
+    rows = rows_for(CURVE[0])[1:]
+    band = fit_band(found.at(rows), grid, len(set(recordings(logs))))
+    return band, (posterior, drawn(found, band, grid), grid)
+
+
+def _stored(
+    table: Parameters, fitted: Estimate, honest: Gaussian, band: Band, seed: int
+) -> dict[str, np.ndarray]:
+    key = jax.random.fold_in(jax.random.key(seed), 1)
+    return {
+        "belief/mean": np.asarray(fitted.posterior.mean),
+        "belief/theta": np.asarray(physical(table, fitted.posterior.mean)),
+        "belief/scale": np.asarray(fitted.posterior.scale),
+        "belief/prior_mean": np.asarray(fitted.prior.mean),
+        "belief/prior_scale": np.asarray(fitted.prior.scale),
+        "belief/information": np.asarray(fitted.information),
+        "belief/noise": np.asarray(fitted.noise.sd),
+        "belief/weights": np.asarray(fitted.noise.weights),
+        "intervals/mean": np.asarray(honest.mean),
+        "intervals/theta": np.asarray(physical(table, honest.mean)),
+        "intervals/scale": np.asarray(honest.scale),
+        "band/start_sd": band.start_sd,
+        "band/input_sd": band.input_sd,
+        "band/resolution": band.resolution,
+        "band/rows": band.rows,
+        "band/shape": band.shape,
+        "band/inflation": np.asarray(band.inflation),
+        **diagnose.arrays(table, fitted.prior, honest, key=key),
+    }
+
+
+def _summarise(
+    project: Project,
+    logs: Sequence[Log],
+    likelihood: WindowsLikelihood,
+    fitted: Estimate,
+    honest: Corrected,
+    band: Band,
+    seed: int,
+) -> dict[str, Any]:
+    system, windows = project.system, likelihood.windows
+    names = channels(system, windows)
+    found = diagnose.summary(
+        system.parameters,
+        fitted.prior,
+        fitted.posterior,
+        fitted.information,
+        fisher_at=information_at(likelihood, fitted),
+        corrected=honest.posterior,
+    )
+    noise = dict(zip(names, np.asarray(fitted.noise.sd).tolist(), strict=True))
+    rows = sum(len(log) for log in logs)
+    actions = [channel.name for channel in system.actions]
+    about = told_intervals(system, honest, found["parameters"], len(windows))
+    listed = told(system, logs, found["parameters"])
+    listed["tables"] = [*lacking_table(about), *listed.get("tables", ())]
+    return {
+        "command": "identify",
+        "title": f"{project.name}: what {_count(logs)}",
+        "headline": headline(found["parameters"]),
+        "seed": seed,
+        "converged": True,
+        "convergence": fitted.convergence.as_dict(),
+        "noise": noise,
+        "intervals": about,
+        "misfit": {
+            **misfit_of_windows(likelihood, fitted).as_dict(),
+            "noise": _noise_words(names, noise, windows, units(system)),
+        },
+        "log_evidence": float(fitted.log_evidence),
+        "n_rows": rows,
+        "period": float(np.median(np.concatenate([np.diff(x.time) for x in logs]))),
+        "n_logs": len(set(recordings(logs))),
+        "n_transitions": rows - len(logs),
+        "n_windows": len(windows),
+        "units": units(system),
+        "band": {
+            "input_sd": dict(zip(actions, band.input_sd.tolist(), strict=True)),
+            "inflation": band.inflation,
+        },
+        "warnings": [*note_lines(logs), *clock_warnings(logs, system)],
+        "trace_note": "Forecasts of half a second from causal starts, of the logs that "
+        "were fitted; they know the recorded inputs and nothing else of the future.",
+        **listed,
+        **found,
+    }
+
+
+def headline(parameters: dict[str, dict[str, Any]]) -> str:
+    """How many constants the logs determine, and which they do not."""
+    sure = [n for n, entry in parameters.items() if entry["verdict"] == "identified"]
+    rest = [n for n in parameters if n not in sure]
+    text = f"{len(sure)} of {len(parameters)} constants are identified"
+    if sure:
+        text += f" ({', '.join(sure)})"
+    return (
+        f"{text}; not by these logs alone: {', '.join(rest)}." if rest else f"{text}."
+    )
+
+
+def _count(logs: Sequence[Log]) -> str:
+    count = len(set(recordings(logs)))
+    return "one log determines" if count == 1 else f"{count} logs determine"
+
+
+def _noise_words(
+    names: Sequence[str],
+    noise: dict[str, float],
+    windows: Windows,
+    unit: dict[str, str],
+) -> list[str]:
+    """What the window noise holds beside the sensor's own."""
+    out = []
+    for name, floor in zip(names, np.asarray(windows.floor), strict=True):
+        times = noise[name] / float(floor)
+        out.append(
+            f"The noise of {name}, {noise[name]:.2g} {unit[name]}, is {times:.0f} "
+            "times the rounding of its sensor: the rest is error of the start and of "
+            "the model, which is not independent from sample to sample: the plain "
+            "posterior, which takes it for that, is narrower than it should be."
+            if times > 3.0
+            else f"The noise of {name}, {noise[name]:.2g} {unit[name]}, is that of "
+            "its sensor's rounding: these windows show no other error."
+        )
+    return out
+
+
+def _drawings(
+    project: Project,
+    logs: Sequence[Log],
+    own: Drawn,
+    other: Unseen | None,
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Forecasts of the fitted logs and of held-out data, and a film of the latter."""
+    posterior, picture, shown = own
+    names = channels(project.system, shown.windows)
+    arrays, data = trace_arrays(picture, shown, logs, names), "fitted"
+    summary: dict[str, Any] = {}
+    if other is not None:
+        summary["held_out"] = other.summary
+        arrays |= other.arrays
+        if other.fold is not None and len(other.picture["which"][0]) >= _SHORTEST:
+            picture, data = other.picture, "held-out"
+            posterior, shown = other.fold.posterior, other.fold.tested
+    title = f"Forecasts of {data} data over what was recorded"
+    about, moves = film(project.system, posterior, picture, shown, logs, title)
+    return summary | ({"animation": about} if about else {}), arrays | moves
+
+
+def held_against(
+    likelihood: WindowsLikelihood,
+    fitted: Estimate,
+    seed: int,
+    check: bool,
+    nuts: bool,
+) -> dict[str, Any]:
+    """What the exact posterior says of Laplace's, where it is asked."""
+    names, key = likelihood.system.parameters.names, jax.random.key(seed)
+    out: dict[str, Any] = {}
+    if check:
+        checked = check_windows(likelihood, fitted, key=jax.random.fold_in(key, 2))
+        out["check"] = checked.as_dict(names)
+    if nuts:
+        sampled = sample_windows(likelihood, fitted, key=jax.random.fold_in(key, 3))
+        out["nuts"] = sampled.as_dict(names)
+    return out

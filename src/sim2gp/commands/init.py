@@ -1,0 +1,79 @@
+"""`sim2gp init`: a model, and logs where there are some, become a first project."""
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from sim2gp.cleanup import replace_file
+from sim2gp.data.logs import Budget
+from sim2gp.experiment_design.safe_excitation import PERIOD, Excitation, safe_excitation
+from sim2gp.project.draft import Request, draft_project, told
+from sim2gp.runs import Progress
+from sim2gp.runs.store import check_absent
+from sim2gp.systems.base import AbstractSystem
+
+
+def run(
+    model: str,
+    logs: Sequence[Path],
+    *,
+    out: Path,
+    root: Path | None,
+    period: float | None,
+    constant: Mapping[str, float],
+    readings: bool,
+    seconds: float,
+    seed: int,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Write the project file, and without logs a first experiment; the summary.
+
+    Raises `InputError` as `sim2gp.project.draft.draft_project` does.
+    """
+    asked = Request(
+        model,
+        logs,
+        out,
+        root=root,
+        period=period,
+        constant=constant,
+        readings=readings,
+        seconds=seconds,
+        started=time.monotonic(),
+        budget=Budget().times(max(1.0, seconds / 60.0)),  # of reading: more on request
+    )
+    if logs:
+        progress.say("matching columns, then trying readings of them on the machine")
+        return told(draft_project(asked), out)
+    table = out.with_name(f"{out.stem}-experiment.csv")
+    check_absent(table)
+    draft = draft_project(asked)
+    summary = told(draft, out)
+    progress.say("simulating a first experiment")
+    until = asked.started + seconds
+    found = safe_excitation(draft.system, key=jax.random.key(seed), until=until)
+    summary["experiment"] = found.words
+    if found.commands is not None and found.states is not None:
+        replace_file(table, _csv(draft.system, found).encode(), lambda _: None)
+        summary["commands"] = str(table)
+    summary["headline"] = (
+        f"Wrote {out}, which says what a log needs; for an experiment that is chosen "
+        f"for what it tells: sim2gp design {out} (slow on a MuJoCo model)"
+    )
+    return summary
+
+
+def _csv(system: AbstractSystem, found: Excitation) -> str:
+    """A row for each period: time, commands, and the positions expected."""
+    names = [c.name for c in system.physical_states]
+    shown = [i for i, name in enumerate(names) if not name.endswith(".velocity")]
+    inputs = [c.name for c in system.actions]
+    text = [",".join(["time", *inputs, *(f"expected.{names[i]}" for i in shown)])]
+    assert found.commands is not None
+    assert found.states is not None
+    for k, (u, x) in enumerate(zip(found.commands, found.states, strict=True)):
+        text.append(",".join(f"{v:.9g}" for v in (PERIOD * k, *u, *x[shown])))
+    return "\n".join(text) + "\n"

@@ -1,0 +1,102 @@
+"""Forecasts of data that a fit has not seen, for the report of `identify`.
+
+The constants of a run rest on all of its logs. Here they are fitted once more without
+the last recording (or the end of the only one), which is then forecast.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from sim2gp.commands.folds import Fold, fold, held_out
+from sim2gp.data.grid import CURVE, Grid, steps_of
+from sim2gp.data.logs import Log
+from sim2gp.data.windows import Windows
+from sim2gp.errors import DeadParameters, NotConverged, NotFinite
+from sim2gp.identification.forecasts.baselines import forecast_sentence
+from sim2gp.identification.forecasts.calibration import calibration
+from sim2gp.identification.forecasts.prediction import (
+    TRACE,
+    Picture,
+    channels,
+    drawn,
+    scores,
+    trace_arrays,
+    units,
+)
+from sim2gp.inference.estimate import Estimate
+from sim2gp.project import Project
+
+PREFIX = "unseen"  # of the traces
+
+
+class Unseen(NamedTuple):
+    """What is said of held-out data, what is drawn, and the windows of a film."""
+
+    summary: dict[str, Any]
+    arrays: dict[str, np.ndarray]
+    fold: Fold | None
+    picture: Picture
+
+
+def unseen(
+    project: Project,
+    logs: Sequence[Log],
+    windows: Windows,
+    places: Sequence[tuple[int, int]],
+    grid: Grid,
+    whole: Estimate,
+) -> Unseen:
+    """A second fit, of a part of the windows, and its forecasts of the rest.
+
+    It begins where the ``whole`` logs put constants, starts and noise, and has as many
+    starts to choose from as that fit: the two share their compilation.
+    """
+    part = held_out(logs, windows, places, grid)
+    if part is None:
+        return _none("too little was recorded to hold some of it out.")
+    horizon = _horizon(grid, part.test)
+    try:
+        key = jax.random.key(0)  # of starts that it does not draw
+        found = fold(
+            project, windows, grid, part, horizon, key=key, starts=2, warm_start=whole
+        )
+    except (NotConverged, NotFinite, DeadParameters) as error:
+        return _none(f"a fit without {part.words} failed ({error}).")
+    names = channels(project.system, windows)
+    summary, arrays = scores(found.judged, names, logs, horizon)
+    summary["calibration"], shares = calibration(found.judged, names, logs, horizon)
+    del summary["tables"]
+    picture = drawn(found.forecast, found.band, found.tested)
+    traces = trace_arrays(picture, found.tested, logs, names, PREFIX)
+    summary["left_out"] = part.words
+    summary["headline"] = forecast_sentence(
+        f"A fit that had not seen {part.words} forecasts it {horizon:g} s ahead, "
+        "root mean square errors",
+        summary["open_loop_rmse"],
+        summary["trivial"],
+        units(project.system),
+    )
+    summary["text"] = (
+        f"The constants were fitted once more without {part.words}, which that fit "
+        "then forecast, knowing its inputs. The other sections rest on all of the data."
+    )
+    if part.recordings == 1:
+        summary["text"] += (
+            " One recording says nothing of how others differ: the bands are twice as "
+            "wide as its own errors ask for."
+        )
+    return Unseen(summary, arrays | shares | traces, found, picture)
+
+
+def _none(why: str) -> Unseen:
+    return Unseen({"text": f"No forecasts of unseen data: {why}"}, {}, None, {})
+
+
+def _horizon(grid: Grid, test: np.ndarray) -> float:
+    """Half a second, or as long as a held-out window is."""
+    measured = np.asarray(grid.windows.mask)[test].any(axis=(0, 2))
+    whole = [h for h in CURVE if h <= TRACE and measured[steps_of(h)]]
+    return max(whole, default=CURVE[0])

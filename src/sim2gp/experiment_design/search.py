@@ -1,0 +1,174 @@
+"""The search: the commands whose worth, over draws of the belief, is largest.
+
+Worth is averaged over draws of the constants, because information depends on them. A
+random motion is improved along gradients (`by_gradients`), or where a simulator on the
+host moves the machine, by samples (`by_samples`). What is returned has passed on draws
+that had no part in the search, made smaller where it did not.
+"""
+
+import math
+from collections.abc import Callable
+from types import ModuleType
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sim2gp import checks
+from sim2gp.errors import InputError, NotFinite
+from sim2gp.experiment_design import by_gradients, by_samples
+from sim2gp.experiment_design.experiment import Experiment
+from sim2gp.experiment_design.goals import AbstractGoal
+from sim2gp.experiment_design.limits import Limits
+from sim2gp.experiment_design.signals import AbstractSignal, Multisine
+from sim2gp.systems.host import simulator_of
+from sim2gp.types import AnyArray, Key, in_float64
+
+STARTS = 1  # random motions
+DRAWS = 4  # of the constants, that information is averaged over, its mean first
+ALLOWED = 0.01  # the share of draws that may leave the limits
+SMALLER = 0.97  # times the commands, where too many still do
+MILD = 0.03  # of an input's range, the sd of each tone of a random motion
+
+
+class Designed(eqx.Module):
+    """Commands, and what they are expected to do and to tell.
+
+    nats: of the goal, on average over draws.
+    scale: square root of the expected covariance at the belief's mean.
+    states: at the mean of what is plausible; ``low`` and ``high`` are the 5 % and 95 %
+        of its draws.
+    violations: the share of checked draws that leave the limits.
+    """
+
+    commands: Float[np.ndarray, "T m"]
+    nats: float
+    scale: Float[np.ndarray, "p p"]
+    states: Float[np.ndarray, "times n"]
+    low: Float[np.ndarray, "times n"]
+    high: Float[np.ndarray, "times n"]
+    violations: float
+    checked: int
+
+
+@in_float64
+def design(
+    experiment: Experiment,
+    goal: AbstractGoal,
+    limits: Limits,
+    signal: AbstractSignal,
+    *,
+    key: Key,
+    draws: int = DRAWS,
+    starts: int = STARTS,
+) -> Designed:
+    """The best commands found.
+
+    Raises `InputError` E150 where none of them keeps the limits, E148 for no draws or
+    starts.
+
+    Their worth is averaged over ``draws`` of the constants, the mean being the first.
+    The best of what is found from so many random motions.
+    """
+    checks.count("design", draws=draws, starts=starts)
+    experiment, goal, limits = jax.tree.map(jnp.asarray, (experiment, goal, limits))
+    by, p = _by(experiment), experiment.belief.mean.size
+    search, *others = jax.random.split(key, 4)
+    informed, trials, held_out = (
+        jax.random.normal(k, (count, p))
+        for k, count in zip(others, (draws, by.TRIALS, by.CHECKED), strict=True)
+    )
+    informed = informed.at[0].set(0.0)
+    about = experiment, signal, goal, limits, informed, trials, held_out
+    improve, check, told = by.ways(*about)
+
+    def one(key: Key) -> Designed:
+        U = signal.commands(jnp.asarray(improve(key), float), limits)
+        U, states, bad = _kept(check, U)
+        worth, scale, middle = told(U)
+        low, high = np.quantile(np.asarray(states), [0.05, 0.95], axis=0)
+        return Designed(
+            np.asarray(U),
+            float(worth),
+            np.asarray(scale),
+            np.asarray(middle),
+            low,
+            high,
+            bad,
+            len(states),
+        )
+
+    found = _of_starts(one, search, starts)
+    best = max(found, key=lambda f: f.nats if math.isfinite(f.nats) else -math.inf)
+    if not math.isfinite(best.nats):
+        raise NotFinite(
+            "E203",
+            "information of the experiment",
+            got=best.nats,
+            fix="narrow the limits of the states: the simulation is lost within them",
+        )
+    return best
+
+
+def _of_starts(one: Callable[[Key], Designed], key: Key, starts: int) -> list[Designed]:
+    """What each start ends with; E150 of the last one where none keeps the limits."""
+    found: list[Designed] = []
+    refused: InputError | None = None
+    for i in range(starts):
+        try:
+            found.append(one(jax.random.fold_in(key, i)))
+        except InputError as error:  # another start may end within the limits
+            refused = error
+    if refused and not found:
+        raise refused
+    return found
+
+
+def _kept(
+    check: Callable[[Array], tuple[AnyArray, AnyArray]], U: Array
+) -> tuple[Array, AnyArray, float]:
+    """Commands that keep the limits; the draws' states, and the share that leaves."""
+    for _ in range(100):
+        states, beyond = check(U)
+        bad = float(np.mean(np.asarray(beyond) > 0.0))
+        if bad <= ALLOWED:
+            return U, states, bad
+        U = SMALLER * U
+    raise InputError(
+        "E150",
+        "no commands keep the limits",
+        got=f"{bad:.0%} of {len(states)} draws leave them however small the commands",
+        expected=f"at most {ALLOWED:.0%}",
+        fix="widen the limits of the states, or know the machine better first",
+    )
+
+
+@in_float64
+def prediction_rows(
+    experiment: Experiment, limits: Limits, horizon: float, key: Key
+) -> Float[Array, "k p"]:
+    """What predictions ``horizon`` seconds ahead depend on, along small random motions.
+
+    Raises E151 where the experiment is shorter than the horizon.
+    """
+    periods = max(1, round(horizon / experiment.period))
+    if periods > experiment.steps:
+        raise InputError(
+            "E151",
+            "prediction longer than the experiment",
+            got=f"{horizon:g} s",
+            expected=f"at most {experiment.period * experiment.steps:g} s",
+            fix="predict less far, or design more seconds",
+        )
+    experiment, limits = jax.tree.map(jnp.asarray, (experiment, limits))
+    signal = Multisine(experiment.period, experiment.steps)
+    U = signal.commands(MILD * signal.random(key, limits.low.size), limits)
+    rows: Array = _by(experiment).sensitivity(experiment, U, periods)
+    return rows
+
+
+def _by(experiment: Experiment) -> ModuleType:
+    """The kind of search that a machine admits."""
+    return by_gradients if simulator_of(experiment.system) is None else by_samples

@@ -1,0 +1,1 @@
+"""The figures of the paper and the mismatch map: cells, seeds, claims, a picture."""

@@ -1,0 +1,247 @@
+"""Figures 2 and 4: posterior sampling, with and without model mismatch.
+
+Best-seen score against episode, for every learner on both machines: with sampling MPC,
+and with policies that are trained off-policy in the sampled world. The cells are on
+the disk as soon as they are flown: an interrupted figure goes on where it was, and a
+finished one is redrawn from them.
+"""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from sim2gp.planning.tasks import MACHINES, SOLVED
+from sim2gp.runs import Progress, new_run
+from sim2gp.runs.cells import Old
+from sim2gp.runs.provenance import provenance, reproduce
+from sim2gp.studies.claims import (
+    SAMPLING_PAYS,
+    at_least_as_good,
+    better_somewhere,
+    claim,
+    interval,
+    told,
+)
+from sim2gp.studies.swingup import (
+    CONDITIONS,
+    METHODS,
+    TRAINED,
+    WITH_TERM,
+    Cell,
+    best_seen,
+    first_at,
+    median_episode,
+    study,
+)
+
+SEEDS, EPISODES = 5, 10
+QUICK_SEEDS, QUICK_EPISODES = 2, 4
+CLAIM_EPISODES = 5  # claims compare means of the best-seen score over these
+#: Each figure's number, its title, how it plans, and the lines it draws.
+FIGURES = {
+    "fig2": ("2", "posterior sampling with MPC", "mpc", tuple(METHODS)),
+    "fig4": (
+        "4",
+        "posterior sampling with off-policy learning",
+        "sac",
+        (*METHODS, *TRAINED),
+    ),
+}
+#: Of the median off-policy oracle, against MPC's.
+CLOSE = 0.9
+#: Learned models that are compared with each other.
+RIVALS = tuple(m for m in METHODS if m not in ("point estimate", "Auto", WITH_TERM))
+
+Table = dict[tuple[str, str, str], Float[np.ndarray, "seeds E"]]
+
+
+def run(
+    *,
+    out: Path,
+    figure: str,
+    seed: int,
+    seeds: int | None,
+    episodes: int | None,
+    quick: bool,
+    workers: int,
+    progress: Progress,
+    old: Old = "refuse",
+) -> dict[str, Any]:
+    """Compute missing cells, check the claims, write the run; returns its summary.
+
+    ``seeds`` and ``episodes`` None are the figure's own numbers. Cells of an earlier
+    run with this ``out`` are used again, also for fewer episodes (E186: of another
+    source, see ``old``). A ``quick`` look has fewer plans and cells of its own.
+    """
+    started = time.perf_counter()
+    seeds = seeds or (QUICK_SEEDS if quick else SEEDS)
+    episodes = episodes or (QUICK_EPISODES if quick else EPISODES)
+    number, title, planning, methods = FIGURES[figure]  # fig2 or fig4
+    groups = {
+        (m, c, w): Cell(m, c, w, seed, episodes, quick=quick, planning=planning)
+        for m in MACHINES
+        for c in CONDITIONS
+        for w in methods
+    }
+    numbers = range(seed, seed + seeds)
+    with new_run(out, f"reproduce {figure}") as writer:
+        table, details = study(
+            groups, numbers, out, workers=workers, progress=progress, old=old
+        )
+        check = claims if figure == "fig2" else off_policy_claims
+        summary: dict[str, Any] = {
+            "command": f"reproduce {figure}",
+            "title": f"Figure {number}: {title}",
+            "figure2": {
+                "number": number,
+                "machines": list(MACHINES),
+                "conditions": list(CONDITIONS),
+                "methods": list(methods),
+                "episodes": episodes,
+            },
+            "seed": seed,
+            "seeds": seeds,
+            "claims": check(table, np.random.default_rng(seed)),
+            **details,
+            "tables": [_table(table, methods)],
+            **provenance(reproduce(figure, seed, seeds, episodes, quick, old), started),
+        }
+        arrays = {f"figure2/{'/'.join(k)}": v for k, v in table.items()}
+        from sim2gp.reports import figure2, figure_bytes, write_report
+
+        writer.write_summary(summary)
+        writer.write_arrays("arrays.npz", arrays)
+        drawn = figure_bytes(figure2(arrays, summary), "png")
+        writer.write_bytes(f"figure{number}.png", drawn)
+        writer.write_text("report.html", write_report(summary, arrays))
+    return summary
+
+
+def claims(table: Table, rng: np.random.Generator) -> dict[str, dict[str, Any]]:
+    """The paper's claims and ours, on paired seeds; a figure beside each verdict.
+
+    Learners are compared by the mean best-seen score over the first five episodes; an
+    interval is the central 95 % of bootstrap means over seeds.
+    """
+    reached = {key: first_at(score, SOLVED) for key, score in table.items()}
+    early = _early(table)
+    out: dict[str, dict[str, Any]] = {}
+    for machine in MACHINES:
+        nominal, wrong = (machine, "nominal"), (machine, "mismatch")
+        soon = {
+            m: median_episode(reached[*nominal, m]) for m in ("SIM2GP", "RES", "NLM")
+        }
+        best = max(soon["SIM2GP"], soon["RES"])
+        out[f"{machine}_physics_learns_twice_as_fast"] = claim(
+            best <= 2.0 and soon["NLM"] >= 2.0 * best,
+            ", ".join(f"{m} {x:g}" for m, x in soon.items()),
+            "without mismatch SIM2GP and RES reach 95 % by episode 2 and NLM needs at "
+            "least twice as many (median episodes)",
+        )
+        out[f"{machine}_residual_costs_nothing"] = _best(
+            "RES", {m: early[*nominal, m] for m in RIVALS}, rng, "without mismatch"
+        )
+        share = float(np.mean(np.isfinite(reached[*wrong, "SIM2GP"])))
+        out[f"{machine}_physics_alone_fails_under_mismatch"] = claim(
+            share == 0.0,
+            f"{share:.0%} of seeds reach 95 %",
+            "under mismatch pure SIM2GP never reaches 95 %",
+        )
+        out[f"{machine}_literal_function_space_is_best_under_mismatch"] = _best(
+            "FS literal", {m: early[*wrong, m] for m in RIVALS}, rng, "under mismatch"
+        )
+        needed = median_episode(reached[*wrong, "RES-FS"])
+        out[f"{machine}_RES_FS_solves_mismatch_in_three"] = claim(
+            needed <= 3.0,
+            f"median episode {needed:g}",
+            "under mismatch RES-FS reaches 95 % in at most 3 episodes",
+        )
+    return out | _sampling_pays(early, rng)
+
+
+def off_policy_claims(
+    table: Table, rng: np.random.Generator
+) -> dict[str, dict[str, Any]]:
+    """As `claims`, of policies that were trained in the sampled world."""
+    early = _early(table)
+    out: dict[str, dict[str, Any]] = {}
+    for machine in MACHINES:
+        nominal, wrong = (machine, "nominal"), (machine, "mismatch")
+        last = [
+            float(np.median(best_seen(table[*group, "off-policy oracle"])[:, -1]))
+            for group in (nominal, wrong)
+        ]
+        out[f"{machine}_off_policy_oracle_is_close_to_MPC"] = claim(
+            min(last) >= CLOSE,
+            f"median best score {last[0]:.2f}, with mismatch {last[1]:.2f}",
+            f"trained in the true world, the best score is at least {CLOSE} of MPC's",
+        )
+        for name, word in (("FS literal", "literal_function_space"), ("FS", "FS")):
+            out[f"{machine}_{word}_is_best_under_mismatch"] = _best(
+                name, {m: early[*wrong, m] for m in RIVALS}, rng, "under mismatch"
+            )
+        gain = early[*nominal, "SIM2GP"] - early[*nominal, "domain randomisation"]
+        low, high = interval(gain, rng)
+        out[f"{machine}_the_posterior_beats_domain_randomisation"] = claim(
+            low > 0.0,
+            told(gain, low, high),
+            "without mismatch policies trained in posterior draws are better than one "
+            "trained in draws of the prior (mean best-seen score, episodes 1-5)",
+        )
+    return out | _sampling_pays(early, rng)
+
+
+def _early(table: Table) -> dict[tuple[str, str, str], Float[np.ndarray, " seeds"]]:
+    """What learners are compared by."""
+    return {
+        key: best_seen(score)[:, :CLAIM_EPISODES].mean(axis=1)
+        for key, score in table.items()
+    }
+
+
+def _sampling_pays(
+    early: dict[tuple[str, str, str], Float[np.ndarray, " seeds"]],
+    rng: np.random.Generator,
+) -> dict[str, dict[str, Any]]:
+    pairs = {
+        f"{m}, {c}": (early[m, c, "SIM2GP"], early[m, c, "point estimate"])
+        for m in MACHINES
+        for c in CONDITIONS
+    }
+    found = better_somewhere(pairs, rng, SAMPLING_PAYS)
+    return {"sampling_beats_the_point_estimate_somewhere": found}
+
+
+def _best(
+    name: str,
+    early: dict[str, Float[np.ndarray, " seeds"]],
+    rng: np.random.Generator,
+    when: str,
+) -> dict[str, Any]:
+    text = f"{when} {name} is at least as good as every other learned model"
+    score = "(mean best-seen score, episodes 1-5)"
+    return at_least_as_good(name, early, rng, f"{text} {score}")
+
+
+def _table(table: Table, methods: tuple[str, ...]) -> dict[str, Any]:
+    """Median episodes to 95 %, and the median best score of the last episode."""
+    groups = [(m, c) for m in MACHINES for c in CONDITIONS]
+    rows = []
+    for method in methods:
+        row = [method]
+        for machine, condition in groups:
+            score = table[machine, condition, method]
+            needed = median_episode(first_at(score, SOLVED))
+            last = float(np.median(best_seen(score)[:, -1]))
+            shown = f"{needed:g}" if np.isfinite(needed) else "never"
+            row.append(f"{shown} ({last:.2f})")
+        rows.append(row)
+    return {
+        "title": "Episodes to 95 % of the oracle's score (and best score in the end)",
+        "columns": ["learner", *(f"{m}, {c}" for m, c in groups)],
+        "rows": rows,
+        "note": "Medians over seeds; every episode counts, 5 s each.",
+    }
