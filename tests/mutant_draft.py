@@ -61,15 +61,15 @@ FIRST_DRAFT = (
     Mutant(
         "draft: a servo has short windows",
         TEXT,
-        "WINDOW = 1.0",
-        "WINDOW = 0.2",
-        SERVOS,
+        "WINDOWS = 1.0, 5.0",
+        "WINDOWS = 0.2, 5.0",
+        ("test_first_draft.py", "windows_of_servos"),
     ),
     Mutant(
         "draft: a window longer than the log",
         TEXT,
-        "min(WINDOW, int(1e3 * longest) / 1e3)",
-        "WINDOW",
+        "high, longest)",
+        "high)",
         ("test_first_draft.py", "short_log"),
     ),
     Mutant(

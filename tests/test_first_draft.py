@@ -13,6 +13,7 @@ from servo_arm import LINKS, model_text, record
 from sim2gp.cli import main
 from sim2gp.errors import InputError
 from sim2gp.project import load_project
+from sim2gp.project.draft_text import window_of
 from test_interrupts import CODES, SECONDS, everything_in, started, stopped
 
 mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is absent")
@@ -62,7 +63,7 @@ def test_signs_and_units_of_a_servo_arm(tmp_path: Path, capsys: Any) -> None:
     }
     assert not told["warnings"]
     project = load_project(tmp_path / "arm.toml")
-    assert project.spec.likelihood.window == 1.0
+    assert 1.99 < project.spec.likelihood.window <= 2.0
     names = project.system.parameters.names
     assert told["open_constants"] == 8
     assert "held_constants" not in told
@@ -76,6 +77,13 @@ def test_a_short_log_is_one_window(tmp_path: Path, capsys: Any) -> None:
     drafted(tmp_path, "--no-readings", capsys=capsys)
     window = load_project(tmp_path / "arm.toml").spec.likelihood.window
     assert 0.75 < window < 0.8
+
+
+@pytest.mark.parametrize(
+    ("longest", "window"), [(0.8, 0.8), (1.6, 1.0), (5.0, 2.5), (30.0, 5.0)]
+)
+def test_windows_of_servos_are_half_of_the_log(longest: float, window: float) -> None:
+    assert window_of(longest) == window
 
 
 @pytest.mark.parametrize("option", [("--budget", "0.01"), ("--no-readings",)])
