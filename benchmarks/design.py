@@ -30,7 +30,7 @@ from sim2gp.experiment_design import (
     Everything,
     Experiment,
     Free,
-    Limits,
+    LimitBox,
     Multisine,
     after,
     design,
@@ -96,7 +96,7 @@ def arm() -> TwoLink:
     return TwoLink(table.replace(**changes), gravity=9.81)
 
 
-def setting(seconds: float) -> tuple[Experiment, Limits]:
+def setting(seconds: float) -> tuple[Experiment, LimitBox]:
     """What is planned with: the prior, the sensors, the limits."""
     system, steps = arm(), round(seconds / PERIOD)
     names = [channel.name for channel in system.physical_states]
@@ -111,7 +111,7 @@ def setting(seconds: float) -> tuple[Experiment, Limits]:
         steps,
         round(WINDOW / PERIOD),
     )
-    return experiment, Limits.of(system, LIMITS, RATES, start=np.zeros(4))
+    return experiment, LimitBox.of(system, LIMITS, RATES, start=np.zeros(4))
 
 
 class Powered(AbstractSignal):
@@ -124,7 +124,7 @@ class Powered(AbstractSignal):
     def coefficients(self) -> int:
         return self.inner.coefficients
 
-    def commands(self, C: Any, limits: Limits) -> Any:
+    def commands(self, C: Any, limits: LimitBox) -> Any:
         U = self.inner.commands(C, limits)
         return U * jnp.minimum(1.0, jnp.sqrt(self.limit / energy(U, limits)))
 
@@ -132,7 +132,7 @@ class Powered(AbstractSignal):
         return self.inner.random(key, inputs)
 
 
-def energy(U: Any, limits: Limits) -> Any:
+def energy(U: Any, limits: LimitBox) -> Any:
     """Mean square of the commands, each in its own limit."""
     return jnp.mean((U / limits.high[None]) ** 2)
 
@@ -158,7 +158,7 @@ def commands(method: str, seed: int, seconds: float) -> np.ndarray:
 
 
 def random_input(
-    experiment: Experiment, limits: Limits, signal: Powered, key: Any
+    experiment: Experiment, limits: LimitBox, signal: Powered, key: Any
 ) -> np.ndarray:
     """The first of many that keeps the limits on 100 drawn arms with all its energy.
 

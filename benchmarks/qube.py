@@ -20,7 +20,7 @@ RATIO = 1.02
 
 def main() -> None:
     """Print the table and the verdict."""
-    from sim2gp.commands.evaluate import leave_one_out
+    from sim2gp.commands.evaluate import evaluate
     from sim2gp.project import load_project
     from sim2gp.runs import Progress
 
@@ -48,13 +48,9 @@ def main() -> None:
         ],
     }
     project = load_project(ROOT / "examples" / "qube.toml")
-    summary = leave_one_out(
-        project,
-        project.load_logs(),
-        horizon=horizon,
-        out=options.run,
-        progress=Progress(),
-    )
+    found = evaluate(project, horizon=horizon, progress=Progress())
+    found.save(options.run)
+    summary = found.summary
     by_log = table(summary, "Error at")
     mine = {name: column(by_log, name) for name in ANGLES}
     say("", f"error at {horizon:g} s, rad (theta / alpha)")

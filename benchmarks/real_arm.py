@@ -47,15 +47,14 @@ def errors_of(models: list[np.ndarray], logs: list[Any], horizon: float) -> list
 
 def ours(horizon: float, folder: Path) -> dict[str, Any]:
     """Leave one log out by the package's own command."""
-    from sim2gp.commands.evaluate import leave_one_out
+    from sim2gp.commands.evaluate import evaluate
     from sim2gp.project import load_project
     from sim2gp.runs import Progress
 
     project = load_project(ROOT / "examples" / "double_pendulum.toml")
-    logs = project.load_logs()
-    return leave_one_out(
-        project, logs, horizon=horizon, out=folder, progress=Progress()
-    )
+    found = evaluate(project, horizon=horizon, progress=Progress())
+    found.save(folder)
+    return found.summary
 
 
 def table(summary: dict[str, Any], title: str) -> dict[str, Any]:

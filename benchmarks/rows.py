@@ -24,7 +24,7 @@ TURNS = 3
 
 def main() -> None:
     """Print rows and warm seconds of both, and the verdict."""
-    from sim2gp.commands import identify
+    from sim2gp.commands.identify import identify
     from sim2gp.identification.fit import fit_windows
     from sim2gp.project import load_project
     from sim2gp.project.training_windows import cut_logs
@@ -49,15 +49,9 @@ def main() -> None:
             works[f"fit, {6 * times} logs"] = lambda p=project, w=windows: (
                 jax.block_until_ready(fit_windows(p.system, w, key=key).posterior)
             )
-            works[f"identify, {6 * times} logs"] = lambda p=project, n=times: (
-                identify.run(
-                    p,
-                    p.load_logs(),
-                    out=folder / f"run{n}",
-                    seed=0,
-                    progress=Progress(quiet=True),
-                )
-            )
+            works[f"identify, {6 * times} logs"] = lambda p=project, n=times: identify(
+                p, progress=Progress(quiet=True)
+            ).save(folder / f"run{n}")
         seconds = warm(works)
     for name, fastest in seconds.items():
         say(f"{name:20} {fastest:6.2f} s, warm")

@@ -37,7 +37,7 @@ def commands(seed=0, size=4.0):
 
 
 def limits(system, stated=LIMITS, rates=None, start=(0.1, 0.4, 0.0, 0.0)):
-    return d.Limits.of(system, stated, rates or {}, start=np.asarray(start))
+    return d.LimitBox.of(system, stated, rates or {}, start=np.asarray(start))
 
 
 def delayed():

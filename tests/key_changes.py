@@ -47,7 +47,7 @@ def logs(project: Project, patch: pytest.MonkeyPatch) -> str:
 
 def windows(project: Project, patch: pytest.MonkeyPatch) -> str:
     """What `explain` fits to, as `identify` does."""
-    found = explain.window_data(project)
+    found = explain.window_data(project, project.load_logs(alike=True))
     with np.printoptions(threshold=10**6, precision=17):
         leaves = [
             np.asarray(leaf) for leaf in jax.tree.leaves(found.cut(project.system))
@@ -65,12 +65,9 @@ def experiment(project: Project, patch: pytest.MonkeyPatch) -> str:
     def reached(experiment: Any, goal: Any, limits: Any, *_: Any, **__: Any) -> None:
         raise Reached(repr(jax.tree.leaves(limits)))
 
-    patch.setattr(design, "design", reached)
-    asked = design.Asked(1.0, "free", (), None, 0.5, {}, {}, {}, None)
+    patch.setattr(design, "search", reached)
     with pytest.raises(Reached) as found:
-        design.run(
-            project, asked, out=Path("run"), seed=0, progress=Progress(quiet=True)
-        )
+        design.design(project, seconds=1.0, progress=Progress(quiet=True))
     return str(found.value)
 
 

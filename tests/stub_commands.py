@@ -1,28 +1,29 @@
-"""Stand-ins for the experiments, so that the command line is tested by itself."""
+"""Stand-ins for the commands, so that the command line is tested by itself."""
 
 import sys
 from collections.abc import Callable, Sequence
-from pathlib import Path
+from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
 import pytest
 
+from sim2gp.commands.result import AbstractResult
 from sim2gp.data.logs import Log, note_lines
 from sim2gp.project import Project
-from sim2gp.runs import Progress, new_run
+from sim2gp.runs import Progress
 
 
-def install(
-    monkeypatch: pytest.MonkeyPatch, **runs: Callable[..., dict[str, Any]]
-) -> None:
-    """Put modules ``sim2gp.commands.<name>`` with the given ``run`` in place."""
-    parent = ModuleType("sim2gp.commands")
-    parent.__path__ = []
-    monkeypatch.setitem(sys.modules, "sim2gp.commands", parent)
-    for name, run in runs.items():
+@dataclass(frozen=True)
+class Told(AbstractResult):
+    """A result with a summary and nothing else."""
+
+
+def install(monkeypatch: pytest.MonkeyPatch, **commands: Callable[..., Any]) -> None:
+    """Put modules ``sim2gp.commands.<name>`` with a function of that name in place."""
+    for name, command in commands.items():
         module = ModuleType(f"sim2gp.commands.{name}")
-        module.run = run  # type: ignore[attr-defined]
+        setattr(module, name, command)
         monkeypatch.setitem(sys.modules, module.__name__, module)
 
 
@@ -30,27 +31,29 @@ def identify(
     project: Project,
     logs: Sequence[Log],
     *,
-    out: Path,
     seed: int,
     progress: Progress,
     check: bool = False,
     nuts: bool = False,
     longer: bool = False,
     held_out: bool = True,
-) -> dict[str, Any]:
+    first: Callable[[Any], str] | None = None,
+) -> Told:
     """What an identification says of its input, and no fit."""
-    summary = {
-        "n_transitions": sum(len(log) - 1 for log in logs),
-        "parameters": {p.name: {"sd": p.sd} for p in project.system.parameters.free},
-        "seed": seed,
-        "check": check,
-        "nuts": nuts,
-        "longer": longer,
-        "held_out": held_out,
-        "warnings": note_lines(logs),
-    }
-    with new_run(out, "identify") as run, progress.task("fit", 2) as task:
+    with progress.task("fit", 2) as task:
         task.advance("half")
-        run.write_summary(summary)
         task.advance()
-    return summary
+    return Told(
+        {
+            "n_transitions": sum(len(log) - 1 for log in logs),
+            "parameters": {
+                p.name: {"sd": p.sd} for p in project.system.parameters.free
+            },
+            "seed": seed,
+            "check": check,
+            "nuts": nuts,
+            "longer": longer,
+            "held_out": held_out,
+            "warnings": note_lines(logs),
+        }
+    )

@@ -17,7 +17,7 @@ import stub_commands
 from sim2gp.cli import main
 from sim2gp.cli.commands import COMMANDS
 from sim2gp.errors import InputError, NotConverged, Sim2GPWarning
-from sim2gp.runs import DiskError, Progress, RunOwned, new_run
+from sim2gp.runs import DiskError, Progress, RunOwned
 
 SUMMARY = {
     "oracle_return": 193.25,
@@ -37,33 +37,31 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def demo(action: Callable[[Path, Progress], Any]) -> Callable[..., dict[str, Any]]:
+def demo(action: Callable[[Progress], Any]) -> Callable[..., stub_commands.Told]:
     """A demo that does something and returns the summary above."""
 
     def run(
         *,
-        out: Path,
         machine: str,
         seed: int,
         seeds: int,
         episodes: int,
         truth: str,
         progress: Progress,
-        log_to: str | None,
-    ) -> dict[str, Any]:
+        sink: Any,
+    ) -> stub_commands.Told:
         assert truth == "prior"
-        action(out, progress)
-        asked = {"seed": seed, "seeds": seeds, "machine": machine, "log_to": log_to}
-        return SUMMARY | asked | {"episodes": episodes}
+        sink.scalars(0, {"seed": seed})
+        action(progress)
+        asked = {"seed": seed, "seeds": seeds, "machine": machine}
+        return stub_commands.Told(SUMMARY | asked | {"episodes": episodes})
 
     return run
 
 
-def raising(error: BaseException) -> Callable[..., dict[str, Any]]:
-    def action(out: Path, progress: Progress) -> None:
-        with new_run(out, "demo") as run:
-            run.write_text("half", "x")
-            raise error
+def raising(error: BaseException) -> Callable[..., stub_commands.Told]:
+    def action(progress: Progress) -> None:
+        raise error
 
     return demo(action)
 
@@ -73,7 +71,7 @@ def test_json_is_alone_on_stdout(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    def chatty(out: Path, progress: Progress) -> None:
+    def chatty(progress: Progress) -> None:
         print("a library talks")
         progress.say("working")
 
@@ -83,7 +81,8 @@ def test_json_is_alone_on_stdout(
     said = capsys.readouterr()
     summary = json.loads(said.out)
     assert (summary["seed"], summary["machine"]) == (7, "cartpole")
-    assert summary["log_to"] == "jsonl"
+    assert (here / "runs" / "demo.jsonl").exists()
+    assert summary["command_line"] == "sim2gp demo --json " + " ".join(asked)
     assert summary["parameters"] == SUMMARY["parameters"]
     assert "a library talks\nworking\nW110" in said.err
 
@@ -93,7 +92,7 @@ def test_tables_for_people(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    stub_commands.install(monkeypatch, demo=demo(lambda out, progress: None))
+    stub_commands.install(monkeypatch, demo=demo(lambda progress: None))
     assert main(["demo", "--quiet"]) == 0
     said = capsys.readouterr()
     assert said.err == ""
@@ -141,8 +140,8 @@ def test_exit_codes(
 def test_failed_claims_are_not_a_success(
     here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def selftest(*, seed: int, progress: Progress) -> dict[str, Any]:
-        return {"passed": seed == 1}
+    def selftest(*, seed: int, progress: Progress) -> stub_commands.Told:
+        return stub_commands.Told({"passed": seed == 1})
 
     stub_commands.install(monkeypatch, selftest=selftest)
     assert main(["selftest", "--seed", "1", "--quiet"]) == 0
@@ -154,7 +153,7 @@ def test_our_warnings_are_one_line_each(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    def careful(out: Path, progress: Progress) -> None:
+    def careful(progress: Progress) -> None:
         warnings.warn("W200 take care", Sim2GPWarning, stacklevel=1)
 
     stub_commands.install(monkeypatch, demo=demo(careful))
@@ -288,17 +287,15 @@ def test_signals_clean_up(sign: str, code: int, here: Path) -> None:
     """A command that is stopped removes what it had begun to write."""
     script = (
         "import signal, sys, time\nfrom types import ModuleType\n"
-        "from sim2gp.cli import main\nfrom sim2gp.runs import new_run\n"
+        "from sim2gp.cli import main\n"
         # A shell that runs the tests in the background has it ignored.
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "def run(*, out, progress, **options):\n"
-        "    with new_run(out, 'demo') as run:\n"
-        "        run.write_text('half', 'x')\n"
-        "        progress.say('ready')\n"
-        "        time.sleep(60)\n"
-        "for name in ('sim2gp.commands', 'sim2gp.commands.demo'):\n"
-        "    sys.modules[name] = ModuleType(name)\n"
-        "sys.modules[name].run = run\n"
+        "def demo(*, progress, **options):\n"
+        "    progress.say('ready')\n"
+        "    time.sleep(60)\n"
+        "name = 'sim2gp.commands.demo'\n"
+        "sys.modules[name] = ModuleType(name)\n"
+        "sys.modules[name].demo = demo\n"
         "raise SystemExit(main(['demo']))\n"
     )
     with subprocess.Popen([*START, script], stderr=subprocess.PIPE, text=True) as child:

@@ -100,15 +100,10 @@ def compared(folder: Path, name: str) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(compare, "MOST_FOLDS", 2)
         project = load_project(project_in(folder, name))
-        compare.run(
-            project,
-            project.load_logs(),
-            out=folder / f"run-{name}",
-            seed=0,
-            progress=QUIET,
-            horizons=(0.2, 0.4),
-            models=SOME,
+        found = compare.compare(
+            project, progress=QUIET, horizons=(0.2, 0.4), models=SOME
         )
+        found.save(folder / f"run-{name}")
     return folder / f"run-{name}"
 
 
@@ -212,13 +207,10 @@ def test_every_position_must_be_measured(folder: Path) -> None:
     path = project_in(folder, "cable")
     lame = folder / "lame.toml"
     lame.write_text(path.read_text().replace('q2 = "q2"\n', ""))
-    project, out = load_project(lame), folder / "none"
-    logs = project.load_logs()
     with pytest.raises(InputError, match="also q2") as caught:
-        compare.run(project, logs, out=out, seed=0, progress=QUIET, models=SOME)
+        compare.compare(load_project(lame), progress=QUIET, models=SOME)
     assert caught.value.code == "E103"
     assert "lame.toml:line" in str(caught.value)
-    assert not (folder / "none").exists()
 
 
 def test_one_recording_leaves_out_its_last_quarter(folder: Path) -> None:

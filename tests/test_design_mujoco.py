@@ -45,9 +45,9 @@ def experiment_with(*parts: Any) -> d.Experiment:
         )
 
 
-def box_of(experiment: d.Experiment, reach: float = 1.0) -> d.Limits:
+def box_of(experiment: d.Experiment, reach: float = 1.0) -> d.LimitBox:
     stated = {"hinge": (-reach, reach)}
-    return d.Limits.of(experiment.system, stated, {}, start=np.zeros(2))
+    return d.LimitBox.of(experiment.system, stated, {}, start=np.zeros(2))
 
 
 def commands(experiment: d.Experiment, size: float = 0.1) -> Any:

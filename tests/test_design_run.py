@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from sim2gp.cli import main
-from sim2gp.commands import identify
 from sim2gp.commands.design import goal_of, setting
-from sim2gp.experiment_design import Everything, Limits, Named, by_gradients
+from sim2gp.commands.identify import identify
+from sim2gp.experiment_design import Everything, LimitBox, Named, by_gradients
 from sim2gp.experiment_design.verdict import Asked, foretold, verdict
 from sim2gp.project import load_project
 from sim2gp.runs import Progress, load_run
@@ -20,7 +20,7 @@ from test_identify import folder, project_in
 assert folder  # a fixture
 
 SHORT = ["--seconds", "1", "--period", "0.01"]
-ASKED = Asked(10.0, "multisine", (), None, 2.0, {}, {}, {}, None)
+ASKED = Asked(kind="multisine")
 LIMITS = ["--limit", "theta=-1:1", "theta.velocity=-15:15", "--rate", "voltage=200"]
 
 
@@ -30,11 +30,8 @@ QUICK = {"BLOCK": 5, "BLOCKS": 2, "TRIALS": 40, "GUARDS": 8, "CHECKED": 100}
 @pytest.fixture(scope="module")
 def run(folder: Path) -> Path:
     """A fit alone: nothing of it is held out."""
-    project, out = load_project(project_in(folder)), folder / "run"
-    quiet = Progress(quiet=True)
-    logs = project.load_logs()
-    identify.run(project, logs, out=out, seed=0, progress=quiet, held_out=False)
-    return out
+    project, quiet = load_project(project_in(folder)), Progress(quiet=True)
+    return identify(project, progress=quiet, held_out=False).save(folder / "run")
 
 
 @pytest.fixture(autouse=True)
@@ -96,7 +93,7 @@ def test_what_is_asked_about(tmp_path: Path) -> None:
     asked = dataclasses.replace(ASKED, about=("pendulum_length", "arm_damping"))
     _, experiment, _ = setting(load_project(project_in(tmp_path)), asked)
     names = experiment.system.parameters.names
-    box = Limits.of(experiment.system, {}, {}, start=np.zeros(4))
+    box = LimitBox.of(experiment.system, {}, {}, start=np.zeros(4))
     goal = goal_of(asked, experiment, box, jax.random.key(0))
     assert isinstance(goal, Named)
     assert [names[i] for i in goal.index] == ["pendulum_length", "arm_damping"]

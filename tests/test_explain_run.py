@@ -11,8 +11,8 @@ import pytest
 import stub_commands
 from sim2gp import systems as sy
 from sim2gp.cli import main
-from sim2gp.commands import explain, identify
-from sim2gp.data.logs import Budget
+from sim2gp.commands.explain import explain, explainable, project_file, window_data
+from sim2gp.commands.identify import identify
 from sim2gp.errors import InputError
 from sim2gp.project import load_project
 from sim2gp.runs import Progress, load_run, new_run
@@ -45,17 +45,24 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for seed in (1, 2):
         log = simulated(seconds=1.3, seed=seed, noise=5e-4, effects=(SPRING,))
         write(log, folder / "logs" / f"log{seed}.csv")
-    out = folder / "run"
     project = load_project(project_in(folder))
-    logs = project.load_logs()
-    identify.run(project, logs, out=out, seed=0, progress=QUIET, held_out=False)
-    return folder / "run"
+    return identify(project, progress=QUIET, held_out=False).save(folder / "run")
+
+
+def explained(run: Path, out: Path, *, add: bool) -> dict[str, Any]:
+    """The command line's summary; an error of the input is raised."""
+    found = explainable(run)
+    file = project_file(found) if add else None
+    missing = explain(found, progress=QUIET)
+    missing = missing.add_to(file) if file else missing
+    missing.save(out)
+    return missing.summary
 
 
 @pytest.mark.usefixtures("few")
 def test_a_spring_is_found_in_logs_and_added(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    summary = explain.run(run, add=True, out=out, progress=QUIET)
+    summary = explained(run, out, add=True)
     json.dumps(summary, allow_nan=False)
     assert summary["best"] == "theta.spring"
     assert summary["none_of_these"] is False
@@ -71,15 +78,13 @@ def test_a_spring_is_found_in_logs_and_added(run: Path, tmp_path: Path) -> None:
     assert load_project(project).system.parameters.names[-1] == "theta.spring"
     # The run was made with another file: nothing is added twice.
     with pytest.raises(InputError, match=r"E160.*changed.*identify again"):
-        explain.run(run, add=True, out=out, progress=QUIET)
+        explained(run, out, add=True)
 
 
 def test_windows_of_a_second_share_an_error(run: Path) -> None:
-    project = load_project(run / "project.toml")
-    moved = type(project)(
-        run.parent / "machine.toml", project.source, project.spec, project.system
-    )
-    data = explain.window_data(moved)
+    found = explainable(run)
+    assert found.project is not None
+    data = window_data(found.project, found.project.load_logs())
     assert data.cluster.tolist() == [0] * 5 + [1] + [2] * 5 + [3]
     assert data.period == 0.0
 
@@ -102,10 +107,10 @@ def test_a_demo_is_explained_by_its_own_flights(tmp_path: Path) -> None:
         arrays = {"animation/state": states, "animation/action": inputs}
         writer.write_arrays("arrays.npz", arrays)
     out, demo = tmp_path / "out", tmp_path / "demo"
-    summary = explain.run(demo, add=False, out=out, progress=QUIET)
+    summary = explained(demo, out, add=False)
     assert summary["best"] == "theta.spring"
     with pytest.raises(InputError, match=r"E160.*--add without a project"):
-        explain.run(demo, add=True, out=out, progress=QUIET)
+        explained(demo, out, add=True)
 
 
 def test_a_run_without_data_is_told(tmp_path: Path) -> None:
@@ -116,7 +121,7 @@ def test_a_run_without_data_is_told(tmp_path: Path) -> None:
     with pytest.raises(
         InputError, match=r"E130.*got evaluate.*identify or sim2gp demo"
     ):
-        explain.run(other, add=False, out=out, progress=QUIET)
+        explained(other, out, add=False)
     assert not out.exists()
 
 
@@ -128,24 +133,25 @@ def test_the_command_line_hands_on(
 ) -> None:
     monkeypatch.chdir(tmp_path)
 
-    def told(
-        path: Path,
-        *,
-        add: bool,
-        out: Path,
-        strict: bool,
-        budget: Budget,
-        progress: Progress,
-    ) -> dict[str, Any]:
-        assert not strict
-        assert budget == Budget()
-        return {"path": str(path), "add": add, "out": str(out), "answer": "missing"}
+    added: list[Path] = []
 
-    stub_commands.install(monkeypatch, explain=told)
+    class Missing(stub_commands.Told):
+        def add_to(self, file: Path) -> Any:
+            added.append(file)
+            return self
+
+    def told(found: Any, *, progress: Progress) -> Any:
+        assert found.training_logs()
+        return Missing({"answer": "missing", "path": str(found.path)})
+
+    monkeypatch.setattr("sim2gp.commands.explain.explain", told)
+    text = (run / "project.toml").read_text()
+    (run.parent / "machine.toml").write_text(text)  # as it was identified
     assert main(["explain", str(run), "--add", "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
-    assert said["add"] is True
-    assert said["out"] == "runs/explain-run"
+    assert said["path"] == str(run)
+    assert added == [run.parent / "machine.toml"]
+    assert load_run(Path("runs/explain-run")).summary == said
     for args, words in (
         (["explain"], "E160 missing RUN"),
         (["explain", str(tmp_path)], "E130"),

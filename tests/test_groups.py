@@ -7,11 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sim2gp.commands import apply, design, evaluate, explain, identify
+from sim2gp.commands.apply import apply
+from sim2gp.commands.design import setting as setting_of
+from sim2gp.commands.evaluate import evaluate
+from sim2gp.commands.explain import explainable
 from sim2gp.commands.identification import restored
+from sim2gp.commands.identify import identify
 from sim2gp.data.logs import Log
 from sim2gp.errors import InputError
-from sim2gp.experiment_design import verdict as design_verdict
+from sim2gp.experiment_design.verdict import Asked
 from sim2gp.identification.configurations import told
 from sim2gp.project import load_project
 from sim2gp.runs import Progress, load_run
@@ -187,9 +191,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def identified(path: Path, out: Path, *, held_out: bool = True) -> None:
-    project = load_project(path)
-    logs = project.load_logs()
-    identify.run(project, logs, out=out, seed=0, progress=QUIET, held_out=held_out)
+    found = identify(load_project(path), progress=QUIET, held_out=held_out)
+    found.save(out)
 
 
 @pytest.fixture(scope="module")
@@ -234,24 +237,14 @@ def test_held_out_logs_are_of_one_configuration(
     run: Path, folder: Path, tmp_path: Path
 ) -> None:
     def error(name: str | None) -> dict[str, Any]:
-        held, out = [folder / "held.csv"], tmp_path / f"{name}"
         fit = restored(run)
-        logs = fit.read(held, name, strict=False)
-        return evaluate.run(
-            fit,
-            logs,
-            files=held,
-            horizon=0.2,
-            out=out,
-            progress=QUIET,
-            configuration=name,
-        )
+        logs = fit.read_logs([folder / "held.csv"], name)
+        return evaluate(fit, logs, progress=QUIET).summary
 
     right, wrong = error("loaded"), error("bare")
     assert (
         right["open_loop_rmse"]["shoulder"] < 0.5 * wrong["open_loop_rmse"]["shoulder"]
     )
-    assert right["command_line"].endswith("--configuration loaded")
     json.dumps(right, allow_nan=False)
     with pytest.raises(InputError, match=r"E152 which configuration.*bare, loaded"):
         error(None)
@@ -262,11 +255,8 @@ def test_held_out_logs_are_of_one_configuration(
 @pytest.mark.nightly
 def test_an_experiment_is_for_the_machine_as_it_stands(run: Path) -> None:
     def setting(name: str | None) -> Any:
-        nothing: dict[str, Any] = {}
-        asked = design_verdict.Asked(
-            1.0, "free", (), None, 2.0, nothing, nothing, nothing, None, 1, name
-        )
-        return design.setting(restored(run), asked)[1]
+        asked = Asked(seconds=1.0, configuration=name)
+        return setting_of(restored(run), asked)[1]
 
     x = load_run(run).arrays
     bare, loaded = setting("bare"), setting("loaded")
@@ -285,14 +275,8 @@ def test_an_experiment_is_for_the_machine_as_it_stands(run: Path) -> None:
 @pytest.mark.nightly
 def test_a_models_file_gets_the_constants_of_one(run: Path, tmp_path: Path) -> None:
     def applied(name: str | None) -> Any:
-        return apply.run(
-            run,
-            out=tmp_path / f"{name}.xml",
-            model=None,
-            in_place=False,
-            progress=QUIET,
-            configuration=name,
-        )["constants"]
+        found = apply(restored(run), progress=QUIET, configuration=name)
+        return found.save_model(tmp_path / f"{name}.xml").constants
 
     found = load_run(run).summary["parameters"]
     hand = applied("loaded")["body/hand/mass"]["is"]
@@ -303,16 +287,13 @@ def test_a_models_file_gets_the_constants_of_one(run: Path, tmp_path: Path) -> N
 
 
 @pytest.mark.nightly
-def test_commands_for_one_configuration_say_so(
-    run: Path, folder: Path, tmp_path: Path
-) -> None:
-    path, out = folder / "arm.toml", tmp_path / "out"
+def test_commands_for_one_configuration_say_so(run: Path, folder: Path) -> None:
+    path = folder / "arm.toml"
     one = "E160 several configurations, which explain and compare do not take"
     with pytest.raises(InputError, match=one):
         load_project(path).load_logs(alike=True)
     with pytest.raises(InputError, match=one):
-        explain.run(run, add=False, out=out, progress=QUIET)
-    assert not out.exists()
+        explainable(run)
 
 
 @pytest.mark.nightly

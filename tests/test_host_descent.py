@@ -11,7 +11,7 @@ import pytest
 
 import sim2gp.inference.host_descent as host
 from sim2gp.cli import main
-from sim2gp.commands.first_answer import FirstAnswer
+from sim2gp.cli.late import FirstFolder
 from sim2gp.data.logs import Log
 from sim2gp.data.split_log import cut
 from sim2gp.errors import NotConverged
@@ -181,14 +181,14 @@ def identified(folder: Path) -> tuple[int, Path]:
 
 @pytest.mark.nightly
 def test_the_first_answer_is_replaced_by_the_run(tmp_path, capsys, monkeypatch):
-    replaced, seen = FirstAnswer.replaced, []
+    replaced, seen = FirstFolder.replaced, []
 
-    def look(self: FirstAnswer) -> None:
+    def look(self: FirstFolder) -> None:
         text = (self.folder / "summary.json").read_text()
         seen.append(json.loads(text))
         replaced(self)
 
-    monkeypatch.setattr(FirstAnswer, "replaced", look)
+    monkeypatch.setattr(FirstFolder, "replaced", look)
     code, run = identified(tmp_path)
     said = capsys.readouterr()
     assert code == 0, said.err

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sim2gp.commands import compare
+from sim2gp.commands.compare import compare
 from sim2gp.project import load_project
 from sim2gp.runs import Progress
 
@@ -39,13 +39,7 @@ def test_a_residual_helps_the_arm_or_is_not_supported(
     text = project.read_text().replace("../../shared/data", shared_data.as_posix())
     (tmp_path / "arm.toml").write_text(text)
     found = load_project(tmp_path / "arm.toml")
-    summary = compare.run(
-        found,
-        found.load_logs(alike=True),
-        out=tmp_path / "run",
-        seed=0,
-        progress=Progress(quiet=True),
-    )
+    summary = compare(found, progress=Progress(quiet=True)).summary
     sim, residual = (summary["models"][n]["horizons"] for n in ("SIM2GP", "RES-FS"))
     better = [
         residual[h]["crps"][q] < sim[h]["crps"][q]

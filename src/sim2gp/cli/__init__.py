@@ -9,6 +9,7 @@ import contextlib
 import io
 import os
 import re
+import shlex
 import sys
 import traceback
 import warnings
@@ -22,6 +23,7 @@ from tyro.conf import subcommand
 from sim2gp.cli.arguments import check_arguments, usage_error
 from sim2gp.cli.commands import COMMANDS, Common
 from sim2gp.cli.interrupts import DONE, interruptible, leave
+from sim2gp.cli.late import Call
 from sim2gp.errors import InputError, Sim2GPError, Sim2GPWarning
 from sim2gp.runs import DiskError, Progress, RunOwned
 from sim2gp.runs.plain import to_json
@@ -99,7 +101,8 @@ def _run(args: list[str]) -> int:
         warnings.showwarning = _warner(progress, warnings.showwarning)
         # Whatever a library prints must not mix with the summary.
         with contextlib.redirect_stdout(sys.stderr):
-            summary = command.run(progress)  # type: ignore[attr-defined]
+            call = Call(progress, shlex.join(["sim2gp", *args]))
+            summary = command.run(call)  # type: ignore[attr-defined]
     for note in summary.get("warnings", ()):
         progress.say(str(note))
     name = args[0]

@@ -11,11 +11,20 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from sim2gp.cli.arguments import numbers, pairs, usage_error
-from sim2gp.cli.late import FIGURES, budget, function, read_project, run_directory
+from sim2gp.cli.late import (
+    Call,
+    FirstFolder,
+    budget,
+    command,
+    function,
+    identification,
+    read_project,
+    read_run,
+    run_directory,
+)
 from sim2gp.cli.options import Chosen, Common, Reads, Wide, Writes
-from sim2gp.runs import Progress, load_run
+from sim2gp.runs.sinks import opened
 from sim2gp.runs.store import check_absent
-from sim2gp.runs.workers import cores
 
 
 @dataclass(kw_only=True)
@@ -35,17 +44,15 @@ class Demo(Writes):
     log_to: Literal["jsonl", "tensorboard", "wandb"] | None = None
     """Write each episode's numbers, as they come, beside the run directory."""
 
-    def run(self, progress: Progress) -> dict[str, Any]:
-        return function("commands.demo")(
-            out=run_directory(self.out, "demo"),
-            machine=self.machine,
-            seed=self.seed,
-            seeds=self.seeds,
-            episodes=self.episodes,
-            truth=self.truth,
-            progress=progress,
-            log_to=self.log_to,
-        )
+    def run(self, call: Call) -> dict[str, Any]:
+        out = run_directory(self.out, "demo")
+        about = ("machine", "seed", "seeds", "episodes", "truth")
+        asked = {name: getattr(self, name) for name in about}
+        with opened(self.log_to, out, asked) as sink:
+            return call.saved(
+                out,
+                lambda: command("demo")(**asked, sink=sink, progress=call.progress),
+            )
 
 
 @dataclass(kw_only=True)
@@ -71,10 +78,10 @@ class Init(Common):
     seed: int = 0
     """Draws the phases of the first experiment."""
 
-    def run(self, progress: Progress) -> dict[str, Any]:
+    def run(self, call: Call) -> dict[str, Any]:
         out = self.out or Path(Path(self.model).stem + ".toml")
         check_absent(out)
-        return function("commands.init")(
+        return command("init")(
             self.model,
             self.logs,
             out=out,
@@ -84,7 +91,7 @@ class Init(Common):
             readings=not self.no_readings,
             seconds=self.budget,
             seed=self.seed,
-            progress=progress,
+            progress=call.progress,
         )
 
 
@@ -105,19 +112,25 @@ class Identify(Reads):
     quick: bool = False
     """No second fit, which forecasts data that it has not seen."""
 
-    def run(self, progress: Progress) -> dict[str, Any]:
+    def run(self, call: Call) -> dict[str, Any]:
         out = run_directory(self.out, self.project.stem)
         read = read_project(self.project, self)
-        return function("commands.identify")(
-            *read,
-            out=out,
-            seed=self.seed,
-            check=self.check,
-            nuts=self.nuts,
-            longer=self.longer,
-            held_out=not self.quick,
-            progress=progress,
+        first = FirstFolder(out)
+        summary = call.saved(
+            out,
+            lambda: command("identify")(
+                *read,
+                seed=self.seed,
+                check=self.check,
+                nuts=self.nuts,
+                longer=self.longer,
+                held_out=not self.quick,
+                first=first,
+                progress=call.progress,
+            ),
         )
+        first.replaced()
+        return summary
 
 
 @dataclass(kw_only=True)
@@ -131,30 +144,25 @@ class Evaluate(Reads, Chosen):
     horizon: float = 0.2
     """Open-loop horizon in s."""
 
-    def run(self, progress: Progress) -> dict[str, Any]:
-        name = self.run_or_project.stem
-        how: dict[str, Any] = {
-            "horizon": self.horizon,
-            "out": run_directory(self.out, f"evaluate-{name}"),
-            "progress": progress,
-        }
-        if self.run_or_project.suffix == ".toml":
+    def run(self, call: Call) -> dict[str, Any]:
+        path = self.run_or_project
+        out = run_directory(self.out, f"evaluate-{path.stem}")
+        how = {"horizon": self.horizon, "progress": call.progress}
+        if path.suffix == ".toml":
             for option in ("logs", "configuration"):
                 if getattr(self, option):
                     fix = f"leave --{option} out, or name a run"
                     expected = "a project file alone: its own logs are left out"
                     raise usage_error("too much", f"--{option}", expected, fix)
-            read = read_project(self.run_or_project, self)
-            return function("commands.evaluate", "leave_one_out")(*read, **how)
-        load_run(self.run_or_project)  # a folder that is no run fails before the work
+            read = read_project(path, self)
+            return call.saved(out, lambda: command("evaluate")(*read, **how))
+        read_run(path)
         if not self.logs:
             expected, fix = "--logs FILE...", "name the logs to predict"
             raise usage_error("no logs", "no --logs", expected, fix)
-        fit = function("commands.identification", "restored")(self.run_or_project)
-        fit = fit.within(budget(self.budget))
-        tested = fit.read(self.logs, self.configuration, strict=self.strict)
-        how |= {"configuration": self.configuration, "files": self.logs}
-        return function("commands.evaluate")(fit, tested, **how)
+        fit = identification(path).within(budget(self.budget))
+        tested = fit.read_logs(self.logs, self.configuration, strict=self.strict)
+        return call.saved(out, lambda: command("evaluate")(fit, tested, **how))
 
 
 @dataclass(kw_only=True)
@@ -166,17 +174,19 @@ class Explain(Reads):
     add: bool = False
     """Write the winner into the project file, so that identify fits it."""
 
-    def run(self, progress: Progress) -> dict[str, Any]:
+    def run(self, call: Call) -> dict[str, Any]:
         out = run_directory(self.out, f"explain-{self.path.name}")
-        load_run(self.path)  # a folder that is no run fails before the work
-        return function("commands.explain")(
-            self.path,
-            add=self.add,
-            out=out,
-            strict=self.strict,
-            budget=budget(self.budget),
-            progress=progress,
+        module = "commands.explain"
+        run = function(module, "explainable")(
+            self.path, budget(self.budget), strict=self.strict
         )
+        file = function(module, "project_file")(run) if self.add else None
+
+        def found() -> Any:
+            missing = command("explain")(run, progress=call.progress)
+            return missing if file is None else missing.add_to(file)
+
+        return call.saved(out, found)
 
 
 @dataclass(kw_only=True)
@@ -190,16 +200,11 @@ class Compare(Reads):
     horizon: Annotated[tuple[float, ...], arg(metavar="S...")] = (0.2, 0.5)
     """Open-loop horizons in s."""
 
-    def run(self, progress: Progress) -> dict[str, Any]:
+    def run(self, call: Call) -> dict[str, Any]:
         out = run_directory(self.out, f"compare-{self.project.stem}")
         read = read_project(self.project, self, alike=True)
-        return function("commands.compare")(
-            *read,
-            horizons=self.horizon,
-            out=out,
-            seed=self.seed,
-            progress=progress,
-        )
+        how = {"horizons": self.horizon, "seed": self.seed, "progress": call.progress}
+        return call.saved(out, lambda: command("compare")(*read, **how))
 
 
 @dataclass(kw_only=True)
@@ -231,29 +236,27 @@ class Design(Writes, Chosen):
     seed: int = 0
     """Draws machines and motions."""
 
-    def run(self, progress: Progress) -> dict[str, Any]:
+    def run(self, call: Call) -> dict[str, Any]:
         out = run_directory(self.out, f"design-{self.run_or_project.stem}")
-        source: Any = self.run_or_project
-        if source.suffix == ".toml":
-            source = import_module("sim2gp.project").load_project(source)
+        path = self.run_or_project
+        if path.suffix == ".toml":
+            source = import_module("sim2gp.project").load_project(path)
         else:
-            load_run(source)  # a folder that is no run fails early
-            source = function("commands.identification", "restored")(source)
-        asked = import_module("sim2gp.experiment_design.verdict").Asked(
-            seconds=self.seconds,
-            kind=self.kind,
-            about=self.about,
-            predict=self.predict,
-            within=self.within,
-            limits=pairs("--limit", self.limit),
-            rates=numbers("--rate", self.rate),
-            start=numbers("--start", self.start),
-            period=self.period,
-            starts=self.starts,
-            configuration=self.configuration,
-        )
-        return function("commands.design")(
-            source, asked, out=out, seed=self.seed, progress=progress
+            source = identification(path)
+        bounds = import_module("sim2gp.experiment_design.verdict").Limits
+        asked: dict[str, Any] = {
+            "limits": bounds(
+                pairs("--limit", self.limit), rates=numbers("--rate", self.rate)
+            ),
+            "start": numbers("--start", self.start),
+        }
+        for name in (
+            *("seconds", "kind", "about", "predict", "within", "period", "starts"),
+            *("configuration", "seed"),
+        ):
+            asked[name] = getattr(self, name)
+        return call.saved(
+            out, lambda: command("design")(source, **asked, progress=call.progress)
         )
 
 
@@ -270,16 +273,25 @@ class Apply(Wide):
     in_place: bool = False
     """Change the model's file itself."""
 
-    def run(self, progress: Progress) -> dict[str, Any]:
-        return function("commands.apply")(
-            self.path,
-            out=self.out,
-            model=self.model,
-            in_place=self.in_place,
+    def run(self, call: Call) -> dict[str, Any]:
+        if self.out is not None and self.in_place:
+            got, fix = "--out and --in-place", "leave one of the two out"
+            raise usage_error("output file", got, "one of the two", fix, "E132")
+        if self.out is not None:
+            check_absent(self.out)
+        run = function("commands.apply", "for_model")(self.path, self.model)
+        found = command("apply")(
+            run,
             configuration=self.configuration,
             posterior=self.posterior,
-            progress=progress,
+            progress=call.progress,
         )
+        if self.out is not None:
+            found = found.save_model(self.out)
+        elif self.in_place:
+            found = found.replace_model()
+        summary: dict[str, Any] = found.summary
+        return summary
 
 
 @dataclass(kw_only=True)
@@ -293,18 +305,16 @@ class Export(Writes, Wide):
     seed: int = 0
     """Draws them."""
 
-    def run(self, progress: Progress) -> dict[str, Any]:
+    def run(self, call: Call) -> dict[str, Any]:
         out = run_directory(self.out, f"export-{self.path.name}")
-        load_run(self.path)  # a folder that is no run fails before the work
-        fit = function("commands.identification", "restored")(self.path)
-        return function("commands.export")(
-            fit,
+        return command("export")(
+            identification(self.path),
+            out,
             draws=self.draws,
-            out=out,
             seed=self.seed,
             configuration=self.configuration,
             posterior=self.posterior,
-            progress=progress,
+            progress=call.progress,
         )
 
 
@@ -315,10 +325,10 @@ class Report(Common):
     path: Annotated[Positional[Path], arg(metavar="RUN")]
     """The folder of an earlier command."""
 
-    def run(self, progress: Progress) -> dict[str, Any]:
-        summary = load_run(self.path).summary
+    def run(self, call: Call) -> dict[str, Any]:
+        summary = read_run(self.path).summary
         redraw = import_module("sim2gp.reports").redraw
-        progress.say(f"report: {redraw(self.path)}")
+        call.progress.say(f"report: {redraw(self.path)}")
         return summary
 
 
@@ -329,8 +339,10 @@ class Selftest(Common):
     seed: int = 0
     """Draws the problems."""
 
-    def run(self, progress: Progress) -> dict[str, Any]:
-        return function("commands.selftest")(seed=self.seed, progress=progress)
+    def run(self, call: Call) -> dict[str, Any]:
+        found = command("selftest")(seed=self.seed, progress=call.progress)
+        summary: dict[str, Any] = found.with_entries(command_line=call.line).summary
+        return summary
 
 
 @dataclass(kw_only=True)
@@ -357,31 +369,24 @@ class Reproduce(Writes):
     keep_old: bool = False
     """Use them; the summary says how many."""
 
-    def run(self, progress: Progress) -> dict[str, Any]:
+    def run(self, call: Call) -> dict[str, Any]:
         if self.refresh and self.keep_old:
             where, one = "--refresh with --keep-old", "one of them"
             raise usage_error(where, "both", one, "leave one out")
-        more: dict[str, Any] = {}
-        if self.figure == "fig1":
-            for name in ("seeds", "episodes", "workers", "refresh", "keep_old"):
-                value = getattr(self, name)
-                if value not in (None, False):
-                    where = f"--{name.replace('_', '-')} with fig1"
-                    one = "one run in one process"
-                    raise usage_error(where, str(value), one, "leave it out")
-        else:
-            old = "refresh" if self.refresh else "keep" if self.keep_old else "refuse"
-            more = {"seeds": self.seeds, "episodes": self.episodes, "old": old}
-            more["workers"] = self.workers or cores()
-        if FIGURES[self.figure] in ("figure2", "figure3"):  # of two figures each
-            more["figure"] = self.figure
-        return function(f"studies.{FIGURES[self.figure]}")(
-            out=run_directory(self.out, self.figure),
+        old = "refresh" if self.refresh else "keep" if self.keep_old else "refuse"
+        found = command("reproduce")(
+            self.figure,
+            run_directory(self.out, self.figure),
             seed=self.seed,
+            seeds=self.seeds,
+            episodes=self.episodes,
             quick=self.quick,
-            progress=progress,
-            **more,
+            workers=self.workers,
+            old=old,
+            progress=call.progress,
         )
+        summary: dict[str, Any] = found.summary
+        return summary
 
 
 COMMANDS: dict[str, type[Common]] = {

@@ -3,24 +3,58 @@
 Everything heavy is imported inside: help and a mistyped option cost nothing.
 """
 
+import shutil
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from sim2gp.cli.options import Reads
+from sim2gp.runs import Progress, new_run
 from sim2gp.runs.store import check_target
+from sim2gp.runs.store import load_run as read_run
 
-#: Figure, and the module of `sim2gp.studies` that makes it.
-FIGURES = {
-    "fig1": "figure1",
-    "fig2": "figure2",
-    "fig3": "figure3",
-    "fig4": "figure2",
-    "fig5": "figure3",
-    "mismatch": "mismatch",
-}
+
+@dataclass(frozen=True)
+class Call:
+    """How a command was called: what shows its progress, and the line as typed."""
+
+    progress: Progress
+    line: str
+
+    def saved(self, out: Path, make: Callable[[], Any]) -> dict[str, Any]:
+        """Write the run of the result that ``make`` returns; its summary.
+
+        The folder is locked, and known to be writable, before the work begins.
+        """
+        name = self.line.split()[1]
+        with new_run(out, name) as writer:
+            result = make().with_entries(command_line=self.line).at(out)
+            result.write(writer)
+        summary: dict[str, Any] = result.summary
+        return summary
+
+
+class FirstFolder:
+    """The first answer of a long fit, as the run ``NAME-first`` until the whole stands.
+
+    Where the fit fails it stays.
+    """
+
+    def __init__(self, out: Path) -> None:
+        self.folder, self.written = out.parent / f"{out.name}-first", False
+        check_target(self.folder)
+
+    def __call__(self, answer: Any) -> str:
+        answer.save(self.folder)
+        self.written = True
+        return str(self.folder)
+
+    def replaced(self) -> None:
+        """The whole run stands: the first answer goes."""
+        if self.written:
+            shutil.rmtree(self.folder, ignore_errors=True)
 
 
 def run_directory(out: Path | None, name: str) -> Path:
@@ -37,12 +71,23 @@ def read_project(path: Path, given: Reads, *, alike: bool = False) -> tuple[Any,
     return project, project.load_logs(strict=given.strict, alike=alike)
 
 
+def identification(path: Path) -> Any:
+    """An identification read back; a folder that is no run fails before the imports."""
+    read_run(path)
+    return function("commands.identification", "restored")(path)
+
+
 def budget(factor: float) -> Any:
     """So many times what one file may take to read."""
     return import_module("sim2gp.data.logs").Budget().times(factor)
 
 
-def function(module: str, name: str = "run") -> Callable[..., Any]:
+def command(name: str) -> Callable[..., Any]:
+    """The function of a command, imported when it runs."""
+    return function(f"commands.{name}", name)
+
+
+def function(module: str, name: str) -> Callable[..., Any]:
     """A function of a module of ours, imported when a command runs."""
     found: Callable[..., Any] = getattr(import_module(f"sim2gp.{module}"), name)
     return found

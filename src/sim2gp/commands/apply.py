@@ -7,22 +7,25 @@ of the plain one.
 """
 
 import difflib
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from sim2gp.cleanup import replace_file, temporary_folder
 from sim2gp.commands.identification import (
+    Identification,
     Width,
     check_identified,
     modes,
     project_of,
     used,
 )
+from sim2gp.commands.result import AbstractResult
 from sim2gp.errors import InputError
 from sim2gp.project import Project
 from sim2gp.project.project import is_model
 from sim2gp.runs import Progress, load_run
-from sim2gp.runs.store import Run, check_absent
+from sim2gp.runs.store import check_absent
 from sim2gp.systems import MuJoCo
 from sim2gp.systems.machine import plant_of
 from sim2gp.systems.mujoco.constants import matching
@@ -33,61 +36,95 @@ from sim2gp.systems.variants import own_table
 Written = list[tuple[str, bytes]]
 
 
-def run(
-    run: Path,
+@dataclass(frozen=True, repr=False)
+class AppliedModel(AbstractResult):
+    """A model's file with identified constants, which is written on request."""
+
+    file: ModelFile | None = field(default=None)
+    edited: Edited | None = field(default=None)
+
+    @property
+    def diff(self) -> str:
+        """The changes of the model's files, as a unified diff."""
+        return str(self.summary["diff"])
+
+    @property
+    def constants(self) -> dict[str, dict[str, Any]]:
+        """What each changed constant was and is, in its unit."""
+        return dict(self.summary["constants"])
+
+    def save_model(self, out: Path | str) -> "AppliedModel":
+        """Write a new file, and copies of those that it includes (E132, E170)."""
+        assert self.file is not None
+        assert self.edited is not None
+        out = Path(out)
+        check_absent(out)
+        written = [str(path) for path in _written(self.file, self.edited, out)]
+        diff = _diff(self.file, self.edited, out)
+        return self.with_entries(written=written, diff=diff)
+
+    def replace_model(self) -> "AppliedModel":
+        """Change the model's own files."""
+        assert self.file is not None
+        assert self.edited is not None
+        changed = self.file.replaced(self.edited)
+        for path, data in changed.items():
+            replace_file(path, data)
+        return self.with_entries(written=[str(path) for path in changed])
+
+
+def apply(
+    found: Identification,
     *,
-    out: Path | None,
-    model: Path | None,
-    in_place: bool,
-    progress: Progress,
     configuration: str | None = None,
     posterior: Width = "corrected",
-) -> dict[str, Any]:
-    """Write the constants of a run into ``out``, or the source ``in_place``, or show.
+    progress: Progress | None = None,
+) -> AppliedModel:
+    """The constants of an identification in its MuJoCo model's own file.
 
-    ``model`` is another copy of the file than the one that was fitted; the machine is
-    that of one ``configuration``, where it has several (E152). ``posterior`` says whose
-    modes are written. Raises `InputError` E130
-    for a run without a model's constants, E132 where ``out`` exists, E170 where the
-    file cannot say them: then nothing is written.
+    The machine is that of one ``configuration``, where it has several (E152);
+    ``posterior`` says whose modes are written. Raises `InputError` E130 for a run
+    without a model's constants, E170 where the file cannot say them.
     """
-    if out is not None and in_place:
-        got, fix = "--out and --in-place", "leave one of the two out"
-        raise InputError("E132", "output file", where=str(out), got=got, fix=fix)
-    if out is not None:
-        check_absent(out)
-    stored = load_run(run)
-    project = _project(run, stored, model)
+    project = _with_model(found)
     system = plant_of(project.system)
     assert isinstance(system, MuJoCo)
-    values, apart = _values(stored, project, system, configuration, posterior)
-    progress.say(f"editing {system.source}")
+    values, apart = _values(found, project, system, configuration, posterior)
+    (progress or Progress()).say(f"editing {system.source}")
     file = system.file()
     edited = file.edited(system.by_path(values))
     with temporary_folder() as folder:
         _written(file, edited, Path(folder, f"model{file.suffix}"))
-    written = _keep(file, edited, out, in_place)
-    return {
+    summary = {
         "command": "apply",
-        "title": f"{run.name}: its constants in {file.source.name}",
+        "title": f"{found.name}: its constants in {file.source.name}",
         "model": str(file.source),
-        **used(stored.summary, posterior),
-        "written": written,
+        **used(found.summary, posterior),
+        "written": [],
         "constants": _table(file, edited),
         "not_written": apart | edited.unsaid,
-        "diff": _diff(file, edited, out),
+        "diff": _diff(file, edited, None),
     }
+    return AppliedModel(summary, file=file, edited=edited)
 
 
-def _project(run: Path, stored: Run, model: Path | None) -> Project:
-    """The run's project with the model's file where it stands now."""
+def for_model(run: Path, model: Path | None = None) -> Identification:
+    """A run to be applied; its model's file may have changed since, or be another."""
+    stored = load_run(run)
     check_identified(run, stored)
-    project = project_of(run, stored, model)
+    project = project_of(run, stored, model=model)
+    return Identification(stored.summary, stored.arrays, {}, project, run)
+
+
+def _with_model(found: Identification) -> Project:
+    """The project, whose machine is a model's file."""
+    project = found.project
+    assert project is not None
     if not is_model(project.spec.system):
         raise InputError(
             "E130",
             "no model's file",
-            where=str(run),
+            where=str(found.path or found.name),
             got=f"the bundled machine {project.spec.system}",
             expected="a project whose system is an MJCF or URDF file",
             fix="copy its constants from summary.json",
@@ -96,7 +133,7 @@ def _project(run: Path, stored: Run, model: Path | None) -> Project:
 
 
 def _values(
-    stored: Run,
+    found: Identification,
     project: Project,
     system: MuJoCo,
     configuration: str | None,
@@ -105,9 +142,9 @@ def _values(
     """The model's constants by name, and why the run's other ones are none."""
     joint = project.system.parameters
     table, places = own_table(joint, project.system.variants, configuration)
-    own = modes(stored, joint, posterior)[list(places)]
-    found = dict(zip(table.names, own.tolist(), strict=True))
-    values = dict(table.fixed) | found
+    own = modes(found.arrays, joint, posterior)[list(places)]
+    learned = dict(zip(table.names, own.tolist(), strict=True))
+    values = dict(table.fixed) | learned
     for name in values:
         if "/" in name and name not in system.names:
             matching(system.file().constants, name)  # raises with the nearest name
@@ -115,7 +152,7 @@ def _values(
     apart = {
         name: "no constant of the model's file"
         for name, value in values.items()
-        if name not in system.names and (name in found or value != _neutral(name))
+        if name not in system.names and (name in learned or value != _neutral(name))
     }
     return {k: v for k, v in values.items() if k in system.names}, apart
 
@@ -123,20 +160,6 @@ def _values(
 def _neutral(name: str) -> float:
     """Of an input that arrives as it was sent."""
     return 1.0 if name.endswith(".gain") else 0.0
-
-
-def _keep(
-    file: ModelFile, edited: Edited, out: Path | None, in_place: bool
-) -> list[str]:
-    """Write what was asked for; names of the files."""
-    if out is not None:
-        return [str(path) for path in _written(file, edited, out)]
-    if not in_place:
-        return []
-    changed = file.replaced(edited)
-    for path, data in changed.items():
-        replace_file(path, data)
-    return [str(path) for path in changed]
 
 
 def _written(file: ModelFile, edited: Edited, out: Path) -> list[Path]:

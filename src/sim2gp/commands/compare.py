@@ -11,7 +11,6 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -21,6 +20,7 @@ import numpy as np
 from sim2gp.belief import AbstractModel
 from sim2gp.commands.compare_summary import Held, summarise
 from sim2gp.commands.evaluate import check_horizon, windows_for
+from sim2gp.commands.result import AbstractResult
 from sim2gp.data.grid import CURVE, PERIOD, Grid
 from sim2gp.data.logs import Log, note_lines
 from sim2gp.data.one_step_log import (
@@ -44,10 +44,11 @@ from sim2gp.inference.estimate import Estimate
 from sim2gp.models import NLM, FunctionSpace, Residual, ResidualFunctionSpace, Sim2GP
 from sim2gp.models.auto import log_scores
 from sim2gp.models.ensemble import ensemble
-from sim2gp.project import Project
+from sim2gp.project import Project, project_and_logs
+from sim2gp.project.in_memory import Logs
 from sim2gp.project.training_windows import cut_logs
-from sim2gp.runs import Progress, new_run
-from sim2gp.runs.provenance import command, provenance
+from sim2gp.runs import Progress
+from sim2gp.runs.provenance import provenance
 from sim2gp.systems.assemble import carrying_inputs
 from sim2gp.systems.base import AbstractSystem
 
@@ -103,26 +104,44 @@ class Setup:
     reach: dict[str, float]
 
 
-def run(
-    project: Project,
-    logs: Sequence[Log],
+@dataclass(frozen=True, repr=False)
+class Comparison(AbstractResult):
+    """Which model predicts recordings that it has not seen."""
+
+    @property
+    def best(self) -> str:
+        """The model that the logs support."""
+        return str(self.summary["best"])
+
+    @property
+    def models(self) -> dict[str, dict[str, Any]]:
+        """Of each model its held-out errors and log density, as in ``summary.json``."""
+        return dict(self.summary["models"])
+
+
+def compare(
+    machine: Project | AbstractSystem,
+    logs: Logs | None = None,
     *,
-    out: Path,
-    seed: int,
-    progress: Progress,
     horizons: Sequence[float] = HORIZONS,
     models: Learners = MODELS,
-) -> dict[str, Any]:
-    """Fit, train and judge all models fold by fold; writes and returns the summary.
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Comparison:
+    """Fit, train and judge all models fold by fold, at open-loop ``horizons`` in s.
 
-    ``models`` are given from simple to complex, the simulator first.
+    ``logs`` None are the project's own. ``models`` are given from simple to complex,
+    the simulator first; ``seed`` draws networks and forecasts. Raises `InputError` E103
+    for a position that no log measures, E116 for too short logs, E160 for several
+    configurations.
     """
     started = time.perf_counter()
     for horizon in horizons:
         check_horizon(horizon)
+    project, logs = project_and_logs(machine, logs, alike=True)
     setup, folds = prepare(project, logs, horizons)
     total = len(folds) * len(models) + 1
-    with new_run(out, "compare") as writer, progress.task("compare", total) as task:
+    with (progress or Progress()).task("compare", total) as task:
         key = jax.random.key(seed)
         parts = []
         for number, left in enumerate(folds):
@@ -130,39 +149,31 @@ def run(
             parts.append(fold(setup, left, models, fold_key, task.advance))
         whole = _fit(setup, [], jax.random.fold_in(key, len(folds)))
         task.advance("evidence")
-        names = channels(project.system, setup.windows)
-        units = {c.name: c.unit for c in project.system.physical_states}
-        summary, arrays = summarise(
-            parts,
-            {name: learner.what for name, learner in models.items()},
-            names,
-            setup.logs,
-            np.asarray(setup.steps.steps) * setup.period,
-            setup.horizons,
-            np.random.default_rng(seed),
-            units,
-        )
-        summary["models"]["SIM2GP"]["log_evidence"] = float(whole.log_evidence)
-        asked = "--horizon", *(f"{h:g}" for h in horizons), "--seed", seed
-        line = command("sim2gp", "compare", project.path, *asked, "--out", out)
-        summary |= {
-            "command": "compare",
-            "title": f"{project.name}: which model its logs support",
-            "seed": seed,
-            "period": setup.period,
-            "folds": len(folds),
-            "n_logs": len(set(recordings(setup.logs))),
-            "n_transitions": len(setup.samples.first),
-            "units": units,
-        }
-        summary["warnings"] += note_lines(setup.logs)
-        summary |= provenance(line, started)
-        from sim2gp.reports import write_report
-
-        writer.write_summary(summary)
-        writer.write_arrays("arrays.npz", arrays)
-        writer.write_text("report.html", write_report(summary, arrays))
-    return summary
+    names = channels(project.system, setup.windows)
+    units = {c.name: c.unit for c in project.system.physical_states}
+    summary, arrays = summarise(
+        parts,
+        {name: learner.what for name, learner in models.items()},
+        names,
+        setup.logs,
+        np.asarray(setup.steps.steps) * setup.period,
+        setup.horizons,
+        np.random.default_rng(seed),
+        units,
+    )
+    summary["models"]["SIM2GP"]["log_evidence"] = float(whole.log_evidence)
+    summary |= {
+        "command": "compare",
+        "title": f"{project.name}: which model its logs support",
+        "seed": seed,
+        "period": setup.period,
+        "folds": len(folds),
+        "n_logs": len(set(recordings(setup.logs))),
+        "n_transitions": len(setup.samples.first),
+        "units": units,
+    }
+    summary["warnings"] += note_lines(setup.logs)
+    return Comparison(summary | provenance(started), arrays)
 
 
 def prepare(

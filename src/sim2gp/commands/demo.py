@@ -9,13 +9,13 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
 
 from sim2gp.belief import AbstractModel
+from sim2gp.commands.result import AbstractResult
 from sim2gp.data.one_step import OneStepLikelihood
 from sim2gp.data.transitions import Transitions
 from sim2gp.identification import diagnose
@@ -25,8 +25,9 @@ from sim2gp.planning import MPC
 from sim2gp.planning.loop import Episode, History, psrl
 from sim2gp.planning.oracle import AcceptedTruth, accept_truth
 from sim2gp.planning.tasks import MACHINES, Task, episodes_to_95, hanging_return, score
-from sim2gp.runs import Progress, new_run, sinks
+from sim2gp.runs import Progress
 from sim2gp.runs.provenance import provenance
+from sim2gp.runs.sinks import Nowhere, Sink, each_episode
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import Key
 
@@ -51,20 +52,37 @@ class SeedRun:
         return episodes_to_95(self.histories[method].returns, self.hang, self.oracle)
 
 
-def run(
-    *,
-    out: Path,
-    machine: str,
-    seed: int,
-    seeds: int,
-    episodes: int,
-    truth: str,
-    progress: Progress,
-    log_to: str | None = None,
-) -> dict[str, Any]:
-    """Fly ``seeds`` machines and write the run; returns its summary.
+@dataclass(frozen=True, repr=False)
+class Demonstration(AbstractResult):
+    """What learners made of machines whose constants they did not know."""
 
-    ``log_to`` is one of `sinks.KINDS`: where every episode's numbers go at once.
+    @property
+    def returns(self) -> dict[str, np.ndarray]:
+        """Of each learner, by seed and episode."""
+        start = "returns/"
+        return {k.removeprefix(start): v for k, v in self.arrays.items() if start in k}
+
+    @property
+    def scores(self) -> dict[str, np.ndarray]:
+        """The same as scores: 1 is the oracle's, 0 a pole left hanging."""
+        start = "scores/"
+        return {k.removeprefix(start): v for k, v in self.arrays.items() if start in k}
+
+
+def demo(
+    *,
+    machine: Literal["furuta", "cartpole"] = "furuta",
+    seed: int = 0,
+    seeds: int = 1,
+    episodes: int = 3,
+    truth: Literal["prior", "2sd", "3sd", "outside"] = "prior",
+    sink: Sink | None = None,
+    progress: Progress | None = None,
+) -> Demonstration:
+    """Swing up ``seeds`` pendulums, each in so many ``episodes`` of 5 s.
+
+    ``truth`` are the hidden constants: as believed, so far off, or beyond their bounds.
+    ``sink`` (`sim2gp.sinks`) gets every episode's numbers at once.
     """
     started = time.perf_counter()
     make, preset = MACHINES[machine]
@@ -75,36 +93,21 @@ def run(
         "point estimate": PointEstimate(model),
         "prior mean": PriorMean(model),
     }
-    parts = 1 + len(learners) * episodes
-    runs = []
-    asked = {"machine": machine, "seed": seed, "seeds": seeds, "episodes": episodes}
-    with (
-        new_run(out, "demo") as writer,
-        sinks.opened(log_to, out, asked | {"truth": truth}) as sink,
-    ):
-        with progress.task("demo", seeds * parts) as task:
-            for s in range(seed, seed + seeds):
-                key = jax.random.key(s)
-                accepted = accept_truth(preset, system, MPC(), key=key, truth=truth)
-                oracle = accepted.oracle.oracle_return
-                task.advance(f"seed {s}: oracle {oracle:.0f}")
-                sink.scalars(0, {f"seed {s}/oracle/return": oracle})
-                told = partial(_told, task.advance, sink, s)
-                histories = _race(accepted.task, learners, episodes, key, told)
-                runs.append(SeedRun(accepted, hanging_return(accepted.task), histories))
-        summary, arrays = _summarise(system, machine, runs, seed, episodes)
-        summary["truth"] = truth
-        summary |= provenance(
-            f"sim2gp demo --machine {machine} --seed {seed} --seeds {seeds} "
-            f"--episodes {episodes} --truth {truth}",
-            started,
-        )
-        from sim2gp.reports import write_report
-
-        writer.write_summary(summary)
-        writer.write_arrays("arrays.npz", arrays)
-        writer.write_text("report.html", write_report(summary, arrays))
-    return summary
+    parts, runs = 1 + len(learners) * episodes, []
+    sink = sink or Nowhere()
+    with (progress or Progress()).task("demo", seeds * parts) as task:
+        for s in range(seed, seed + seeds):
+            key = jax.random.key(s)
+            accepted = accept_truth(preset, system, MPC(), key=key, truth=truth)
+            oracle = accepted.oracle.oracle_return
+            task.advance(f"seed {s}: oracle {oracle:.0f}")
+            sink.scalars(0, {f"seed {s}/oracle/return": oracle})
+            told = partial(_told, task.advance, sink, s)
+            histories = _race(accepted.task, learners, episodes, key, told)
+            runs.append(SeedRun(accepted, hanging_return(accepted.task), histories))
+    summary, arrays = _summarise(system, machine, runs, seed, episodes)
+    summary["truth"] = truth
+    return Demonstration(summary | provenance(started), arrays)
 
 
 def _race(
@@ -124,10 +127,10 @@ def _race(
 
 
 def _told(
-    advance: Callable[[str], None], sink: sinks.Sink, seed: int, name: str
+    advance: Callable[[str], None], sink: Sink, seed: int, name: str
 ) -> Callable[[Episode], None]:
     """Who hears of a learner's episodes: the bar, and wherever numbers go."""
-    write = sinks.each_episode(sink, f"seed {seed}/{name}")
+    write = each_episode(sink, f"seed {seed}/{name}")
 
     def tell(episode: Episode) -> None:
         total = float(episode.trajectory.total)

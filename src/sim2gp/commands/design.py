@@ -8,15 +8,16 @@ Information is counted from the plain one, because data do not reduce a model's 
 
 import io
 import time
-from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sim2gp.commands.identification import Identified, used
+from sim2gp.commands.identification import Identification, used
+from sim2gp.commands.result import AbstractResult
 from sim2gp.errors import InputError
 from sim2gp.experiment_design import (
     AbstractGoal,
@@ -25,15 +26,21 @@ from sim2gp.experiment_design import (
     Everything,
     Experiment,
     Free,
-    Limits,
+    LimitBox,
     Multisine,
     Named,
     Prediction,
-    design,
     prediction_rows,
 )
+from sim2gp.experiment_design import design as search
 from sim2gp.experiment_design.limits import SLOW, servo_rates
-from sim2gp.experiment_design.verdict import Asked, expected_table, foretold, verdict
+from sim2gp.experiment_design.verdict import (
+    Asked,
+    Limits,
+    expected_table,
+    foretold,
+    verdict,
+)
 from sim2gp.identification.forecasts.prediction import units
 from sim2gp.identification.identifiability.table import physical_moments
 from sim2gp.inference.parameters import unknown_parameter
@@ -41,8 +48,8 @@ from sim2gp.inference.prior import ParameterPrior
 from sim2gp.models.features import Encoding
 from sim2gp.models.sim2gp import PRIOR_NOISE
 from sim2gp.project import Project
-from sim2gp.runs import Progress, new_run
-from sim2gp.runs.provenance import command, provenance
+from sim2gp.runs import Progress
+from sim2gp.runs.provenance import provenance
 from sim2gp.systems import one_variant
 from sim2gp.systems.base import AbstractSystem, index_of
 from sim2gp.types import in_float64
@@ -53,68 +60,117 @@ WINDOW = 0.2  # s, where the likelihood has windows of one step
 LOOSE = 1.0  # rad, m, rad/s or m/s: the sd of a window's start where none is stated
 
 
-def run(
-    source: Project | Identified,
-    asked: Asked,
+@dataclass(frozen=True, repr=False)
+class NextExperiment(AbstractResult):
+    """Commands for the machine, what it should do, and what that should tell.
+
+    ``save("next.csv")`` writes the commands alone.
+    """
+
+    @property
+    def commands(self) -> dict[str, np.ndarray]:
+        """``time`` (s) and each input, in its unit, a number for each period."""
+        start = "design/command/"
+        named = {
+            name.removeprefix(start): values
+            for name, values in self.arrays.items()
+            if name.startswith(start)
+        }
+        return {"time": self.arrays["design/time"][:-1], **named}
+
+    @property
+    def expected_sd(self) -> dict[str, float]:
+        """Of each constant after the experiment, in its unit (plain)."""
+        table = self.summary["expected_sd"]
+        return {name: float(entry["expected_sd"]) for name, entry in table.items()}
+
+    @property
+    def worth_running(self) -> bool:
+        """Whether it should narrow what is asked enough to be worth the time."""
+        return bool(self.summary["worth_running"])
+
+
+def design(
+    source: Identification | Project,
     *,
-    out: Path,
-    seed: int,
-    progress: Progress,
-) -> dict[str, Any]:
-    """Choose the commands and write them; returns the summary.
+    limits: Limits | None = None,
+    seconds: float = 10.0,
+    kind: Literal["free", "multisine"] = "free",
+    about: Sequence[str] = (),
+    predict: float | None = None,
+    within: float = 2.0,
+    start: Mapping[str, float] | None = None,
+    period: float | None = None,
+    starts: int = 1,
+    configuration: str | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> NextExperiment:
+    """The next experiment on a machine: its commands, and what it should tell.
+
+    source: what is known, or a project file's priors, where there is no log yet.
+    limits: of inputs, states and rates, in addition to the project's.
+    seconds: the duration; kind: the family of the commands.
+    about: constants to learn, all if none; predict: learn what predictions so many s
+        ahead depend on; within: percent that is known well enough.
+    start: where the machine rests before (0); period: of commands, s (the logs').
+    starts: random motions that are improved; seed: draws machines and motions.
 
     Raises `InputError`: E145 for an unknown constant, E103 for an unknown channel, E150
     where the limits admit no motion, E151 for a duration shorter than a step.
     """
-    started = time.perf_counter()
-    with new_run(out, "design") as writer, progress.task("design", 3) as task:
+    began = time.perf_counter()
+    asked = Asked(
+        seconds, kind, tuple(about), predict, within, limits or Limits(),
+        start or {}, period, starts, configuration,
+    )  # fmt: skip
+    with (progress or Progress()).task("design", 2) as task:
         project, experiment, notes = setting(source, asked)
-        stated = {
-            name: (low, high) for name, (low, high) in project.spec.limits.items()
-        }
-        rates = dict(project.spec.rates) | dict(asked.rates)
-        slow = servo_rates(experiment.system)
-        if slow.keys() - rates.keys():
-            notes.append(
-                f"no rate is stated of some targets of servos: they cross their range "
-                f"in {SLOW:g} s or more"
-            )
-        limits = Limits.of(
-            experiment.system,
-            stated | dict(asked.limits),
-            slow | rates,
-            start=np.asarray(experiment.start),
-        )
-        if not limits.stated():
-            notes.append("no limit of any position or velocity is stated")
+        box = _box(project, experiment, asked.limits, notes)
         key = jax.random.key(seed)
         signal = signal_of(asked.kind, experiment)
-        goal = goal_of(asked, experiment, limits, jax.random.fold_in(key, 1))
+        goal = goal_of(asked, experiment, box, jax.random.fold_in(key, 1))
         task.advance("limits and goal")
-        found = design(experiment, goal, limits, signal, key=key, starts=asked.starts)
+        found = search(experiment, goal, box, signal, key=key, starts=asked.starts)
         task.advance(f"{found.nats:.1f} nats")
-        place = source.path if isinstance(source, Project) else source.run
-        summary = _summarise(place, asked, experiment, goal, found, seed)
-        summary["warnings"] = notes
-        if isinstance(source, Identified):
-            summary |= widths(source)
-        line = command("sim2gp", "design", place, *asked.words().split())
-        line += " " + command("--seed", seed, "--out", out)
-        summary |= provenance(line, started)
-        arrays = _arrays(experiment, limits, found)
-        from sim2gp.reports import write_report
+    name = source.name
+    summary = _summarise(name, asked, experiment, goal, found, seed)
+    summary["warnings"] = notes
+    if isinstance(source, Identification):
+        summary |= widths(source)
+    return NextExperiment(
+        summary | provenance(began),
+        _arrays(experiment, box, found),
+        {FILE: as_csv(experiment, found)},
+    )
 
-        writer.write_summary(summary)
-        writer.write_arrays("arrays.npz", arrays)
-        writer.write_text(FILE, as_csv(experiment, found))
-        writer.write_text("report.html", write_report(summary, arrays))
-        task.advance("report")
-    return summary
+
+def _box(
+    project: Project, experiment: Experiment, limits: Limits, notes: list[str]
+) -> LimitBox:
+    """The project's limits and those asked for; ``notes`` gets what is not stated."""
+    stated = {name: (low, high) for name, (low, high) in project.spec.limits.items()}
+    rates = dict(project.spec.rates) | limits.rates
+    slow = servo_rates(experiment.system)
+    if slow.keys() - rates.keys():
+        notes.append(
+            f"no rate is stated of some targets of servos: they cross their range "
+            f"in {SLOW:g} s or more"
+        )
+    box = LimitBox.of(
+        experiment.system,
+        stated | limits.boxes,
+        slow | rates,
+        start=np.asarray(experiment.start),
+    )
+    if not box.stated():
+        notes.append("no limit of any position or velocity is stated")
+    return box
 
 
 @in_float64
 def setting(
-    source: Project | Identified, asked: Asked
+    source: Project | Identification, asked: Asked
 ) -> tuple[Project, Experiment, list[str]]:
     """The machine and what is believed of it; what the user should know of both."""
     notes: list[str] = []
@@ -126,8 +182,10 @@ def setting(
         noise, period = _stated_noise(project, names), PERIOD
         notes.append("no log was used: what is believed is the project's priors")
     else:
-        project, joint, belief = source.project, source.project.system, source.plain
-        names, noise, period = source.outputs, source.noise, source.period
+        assert source.project is not None
+        project, joint, belief = source.project, source.machine, source.plain
+        names, noise = list(source.noise), list(source.noise.values())
+        period = source.period
         _, corrected = one_variant(joint, source.posterior, asked.configuration)
     system, belief = one_variant(joint, belief, asked.configuration)
     states = [channel.name for channel in system.physical_states]
@@ -162,10 +220,10 @@ def setting(
     return project, experiment, notes
 
 
-def widths(fit: Identified) -> dict[str, Any]:
+def widths(fit: Identification) -> dict[str, Any]:
     """Which of an identification's two posteriors was used for what."""
     return used(fit.summary, "corrected") | {
-        "posterior": "Limits of the states and the expected motion are those of the "
+        "posterior": "LimitBox of the states and the expected motion are those of the "
         "corrected posterior, information and expected sd those of the plain one"
     }
 
@@ -177,7 +235,7 @@ def signal_of(kind: str, experiment: Experiment) -> AbstractSignal:
 
 
 def goal_of(
-    asked: Asked, experiment: Experiment, limits: Limits, key: jax.Array
+    asked: Asked, experiment: Experiment, limits: LimitBox, key: jax.Array
 ) -> AbstractGoal:
     """What is asked about: all constants, some, or a prediction."""
     names = experiment.system.parameters.names
@@ -244,7 +302,7 @@ def expectation(experiment: Experiment, found: Designed) -> dict[str, dict[str, 
 
 @in_float64
 def _summarise(
-    place: Path,
+    name: str,
     asked: Asked,
     experiment: Experiment,
     goal: AbstractGoal,
@@ -265,7 +323,7 @@ def _summarise(
         worth, reason = foretold(asked, ahead, found.nats)
     return {
         "command": "design",
-        "title": f"{place.stem}: the next experiment",
+        "title": f"{name}: the next experiment",
         "headline": reason,
         "seed": seed,
         "trajectory": FILE,
@@ -283,7 +341,7 @@ def _summarise(
 
 
 def _arrays(
-    experiment: Experiment, limits: Limits, found: Designed
+    experiment: Experiment, limits: LimitBox, found: Designed
 ) -> dict[str, np.ndarray]:
     system = experiment.system
     arrays = {

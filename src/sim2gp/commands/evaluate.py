@@ -1,22 +1,22 @@
 """Evaluate: how well does a fit predict what it was not shown, and does it know?
 
-`run` holds a finished identification against other logs; `leave_one_out` fits all of a
-project's logs but one and predicts that one, in turn. The protocol is that of
+A finished identification is held against other logs, or all of a project's logs but one
+are fitted and that one is predicted, in turn. The protocol is that of
 `sim2gp.data.grid`; the bands are those of `identification.forecasts.forecast`, fitted
 to the training logs alone.
 """
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import jax
 import numpy as np
 
 from sim2gp.commands.folds import fold, without
-from sim2gp.commands.identification import Identified, stood
+from sim2gp.commands.identification import Identification
+from sim2gp.commands.result import AbstractResult, numbers
 from sim2gp.data.grid import CURVE, Grid, evaluation_windows, steps_of
 from sim2gp.data.logs import Log, Note, note_lines, shared_rows
 from sim2gp.data.windows import Windows
@@ -40,32 +40,80 @@ from sim2gp.identification.forecasts.prediction import (
     units,
 )
 from sim2gp.inference.gaussian import Gaussian
-from sim2gp.project import Project
+from sim2gp.project import Project, project_and_logs
+from sim2gp.project.in_memory import Logs, as_logs
 from sim2gp.project.training_windows import cut_logs
 from sim2gp.reports.motion import film
-from sim2gp.runs import Progress, new_run
-from sim2gp.runs.provenance import command, provenance
+from sim2gp.runs import Progress
+from sim2gp.runs.provenance import provenance
+from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import in_float64
 
 
-def run(
-    fit: Identified,
-    tested: Sequence[Log],
-    *,
-    files: Sequence[Path],
-    horizon: float,
-    out: Path,
-    progress: Progress,
-    configuration: str | None = None,
-) -> dict[str, Any]:
-    """Predict logs by an identify run; writes and returns the summary.
+@dataclass(frozen=True, repr=False)
+class Evaluation(AbstractResult):
+    """How well logs were forecast that a fit had not seen, at one horizon (s)."""
 
-    They were read from ``files``, as `Identified.read` does for a ``configuration``.
+    @property
+    def rmse(self) -> dict[str, float]:
+        """Root mean square error of open-loop forecasts, by channel in its unit."""
+        return numbers(self.summary["open_loop_rmse"])
+
+    @property
+    def hold_rmse(self) -> dict[str, float]:
+        """The same of the measured start, predicted to stay."""
+        return numbers(self.summary["hold_rmse"])
+
+    @property
+    def regression_rmse(self) -> dict[str, float]:
+        """The same of a linear regression; empty if it had too few windows."""
+        return numbers(self.summary.get("regression_rmse"))
+
+    @property
+    def coverage90(self) -> dict[str, float]:
+        """The share of samples inside 90 % bands, by channel."""
+        return numbers(self.summary["coverage90"])
+
+
+def evaluate(
+    fit: Identification | Project | AbstractSystem,
+    logs: Logs | None = None,
+    *,
+    horizon: float = 0.2,
+    progress: Progress | None = None,
+) -> Evaluation:
+    """Open-loop forecasts over ``horizon`` s of logs that a fit has not seen.
+
+    Of an identification the ``logs`` are forecast. Of a project, or of a machine and
+    its logs, all recordings but one are fitted and that one is forecast, in turn.
+    Raises `InputError` E116 where no log is as long as the horizon, E160.
     """
-    started = time.perf_counter()
     check_horizon(horizon)
-    found, system = fit.project, fit.project.system
-    with new_run(out, "evaluate") as writer, progress.task("evaluate", 2) as task:
+    progress = progress or Progress()
+    if not isinstance(fit, Identification):
+        return _leave_one_out(*project_and_logs(fit, logs), horizon, progress)
+    if logs is None:
+        raise InputError(
+            "E160",
+            "no logs",
+            where="logs",
+            got="an identification alone",
+            expected="the logs to forecast",
+            fix="evaluate(found, logs), or evaluate(project) to leave out its own",
+        )
+    assert fit.project is not None
+    return _forecast(fit, as_logs(fit.project, logs), horizon, progress)
+
+
+def _forecast(
+    fit: Identification, tested: Sequence[Log], horizon: float, progress: Progress
+) -> Evaluation:
+    """Logs predicted by a fit of others."""
+    started = time.perf_counter()
+    found = fit.project
+    assert found is not None
+    system = found.system
+    with progress.task("evaluate", 1) as task:
         rows, longest = rows_for(horizon), max(horizon, CURVE[-1])
         grid = windows_for(tested, found, longest, horizon)
         result = predicted(system, fit.plain, grid, horizon)
@@ -75,47 +123,33 @@ def run(
             known = evaluation_windows(train, system, longest=longest)
             linear = regression_errors(known, grid, rows)
         task.advance("forecasts")
-        names = channels(system, grid.windows)
-        whole = judged(rows, grid, result, fit.band, linear)
-        summary, arrays = scores(whole, names, tested, horizon)
-        summary["calibration"], shares = calibration(whole, names, tested, horizon)
-        arrays |= shares
-        picture = drawn(result, fit.band, grid)
-        arrays |= trace_arrays(picture, grid, tested, names)
-        notes = note_lines(tested, shared_rows(train or (), tested))
-        if train is None:
-            notes.append("the training logs were not found: no regression to compare")
-        about, moves = film(
-            system, fit.plain, picture, grid, tested,
-            "Forecasts over what was recorded",
-        )  # fmt: skip
-        if about:
-            summary["animation"] = about
-            arrays |= moves
-        asked = ["--logs", *files, "--horizon", f"{horizon:g}", "--out", out]
-        asked += ["--configuration", configuration] if configuration else []
-        line = command("sim2gp", "evaluate", fit.run, *asked)
-        summary |= {
-            "command": "evaluate",
-            "title": f"{fit.run.name}: prediction of logs it was not fitted to",
-            "warnings": notes,
-        }
-        _write(writer, summary, arrays, found, line, started)
-        task.advance("report")
-    return summary
+    names = channels(system, grid.windows)
+    whole = judged(rows, grid, result, fit.band, linear)
+    summary, arrays = scores(whole, names, tested, horizon)
+    summary["calibration"], shares = calibration(whole, names, tested, horizon)
+    picture = drawn(result, fit.band, grid)
+    arrays |= shares | trace_arrays(picture, grid, tested, names)
+    notes = note_lines(tested, shared_rows(train or (), tested))
+    if train is None:
+        notes.append("the training logs were not found: no regression to compare")
+    title = "Forecasts over what was recorded"
+    about, moves = film(system, fit.plain, picture, grid, tested, title)
+    if about:
+        summary["animation"] = about
+        arrays |= moves
+    summary |= {
+        "command": "evaluate",
+        "title": f"{fit.name}: prediction of logs it was not fitted to",
+        "warnings": notes,
+    }
+    return _evaluation(summary, arrays, found, started)
 
 
-def leave_one_out(
-    project: Project,
-    logs: Sequence[Log],
-    *,
-    horizon: float,
-    out: Path,
-    progress: Progress,
-) -> dict[str, Any]:
-    """Fit all recordings but one, predict that one, in turn; writes the summary."""
+def _leave_one_out(
+    project: Project, logs: Sequence[Log], horizon: float, progress: Progress
+) -> Evaluation:
+    """Each recording predicted by a fit of the others."""
     started = time.perf_counter()
-    check_horizon(horizon)
     files = list(dict.fromkeys(recordings(logs)))
     if len(files) < 2:
         raise InputError(
@@ -126,7 +160,7 @@ def leave_one_out(
             expected="at least two files",
             fix="record once more, or identify and evaluate RUN --logs",
         )
-    with new_run(out, "evaluate") as writer, progress.task("logs", len(files)) as task:
+    with progress.task("logs", len(files)) as task:
         windows, of = cut_logs(project, logs)
         grid = windows_for(logs, project, max(horizon, CURVE[-1]), horizon)
         names = channels(project.system, windows)
@@ -142,21 +176,18 @@ def leave_one_out(
             arrays |= traced
             constants.append(values)
             task.advance(f"without {logs[left[0]].name}")
-        whole = joined(parts)
-        summary, curves = scores(whole, names, logs, horizon)
-        summary["calibration"], shares = calibration(whole, names, logs, horizon)
-        arrays |= shares
-        summary["tables"].append(_constants_table(project, files, logs, constants))
-        summary |= {
-            "command": "evaluate",
-            "title": f"{project.name}: each log predicted by a fit of the others",
-            "folds": len(files),
-            "warnings": note_lines(logs, _repeated(logs, files)),
-        }
-        asked = "--horizon", f"{horizon:g}", "--out", out
-        line = command("sim2gp", "evaluate", project.path, *asked)
-        _write(writer, summary, curves | arrays, project, line, started)
-    return summary
+    whole = joined(parts)
+    summary, curves = scores(whole, names, logs, horizon)
+    summary["calibration"], shares = calibration(whole, names, logs, horizon)
+    arrays |= shares
+    summary["tables"].append(_constants_table(project, files, logs, constants))
+    summary |= {
+        "command": "evaluate",
+        "title": f"{project.name}: each log predicted by a fit of the others",
+        "folds": len(files),
+        "warnings": note_lines(logs, _repeated(logs, files)),
+    }
+    return _evaluation(summary, curves | arrays, project, started)
 
 
 def _fold(
@@ -230,10 +261,10 @@ def _repeated(logs: Sequence[Log], files: Sequence[str]) -> list[Note]:
     return notes
 
 
-def _training(fit: Identified) -> tuple[Log, ...] | None:
+def _training(fit: Identification) -> tuple[Log, ...] | None:
     """The logs that a run was fitted to, where they still stand."""
     try:
-        return replace(fit.project, path=stood(fit.run, fit.summary)).load_logs()
+        return fit.training_logs()
     except InputError:
         return None
 
@@ -251,15 +282,13 @@ def check_horizon(horizon: float) -> None:
         )
 
 
-def _write(
-    writer: Any,
+def _evaluation(
     summary: dict[str, Any],
     arrays: dict[str, np.ndarray],
     project: Project,
-    line: str,
     started: float,
-) -> None:
-    """Headline, report and files of a run."""
+) -> Evaluation:
+    """The result with its headline."""
     unit = units(project.system)
     summary["headline"] = forecast_sentence(
         f"Open-loop error at {summary['horizon']:g} s",
@@ -275,9 +304,4 @@ def _write(
         "Forecasts of half a second from causal starts, of logs that the fit has not "
         "seen; they know the recorded inputs and nothing else of the future."
     )
-    summary |= provenance(line, started)
-    from sim2gp.reports import write_report
-
-    writer.write_summary(summary)
-    writer.write_arrays("arrays.npz", arrays)
-    writer.write_text("report.html", write_report(summary, arrays))
+    return Evaluation(summary | provenance(started), arrays)

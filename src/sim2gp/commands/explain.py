@@ -7,115 +7,128 @@ answer is one of three: nothing, an effect, or none of these.
 
 import dataclasses
 import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sim2gp.commands.identification import PROJECT, project_of, stood
-from sim2gp.data.logs import Budget
+from sim2gp.commands.demo import Demonstration
+from sim2gp.commands.identification import Identification, project_of
+from sim2gp.commands.result import PROJECT, AbstractResult
+from sim2gp.data.logs import Budget, Log
 from sim2gp.errors import InputError
 from sim2gp.identification.missing_physics.data import (
     AbstractData,
     OneStepData,
     WindowData,
 )
-from sim2gp.identification.missing_physics.explain import explain
+from sim2gp.identification.missing_physics.explain import explain as search_missing
 from sim2gp.identification.missing_physics.words import candidate_rows, headline, table
 from sim2gp.planning.tasks import MACHINES
 from sim2gp.project import Project, load_project
 from sim2gp.project.amend import amend
 from sim2gp.project.training_windows import cut_logs
-from sim2gp.runs import Progress, load_run, new_run
-from sim2gp.runs.provenance import command, provenance
-from sim2gp.runs.store import Run
+from sim2gp.runs import Progress, load_run
+from sim2gp.runs.provenance import provenance
+from sim2gp.systems.effects.registry import Candidate
 
 SHARED_SECOND = 1.0  # s of windows whose errors may be correlated
 
 
-def run(
-    run: Path,
-    *,
-    add: bool,
-    out: Path,
-    progress: Progress,
-    strict: bool = False,
-    budget: Budget | None = None,
-) -> dict[str, Any]:
-    """Search what the run's machine lacks, write and return the summary.
+@dataclass(frozen=True, repr=False)
+class MissingPhysics(AbstractResult):
+    """What a simulator lacks: nothing, an effect of the library, or none of these."""
 
-    ``add`` writes the winner into the project file; ``budget`` is what reading one of
-    the run's logs may take. Raises `InputError` E130 for a run
-    of another command, E160 where there is no project file to add to.
+    winner: Candidate | None = field(default=None)
+
+    @property
+    def answer(self) -> str:
+        """ "nothing missing", "missing" or "none of these"."""
+        return str(self.summary["answer"])
+
+    @property
+    def best(self) -> str | None:
+        """The missing effect, where the answer names one."""
+        found = self.summary["best"]
+        return None if found is None else str(found)
+
+    @property
+    def candidates(self) -> list[dict[str, Any]]:
+        """Every effect that was scored, with its evidence gain and its size."""
+        return list(self.summary["candidates"])
+
+    def add_to(self, file: Path) -> "MissingPhysics":
+        """Write the winner into a project file; what was added stands in the summary.
+
+        The file is left alone where the answer names no effect.
+        """
+        notes = list(self.summary["warnings"])
+        if self.winner is None:
+            notes.append(f"nothing was added to {file}: {self.answer}")
+            return self.with_entries(warnings=notes)
+        gain = max(row["evidence_gain"] for row in self.candidates)
+        amend(
+            file,
+            self.winner,
+            f"added by sim2gp explain: {gain:.0f} nats of evidence",
+        )
+        return self.with_entries(added=str(file))
+
+
+def explain(
+    run: Identification | Demonstration, *, progress: Progress | None = None
+) -> MissingPhysics:
+    """Search what the run's machine lacks.
+
+    Every effect of the library is scored, the best few are fitted. Raises `InputError`
+    E130 for a run of another command, and what reading the run's logs raises.
     """
     started = time.perf_counter()
-    stored = load_run(run)
-    file = _project_file(run, stored, add)
-    data = _data(run, stored, strict, budget)
-    with new_run(out, "explain") as writer, progress.task("explain", 5) as task:
-        found = explain(data, on_step=task.advance)
-        candidates = candidate_rows(found)
-        summary: dict[str, Any] = {
-            "command": "explain",
-            "title": f"{run.name}: what its simulator lacks",
-            "headline": headline(found),
-            "answer": found.answer,
-            "best": found.effect,
-            "none_of_these": found.answer == "none of these",
-            "threshold": found.search.threshold,
-            "candidates": candidates,
-            "misfit": None if found.best is None else found.best.as_dict(),
-            "misfit_as_it_is": None if found.bare is None else found.bare.as_dict(),
-            "log_evidence": float(found.search.bare.log_evidence),
-            "added": None,
-            "warnings": [f"no fit with {name}" for name in found.search.failed],
-            "tables": [table(found, candidates)],
-        }
-        line = command("sim2gp", "explain", run, "--add" * add, "--out", out)
-        summary |= provenance(line, started)
-        best = found.search.best
-        if add and file is not None:
-            if found.effect is None or best is None:
-                note = f"nothing was added to {file}: {found.answer}"
-                summary["warnings"].append(note)
-            else:
-                note = f"added by sim2gp explain: {best.gain:.0f} nats of evidence"
-                amend(file, best.scored.candidate, note)
-                summary["added"] = str(file)
-        from sim2gp.reports import write_report
-
-        gains = np.asarray([s.gain for s in found.search.scored])
-        names = np.asarray([s.candidate.name for s in found.search.scored])
-        arrays = {"explain/gain": gains, "explain/name": names}
-        writer.write_summary(summary)
-        writer.write_arrays("arrays.npz", arrays)
-        writer.write_text("report.html", write_report(summary, arrays))
-    return summary
-
-
-def _data(
-    run: Path, stored: Run, strict: bool = False, budget: Budget | None = None
-) -> AbstractData:
-    """The rows of a run, with their likelihood."""
-    if (run / PROJECT).exists():
-        seed = int(stored.summary.get("seed", 0))
-        project = dataclasses.replace(_project(run, stored), budget=budget or Budget())
-        return window_data(project, seed, strict=strict)
-    if "animation/state" in stored.arrays and "machine" in stored.summary:
-        return _flown(stored)
-    raise InputError(
-        "E130",
-        "nothing to explain",
-        where=str(run),
-        got=str(stored.summary.get("command", "a run without data")),
-        expected="the folder of sim2gp identify or sim2gp demo",
-        fix="run one of them first",
+    data = _data(run)
+    with (progress or Progress()).task("explain", 4) as task:
+        found = search_missing(data, on_step=task.advance)
+    candidates = candidate_rows(found)
+    best = found.search.best
+    gains = np.asarray([s.gain for s in found.search.scored])
+    names = np.asarray([s.candidate.name for s in found.search.scored])
+    summary: dict[str, Any] = {
+        "command": "explain",
+        "title": f"{run.name}: what its simulator lacks",
+        "headline": headline(found),
+        "answer": found.answer,
+        "best": found.effect,
+        "none_of_these": found.answer == "none of these",
+        "threshold": found.search.threshold,
+        "candidates": candidates,
+        "misfit": None if found.best is None else found.best.as_dict(),
+        "misfit_as_it_is": None if found.bare is None else found.bare.as_dict(),
+        "log_evidence": float(found.search.bare.log_evidence),
+        "added": None,
+        "warnings": [f"no fit with {name}" for name in found.search.failed],
+        "tables": [table(found, candidates)],
+    }
+    return MissingPhysics(
+        summary | provenance(started),
+        {"explain/gain": gains, "explain/name": names},
+        winner=best.scored.candidate if best and found.effect else None,
     )
 
 
-def window_data(project: Project, seed: int = 0, *, strict: bool = False) -> WindowData:
+def _data(run: Identification | Demonstration) -> AbstractData:
+    """The rows of a run, with their likelihood."""
+    if isinstance(run, Identification):
+        logs = run.training_logs(alike=True)
+        assert run.project is not None
+        return window_data(run.project, logs, int(run.summary.get("seed", 0)))
+    if isinstance(run, Demonstration):
+        return _flown(run)
+    raise _nothing_to_explain(getattr(run, "path", run), getattr(run, "summary", {}))
+
+
+def window_data(project: Project, logs: Sequence[Log], seed: int = 0) -> WindowData:
     """A project's logs as windows; those of one second may share an error."""
-    logs = project.load_logs(strict=strict, alike=True)
     windows, log = cut_logs(project, logs)
     span = max(project.spec.likelihood.window, 1e-9)
     first = np.concatenate([[0], np.flatnonzero(np.diff(log)) + 1])
@@ -132,9 +145,9 @@ def window_data(project: Project, seed: int = 0, *, strict: bool = False) -> Win
     return WindowData(project.system, cut, cluster.ravel(), robust=robust, seed=seed)
 
 
-def _flown(stored: Run) -> OneStepData:
+def _flown(run: Demonstration) -> OneStepData:
     """A demo's episodes; each lacks its last state."""
-    summary, x = stored.summary, stored.arrays
+    summary, x = run.summary, run.arrays
     count, dt = int(summary["episodes"]), float(summary["animation"]["dt"])
     states = np.split(np.asarray(x["animation/state"], float), count)
     inputs = np.split(np.asarray(x["animation/action"], float), count)
@@ -143,26 +156,48 @@ def _flown(stored: Run) -> OneStepData:
     return OneStepData(make(), episodes, dt=dt)
 
 
-def _project(run: Path, stored: Run) -> Project:
-    """The run's own copy of the project, its logs where the file stood."""
-    return dataclasses.replace(project_of(run, stored), path=stood(run, stored.summary))
+def explainable(
+    folder: Path, budget: Budget | None = None, *, strict: bool = False
+) -> Identification | Demonstration:
+    """The run of an identification, its logs read, or of a demo (E130)."""
+    stored = load_run(folder)
+    if (folder / PROJECT).exists():
+        project = project_of(folder, stored)
+        project = dataclasses.replace(project, budget=budget or Budget())
+        logs = project.load_logs(strict=strict, alike=True)
+        return Identification(
+            stored.summary, stored.arrays, {}, project, folder, logs=logs
+        )
+    if "animation/state" in stored.arrays and "machine" in stored.summary:
+        return Demonstration(stored.summary, stored.arrays, {}, None, folder)
+    raise _nothing_to_explain(folder, stored.summary)
 
 
-def _project_file(run: Path, stored: Run, add: bool) -> Path | None:
-    """The file to add to, unchanged since the run (E130, E160 if there is none)."""
-    if not add:
-        return None
-    if not (run / PROJECT).exists():
+def _nothing_to_explain(where: object, summary: Mapping[str, Any]) -> InputError:
+    return InputError(
+        "E130",
+        "nothing to explain",
+        where=str(where),
+        got=str(summary.get("command", "a run without data")),
+        expected="the folder of sim2gp identify or sim2gp demo",
+        fix="run one of them first",
+    )
+
+
+def project_file(run: AbstractResult) -> Path:
+    """The file to add to, unchanged since the run (E160 if there is none)."""
+    where = str(run.path or run.name)
+    if run.project is None:
         raise InputError(
             "E160",
             "--add without a project file",
-            where=str(run),
-            got=str(stored.summary.get("command")),
+            where=where,
+            got=str(run.summary.get("command")),
             expected="the folder of sim2gp identify",
             fix="leave --add out",
         )
-    place = stood(run, stored.summary)
-    if load_project(place).source.text != load_project(run / PROJECT).source.text:
+    place = run.project.path
+    if load_project(place).source.text != run.project.source.text:
         raise InputError(
             "E160",
             "project file changed since the run",

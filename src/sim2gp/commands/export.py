@@ -9,29 +9,31 @@ from typing import Any
 
 import jax
 
-from sim2gp.commands.identification import Identified, Width, used
+from sim2gp.commands.identification import Identification, Width, used
 from sim2gp.robot.export import write_model
 from sim2gp.runs import Progress
 from sim2gp.systems import one_variant
 
 
-def run(
-    fit: Identified,
+def export(
+    found: Identification,
+    out: Path | str,
     *,
-    draws: int,
-    out: Path,
-    seed: int,
-    progress: Progress,
+    draws: int = 100,
+    seed: int = 0,
     configuration: str | None = None,
     posterior: Width = "corrected",
+    progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Write ``draws`` of the posterior that is asked for; returns the summary.
 
     Raises `InputError` E152 for a machine in several configurations and none named.
     """
-    known = fit.posterior if posterior == "corrected" else fit.plain
-    system, own = one_variant(fit.project.system, known, configuration)
-    progress.say(f"drawing {draws} machines from the {posterior} posterior")
-    about = {"run": fit.run.name, **used(fit.summary, posterior)}
+    known = found.posterior if posterior == "corrected" else found.plain
+    system, own = one_variant(found.machine, known, configuration)
+    (progress or Progress()).say(
+        f"drawing {draws} machines from the {posterior} posterior"
+    )
+    about = {"run": found.name, **used(found.summary, posterior)}
     key = jax.random.key(seed)
-    return write_model(own, out, system, draws=draws, key=key, about=about)
+    return write_model(own, Path(out), system, draws=draws, key=key, about=about)

@@ -1,17 +1,19 @@
-"""A finished identification, read back from its run.
+"""The result of `identify`: a posterior over the constants of a machine.
 
-A command reads a run, and logs to hold it against, before it imports its experiment.
+It is the same object where it was just made and where `load_run` reads it back.
 """
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
 
+from sim2gp.commands.result import PROJECT, AbstractResult
 from sim2gp.data.logs import Budget, Log, none_unused
 from sim2gp.errors import InputError
 from sim2gp.identification.forecasts.forecast import Band
@@ -20,10 +22,9 @@ from sim2gp.inference.parameters import Parameters
 from sim2gp.project import Project, load_project
 from sim2gp.runs import load_run
 from sim2gp.runs.store import Run
+from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.variants import index_of
 from sim2gp.types import AnyArray, in_float64
-
-PROJECT = "project.toml"  # the file's name in a run
 
 #: The corrected posterior has the report's intervals, the plain one is Laplace's.
 Width = Literal["corrected", "plain"]
@@ -31,38 +32,128 @@ Width = Literal["corrected", "plain"]
 _PREFIX = {"corrected": "intervals", "plain": "belief"}
 
 
-class Identified(NamedTuple):
-    """A finished identification, read back from its run.
+@dataclass(frozen=True)
+class Constant:
+    """What is known of one constant, in its physical unit.
 
-    ``posterior`` is as wide as the report's intervals, which allow for errors of the
-    model: it is what leaves the run. ``plain`` is Laplace's about the MAP, which
-    counts the model as right: forecasts start from its mean, because the fit's errors
-    are smallest there, and expected information is counted from it.
+    ``interval`` holds it with 95 % probability, allowing for errors of the model.
     """
 
-    run: Path
-    project: Project
-    summary: dict[str, Any]
-    posterior: Gaussian
-    plain: Gaussian
-    outputs: list[str]  # the measured channels, in the order of `noise`
-    noise: list[float]
-    period: float  # s, median of the logs
-    band: Band
+    name: str
+    unit: str
+    mean: float
+    sd: float
+    interval: tuple[float, float]
+    prior_mean: float
+    prior_sd: float
+    verdict: str
+    meaning: str = ""
 
-    def within(self, budget: Budget) -> "Identified":
+
+@dataclass(frozen=True, repr=False)
+class Identification(AbstractResult):
+    """The posterior of a machine's constants, what it was fitted to, and the summary.
+
+    A ``first_answer`` has a summary alone: no posterior to go on with.
+    """
+
+    logs: tuple[Log, ...] | None = None
+
+    @property
+    def machine(self) -> AbstractSystem:
+        """The machine whose constants these are."""
+        return self._project.system
+
+    @property
+    def parameters(self) -> dict[str, Constant]:
+        """Each constant by name, in physical units."""
+        fields = ("unit", "mean", "sd", "prior_mean", "prior_sd", "verdict")
+        return {
+            name: Constant(
+                name=name,
+                interval=(entry["q025"], entry["q975"]),
+                meaning=entry.get("meaning") or "",
+                **{key: entry[key] for key in fields},
+            )
+            for name, entry in self.summary["parameters"].items()
+        }
+
+    @cached_property
+    def posterior(self) -> Gaussian:
+        """As wide as the report's intervals, which allow for errors of the model.
+
+        Over virtual values; it is what leaves the run.
+        """
+        return _posterior(self.arrays, "corrected")
+
+    @cached_property
+    def plain(self) -> Gaussian:
+        """Laplace's about the MAP, which counts the model as right.
+
+        Forecasts start from its mean, because the fit's errors are smallest there, and
+        expected information is counted from it.
+        """
+        return _posterior(self.arrays, "plain")
+
+    @property
+    def noise(self) -> dict[str, float]:
+        """Standard deviation of each measured channel, in its unit."""
+        return {name: float(sd) for name, sd in self.summary["noise"].items()}
+
+    @property
+    def period(self) -> float:
+        """Median time between rows of the logs, s; clocks jitter."""
+        return float(f"{self.summary['period']:.3g}")
+
+    @cached_property
+    def band(self) -> Band:
+        """What the bands of forecasts are made of."""
+        x = self.arrays
+        return Band(
+            x["band/start_sd"],
+            x["band/input_sd"],
+            x["band/resolution"],
+            x["band/rows"],
+            x["band/shape"],
+            float(x["band/inflation"]),
+        )
+
+    @property
+    def _project(self) -> Project:
+        assert self.project is not None
+        return self.project
+
+    def within(self, budget: Budget) -> "Identification":
         """The same, where reading a log may take another budget."""
-        return self._replace(project=replace(self.project, budget=budget))
+        return replace(self, project=replace(self._project, budget=budget))
 
-    def read(
-        self, logs: Sequence[Path], configuration: str | None, *, strict: bool
+    def read_logs(
+        self,
+        files: Sequence[Path | str],
+        configuration: str | None = None,
+        *,
+        strict: bool = False,
     ) -> tuple[Log, ...]:
         """Logs of the machine in one configuration (E152 where it has several)."""
-        index_of(configuration, self.project.system.variants)
-        found = self.project.read_logs(logs, configuration)
+        index_of(configuration, self.machine.variants)
+        found = self._project.read_logs(files, configuration)
         if strict:
             none_unused(found)
         return found
+
+    def training_logs(
+        self, *, strict: bool = False, alike: bool = False
+    ) -> tuple[Log, ...]:
+        """What it was fitted to: as given, or read from where the files stood."""
+        if self.logs is not None:
+            return self.logs
+        return self._project.load_logs(strict=strict, alike=alike)
+
+    def forecast(self, logs: Sequence[Log] | Log, horizon: float = 0.2) -> Any:
+        """Open-loop forecasts of logs that it has not seen: `evaluate`."""
+        from sim2gp.commands.evaluate import evaluate
+
+        return evaluate(self, logs, horizon=horizon)
 
 
 @in_float64
@@ -71,19 +162,20 @@ def physical(table: Parameters, tt: AnyArray) -> np.ndarray:
     return np.asarray(table.constrain(np.asarray(tt, float)))
 
 
-def _posterior(stored: Run, which: Width) -> Gaussian:
+def _posterior(x: Mapping[str, np.ndarray], which: Width) -> Gaussian:
     """One of the two posteriors of an identification, over virtual values."""
-    x, prefix = stored.arrays, _PREFIX[which]
-    return Gaussian(jnp.asarray(x[f"{prefix}/mean"]), jnp.asarray(x[f"{prefix}/scale"]))
+    prefix = _PREFIX[which]
+    mean, scale = (np.asarray(x[f"{prefix}/{n}"]) for n in ("mean", "scale"))
+    return Gaussian(jnp.asarray(mean), jnp.asarray(scale))
 
 
-def modes(stored: Run, table: Parameters, which: Width) -> np.ndarray:
+def modes(x: Mapping[str, np.ndarray], table: Parameters, which: Width) -> np.ndarray:
     """The constants at a posterior's mode, in physical units, as they were fitted.
 
-    E170 where a run of an older version does not say them, and the model's file has
-    changed since.
+    ``x`` are the run's arrays. E170 where a run of an older version does not say them,
+    and the model's file has changed since.
     """
-    x, prefix = stored.arrays, _PREFIX[which]
+    prefix = _PREFIX[which]
     if f"{prefix}/theta" not in x:
         _check_fitted("the model's file", table, x)
         return np.asarray(physical(table, jnp.asarray(x[f"{prefix}/mean"])))
@@ -113,42 +205,35 @@ def stood(run: Path, summary: dict[str, Any]) -> Path:
     return Path(os.path.normpath(place))
 
 
-def project_of(run: Path, stored: Run, model: Path | None = None) -> Project:
-    """The run's own copy of its project, its model's file where it was (or another)."""
-    return load_project(run / PROJECT, stood(run, stored.summary).parent, model)
+def project_of(
+    run: Path,
+    stored: Run,
+    *,
+    model: Path | None = None,
+    machine: AbstractSystem | None = None,
+) -> Project:
+    """The run's own copy of its project; its logs and model's file where they stood.
+
+    ``model`` is another file of the model, ``machine`` one of the user's own.
+    """
+    place = stood(run, stored.summary)
+    found = load_project(run / PROJECT, place.parent, model, system=machine)
+    return replace(found, path=place)
 
 
 @in_float64
-def restored(run: Path) -> Identified:
-    """What `identify.run` wrote (E130 for another folder, E184 for other constants)."""
+def restored(run: Path, machine: AbstractSystem | None = None) -> Identification:
+    """What `identify` saved (E130 for another folder, E184 for other constants)."""
     stored = load_run(run)
     check_identified(run, stored)
-    x, noise = stored.arrays, stored.summary["noise"]
-    project = project_of(run, stored)
+    project = project_of(run, stored, machine=machine)
     _check_constants(run, project, stored.summary)
-    _check_fitted(project.spec.system, project.system.parameters, x)
-    return Identified(
-        run,
-        project,
-        stored.summary,
-        _posterior(stored, "corrected"),
-        _posterior(stored, "plain"),
-        list(noise),
-        [float(sd) for sd in noise.values()],
-        float(f"{stored.summary['period']:.3g}"),  # clocks jitter
-        Band(
-            x["band/start_sd"],
-            x["band/input_sd"],
-            x["band/resolution"],
-            x["band/rows"],
-            x["band/shape"],
-            float(x["band/inflation"]),
-        ),
-    )
+    _check_fitted(project.spec.system, project.system.parameters, stored.arrays)
+    return Identification(stored.summary, stored.arrays, {}, project, run)
 
 
 def check_identified(run: Path, stored: Run) -> None:
-    """E130 for a folder that `identify.run` did not write, or not with both widths."""
+    """E130 for a folder that `identify` did not save, or not with both widths."""
     found = {"belief/mean", "intervals/mean"} <= set(stored.arrays)
     if found and (run / PROJECT).exists():
         return
@@ -177,7 +262,7 @@ def _check_constants(run: Path, project: Project, summary: dict[str, Any]) -> No
     )
 
 
-def _check_fitted(where: str, table: Parameters, x: dict[str, np.ndarray]) -> None:
+def _check_fitted(where: str, table: Parameters, x: Mapping[str, np.ndarray]) -> None:
     """A model's file still has the numbers that its default priors are about (E170)."""
     now = physical(table, jnp.asarray(x["belief/mean"]))
     theta = x.get("belief/theta", now)

@@ -16,7 +16,7 @@ from sim2gp.runs.store import check_absent
 from sim2gp.systems.base import AbstractSystem
 
 
-def run(
+def init(
     model: str,
     logs: Sequence[Path],
     *,

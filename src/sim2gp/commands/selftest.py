@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from sim2gp.commands import selftest_checks as checks
+from sim2gp.commands.result import AbstractResult
 from sim2gp.runs import Progress
 from sim2gp.runs.provenance import provenance
 
@@ -27,7 +28,7 @@ class Check:
     limit: float
 
 
-#: Limits are those of the test suite; -log10 p = 4 is one false alarm in 10,000.
+#: LimitBox are those of the test suite; -log10 p = 4 is one false alarm in 10,000.
 CHECKS = {
     "exactness": Check(
         "posterior and evidence of linear problems against rational arithmetic "
@@ -80,8 +81,19 @@ CHECKS = {
 }
 
 
-def run(*, seed: int, progress: Progress) -> dict[str, Any]:
-    """Run every check; the summary's ``passed`` says whether all hold."""
+@dataclass(frozen=True, repr=False)
+class SelfTest(AbstractResult):
+    """The checks of an installation, each with its figure and its limit."""
+
+    @property
+    def passed(self) -> bool:
+        """Whether all hold."""
+        return bool(self.summary["passed"])
+
+
+def selftest(*, seed: int = 0, progress: Progress | None = None) -> SelfTest:
+    """Run every check; ``passed`` says whether all hold."""
+    progress = progress or Progress()
     started = time.perf_counter()
     device = jax.devices()[0]
     found = {}
@@ -95,7 +107,7 @@ def run(*, seed: int, progress: Progress) -> dict[str, Any]:
         "passed": not failed,
         "seed": seed,
         "checks": found,
-        **provenance(f"sim2gp selftest --seed {seed}", started),
+        **provenance(started),
         "device": f"{device.platform} ({device.device_kind})",
     }
     names = ("sim2gp", "jax", "python")
@@ -106,7 +118,7 @@ def run(*, seed: int, progress: Progress) -> dict[str, Any]:
         f"{summary['wall_seconds']:.0f} s; {made_of}, {summary['device']}"
     )
     progress.say(summary["headline"])
-    return summary
+    return SelfTest(summary)
 
 
 def measure(check: Check, rng: np.random.Generator) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from sim2gp.experiment_design.experiment import (
     trajectory,
 )
 from sim2gp.experiment_design.goals import AbstractGoal, Everything, Named, Prediction
-from sim2gp.experiment_design.limits import Limits
+from sim2gp.experiment_design.limits import LimitBox
 from sim2gp.experiment_design.search import Designed, design, prediction_rows
 from sim2gp.experiment_design.signals import AbstractSignal, Free, Multisine
 
@@ -18,7 +18,7 @@ __all__ = [
     "Everything",
     "Experiment",
     "Free",
-    "Limits",
+    "LimitBox",
     "Multisine",
     "Named",
     "Prediction",

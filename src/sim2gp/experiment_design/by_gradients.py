@@ -26,7 +26,7 @@ from sim2gp.experiment_design.experiment import (
     trajectory,
 )
 from sim2gp.experiment_design.goals import AbstractGoal
-from sim2gp.experiment_design.limits import Limits, all_excess, excess, narrowed
+from sim2gp.experiment_design.limits import LimitBox, all_excess, excess, narrowed
 from sim2gp.experiment_design.signals import AbstractSignal
 from sim2gp.experiment_design.ways import Ways
 from sim2gp.models.training import adamw, descend
@@ -48,7 +48,7 @@ def ways(
     experiment: Experiment,
     signal: AbstractSignal,
     goal: AbstractGoal,
-    limits: Limits,
+    limits: LimitBox,
     informed: Float[Array, "D p"],
     trials: Float[Array, "N p"],
     held_out: Float[Array, "K p"],
@@ -88,7 +88,7 @@ def _climber(
     experiment: Experiment,
     signal: AbstractSignal,
     goal: AbstractGoal,
-    limits: Limits,
+    limits: LimitBox,
     draws: Float[Array, "D p"],
     trials: Float[Array, "N p"],
 ) -> Callable[[Key], Float[Array, "k m"]]:
@@ -144,7 +144,7 @@ def _climb(
     signal: AbstractSignal,
     experiment: Experiment,
     goal: AbstractGoal,
-    limits: Limits,
+    limits: LimitBox,
     draws: Float[Array, "D p"],
     guards: Float[Array, "G p"],
     cost: Array,
@@ -175,7 +175,7 @@ def _climb(
     )
 
 
-def _beyond_of(experiment: Experiment, limits: Limits) -> Callable[[Array], Array]:
+def _beyond_of(experiment: Experiment, limits: LimitBox) -> Callable[[Array], Array]:
     """How far machines leave the limits in all of their turns, on average."""
     turn = min(max(1, round(TURN / experiment.period)), experiment.steps)
     turns = experiment.steps // turn
@@ -218,7 +218,7 @@ def _states(experiment: Experiment, U: Array, machines: Array) -> Array:
 
 @compile_async
 def _checked(
-    experiment: Experiment, limits: Limits, U: Array, draws: Array
+    experiment: Experiment, limits: LimitBox, U: Array, draws: Array
 ) -> tuple[Array, Array]:
     """Of plausible machines, and how far each leaves the limits; infinite when lost."""
     states = _states(experiment, U, jax.vmap(experiment.plausible.at)(draws))

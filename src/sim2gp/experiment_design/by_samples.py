@@ -22,7 +22,7 @@ from sim2gp.experiment_design.experiment import (
     piece,
 )
 from sim2gp.experiment_design.goals import AbstractGoal
-from sim2gp.experiment_design.limits import Limits, all_excess, narrowed
+from sim2gp.experiment_design.limits import LimitBox, all_excess, narrowed
 from sim2gp.experiment_design.signals import AbstractSignal
 from sim2gp.experiment_design.ways import Ways
 from sim2gp.systems.host import simulator_of
@@ -42,7 +42,7 @@ def ways(
     experiment: Experiment,
     signal: AbstractSignal,
     goal: AbstractGoal,
-    limits: Limits,
+    limits: LimitBox,
     informed: Float[Array, "D p"],
     trials: Float[Array, "N p"],
     held_out: Float[Array, "K p"],
@@ -80,7 +80,7 @@ def states_of(
 
 
 def checked(
-    experiment: Experiment, limits: Limits, U: np.ndarray, draws: np.ndarray
+    experiment: Experiment, limits: LimitBox, U: np.ndarray, draws: np.ndarray
 ) -> tuple[States, Float[np.ndarray, " K"]]:
     """Of plausible machines, and how far each leaves the limits; infinite when lost."""
     machines = np.stack([np.asarray(experiment.plausible.at(z)) for z in draws])
@@ -119,7 +119,7 @@ def sampled(
     experiment: Experiment,
     signal: AbstractSignal,
     goal: AbstractGoal,
-    limits: Limits,
+    limits: LimitBox,
     draws: Float[np.ndarray, "D p"],
     guards: Float[np.ndarray, "G p"],
 ) -> Callable[[Key], Float[np.ndarray, "k m"]]:

@@ -22,7 +22,7 @@ MARGIN = 0.05  # of a box's half, kept free while searching
 SLOW = 3.0  # s, in which the target of a servo crosses its range at the fastest
 
 
-class Limits(eqx.Module):
+class LimitBox(eqx.Module):
     """Boxes of the inputs and the states, and the largest change of a command per s."""
 
     low: Float[np.ndarray, " m"]
@@ -39,7 +39,7 @@ class Limits(eqx.Module):
         rates: Mapping[str, float],
         *,
         start: np.ndarray,
-    ) -> "Limits":
+    ) -> "LimitBox":
         """The channels' own limits, narrowed by what is stated by name.
 
         Raises `InputError` E103 for an unknown name, E150 where nothing may move: an
@@ -92,7 +92,7 @@ class Limits(eqx.Module):
 def input_ranges(
     system: AbstractSystem,
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """Limits of the inputs; a servo's target stays within its joint's range, too."""
+    """LimitBox of the inputs; a servo's target stays within its joint's range, too."""
     plant = plant_of(system)
     servos, drives = (getattr(plant, name, {}) for name in ("servos", "drives"))
     joints = {c.name: c for c in system.physical_states}
@@ -119,7 +119,7 @@ def servo_rates(system: AbstractSystem) -> dict[str, float]:
     return {c.name: rate for c, rate in rates if c.name in servos and rate < math.inf}
 
 
-def excess(limits: Limits, states: Float[Array, "T n"]) -> Float[Array, ""]:
+def excess(limits: LimitBox, states: Float[Array, "T n"]) -> Float[Array, ""]:
     """How far a trajectory leaves the box at worst, in halves of it; below 0 inside."""
     half = 0.5 * (limits.state_high - limits.state_low)
     half = jnp.where(jnp.isfinite(half), half, 1.0)
@@ -129,13 +129,13 @@ def excess(limits: Limits, states: Float[Array, "T n"]) -> Float[Array, ""]:
     return jnp.max(over / half[None])
 
 
-def all_excess(limits: Limits, states: Float[Array, "K T n"]) -> Float[Array, " K"]:
+def all_excess(limits: LimitBox, states: Float[Array, "K T n"]) -> Float[Array, " K"]:
     """`excess` of each machine; infinite where its simulation is lost."""
     beyond = jax.vmap(lambda S: excess(limits, S))(states)
     return jnp.where(jnp.isfinite(beyond), beyond, jnp.inf)
 
 
-def narrowed(limits: Limits) -> Limits:
+def narrowed(limits: LimitBox) -> LimitBox:
     """With a little of the states' box kept free at each end."""
     low, high = limits.state_low, limits.state_high
     off = 0.5 * MARGIN * jnp.where(jnp.isfinite(high - low), high - low, 0.0)
@@ -143,7 +143,9 @@ def narrowed(limits: Limits) -> Limits:
     return eqx.tree_at(lambda l: (l.state_low, l.state_high), limits, box)
 
 
-def kept(limits: Limits, U: Float[Array, "T m"], period: float) -> Float[Array, "T m"]:
+def kept(
+    limits: LimitBox, U: Float[Array, "T m"], period: float
+) -> Float[Array, "T m"]:
     """The nearest commands that a machine at rest may be given, one after the other."""
     step = limits.rate * period
 

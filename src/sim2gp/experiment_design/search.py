@@ -21,7 +21,7 @@ from sim2gp.errors import InputError, NotFinite
 from sim2gp.experiment_design import by_gradients, by_samples
 from sim2gp.experiment_design.experiment import Experiment
 from sim2gp.experiment_design.goals import AbstractGoal
-from sim2gp.experiment_design.limits import Limits
+from sim2gp.experiment_design.limits import LimitBox
 from sim2gp.experiment_design.signals import AbstractSignal, Multisine
 from sim2gp.systems.host import simulator_of
 from sim2gp.types import AnyArray, Key, in_float64
@@ -57,7 +57,7 @@ class Designed(eqx.Module):
 def design(
     experiment: Experiment,
     goal: AbstractGoal,
-    limits: Limits,
+    limits: LimitBox,
     signal: AbstractSignal,
     *,
     key: Key,
@@ -147,7 +147,7 @@ def _kept(
 
 @in_float64
 def prediction_rows(
-    experiment: Experiment, limits: Limits, horizon: float, key: Key
+    experiment: Experiment, limits: LimitBox, horizon: float, key: Key
 ) -> Float[Array, "k p"]:
     """What predictions ``horizon`` seconds ahead depend on, along small random motions.
 

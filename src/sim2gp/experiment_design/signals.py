@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sim2gp import checks
-from sim2gp.experiment_design.limits import Limits, kept
+from sim2gp.experiment_design.limits import LimitBox, kept
 from sim2gp.planning.coloured_noise import coloured_noise
 from sim2gp.planning.mpc import from_unit
 from sim2gp.types import Box, Key
@@ -41,7 +41,7 @@ class AbstractSignal(eqx.Module):
         """``k``, for each input."""
 
     @abstractmethod
-    def commands(self, C: Float[Array, "k m"], limits: Limits) -> Float[Array, "T m"]:
+    def commands(self, C: Float[Array, "k m"], limits: LimitBox) -> Float[Array, "T m"]:
         """Within the limits of value and rate, exactly."""
 
     @abstractmethod
@@ -63,7 +63,7 @@ class Multisine(AbstractSignal):
     def coefficients(self) -> int:
         return 2 * self.tones
 
-    def commands(self, C: Float[Array, "k m"], limits: Limits) -> Float[Array, "T m"]:
+    def commands(self, C: Float[Array, "k m"], limits: LimitBox) -> Float[Array, "T m"]:
         """Scaled as a whole where a limit of value or rate would be left."""
         t = self.period * np.arange(self.steps)
         lowest = 1.0 / (self.period * self.steps)
@@ -94,7 +94,7 @@ class Free(AbstractSignal):
     def coefficients(self) -> int:
         return max(2, round(self.period * self.steps / self.spacing))
 
-    def commands(self, C: Float[Array, "k m"], limits: Limits) -> Float[Array, "T m"]:
+    def commands(self, C: Float[Array, "k m"], limits: LimitBox) -> Float[Array, "T m"]:
         at = np.linspace(0.0, len(C) - 1.0, self.steps)
         left = np.minimum(at.astype(int), len(C) - 2)
         share = jnp.asarray((at - left)[:, None], C.dtype)

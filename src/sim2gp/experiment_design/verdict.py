@@ -1,48 +1,59 @@
 """What is asked of an experiment, and whether it is worth the robot's time."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
+from sim2gp.errors import InputError
 from sim2gp.identification.words import digits, listed
 
 NARROWER = 0.05  # an experiment must narrow what is asked by this share
 
 
+class Limits:
+    """What an experiment must keep: ``Limits(torque=2.0, q1=(-1.0, 1.0))``.
+
+    A number is a half-width about zero, a pair low and high; channels, inputs and
+    velocities by the machine's names, in its units. ``rates`` are the largest changes
+    of inputs per s. Names that are none of Python's are given in a mapping.
+    """
+
+    def __init__(
+        self,
+        channels: Mapping[str, float | tuple[float, float]] | None = None,
+        /,
+        *,
+        rates: Mapping[str, float] | None = None,
+        **more: float | tuple[float, float],
+    ) -> None:
+        given = {**(channels or {}), **more}
+        self.boxes = {name: _pair(name, x) for name, x in given.items()}
+        self.rates = {name: float(x) for name, x in (rates or {}).items()}
+
+
+def _pair(name: str, limit: float | tuple[float, float]) -> tuple[float, float]:
+    """Low and high (E141 where low is not below high)."""
+    low, high = (-limit, limit) if isinstance(limit, int | float) else limit
+    if low < high:
+        return float(low), float(high)
+    got, fix = f"{low:g} to {high:g}", "swap the two, or give a positive number"
+    raise InputError("E141", f"limits of {name}", got=got, fix=fix)
+
+
 @dataclass(frozen=True)
 class Asked:
-    """What is asked of an experiment: the options of the command."""
+    """What is asked of an experiment: the options of `sim2gp.design`."""
 
-    seconds: float
-    kind: str
-    about: tuple[str, ...]
-    predict: float | None
-    within: float
-    limits: Mapping[str, tuple[float, float]]
-    rates: Mapping[str, float]
-    start: Mapping[str, float]
-    period: float | None
+    seconds: float = 10.0
+    kind: str = "free"
+    about: tuple[str, ...] = ()
+    predict: float | None = None
+    within: float = 2.0
+    limits: Limits = field(default_factory=Limits)
+    start: Mapping[str, float] = field(default_factory=dict)
+    period: float | None = None
     starts: int = 1
     configuration: str | None = None
-
-    def words(self) -> str:
-        """As they were typed."""
-        parts = [f"--seconds {self.seconds:g}", f"--kind {self.kind}"]
-        parts += [f"--about {' '.join(self.about)}"] if self.about else []
-        parts += [f"--predict {self.predict:g}"] if self.predict else []
-        parts += [f"--within {self.within:g}"]
-        boxes = [f"{n}={low:g}:{high:g}" for n, (low, high) in self.limits.items()]
-        for option, pairs in (
-            ("--limit", boxes),
-            ("--rate", [f"{n}={x:g}" for n, x in self.rates.items()]),
-            ("--start", [f"{n}={x:g}" for n, x in self.start.items()]),
-        ):
-            parts += [f"{option} {' '.join(pairs)}"] if pairs else []
-        parts += [f"--period {self.period:g}"] if self.period else []
-        parts += [f"--starts {self.starts}"]
-        if self.configuration:
-            parts += [f"--configuration {self.configuration}"]
-        return " ".join(parts)
 
 
 def verdict(

@@ -14,7 +14,15 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sim2gp.data.logs import Budget, Column, Log, Resample, none_unused, read_log
+from sim2gp.data.logs import (
+    Budget,
+    Column,
+    Log,
+    RawLog,
+    Resample,
+    none_unused,
+    read_log,
+)
 from sim2gp.data.logs.file import shown
 from sim2gp.errors import InputError, nearest
 from sim2gp.project.schema import (
@@ -37,6 +45,8 @@ SYSTEMS = {
     "two_link": ("two_link", "TwoLink"),
     "uniform_rod_arm": ("two_link", "UniformRodArm"),
 }
+#: What stands for the system of a machine that was made in Python.
+IN_MEMORY = "in memory"
 MODEL_FILES = (".xml", ".mjcf", ".urdf")
 #: What other tools write before a model's file.
 _PREFIX = re.compile(r"(?i)^(mujoco|mjcf|mjx|urdf|xml)\s*:\s*")
@@ -70,7 +80,7 @@ class Project:
         configuration, or E160.
         """
         if alike:
-            self._check_alike()
+            self.check_alike()
         seen: dict[str, int] = {}
         logs: list[Log] = []
         for group, spec in enumerate(self.spec.logs):
@@ -101,11 +111,12 @@ class Project:
         return tuple(_uniquely_named(logs))
 
     def read_logs(
-        self, files: Iterable[Path | str], configuration: str | None = None
+        self, files: Iterable[Path | str | RawLog], configuration: str | None = None
     ) -> tuple[Log, ...]:
-        """Other files, each read like the first group whose columns it has.
+        """Other files or columns, each read like the first group whose columns it has.
 
-        Of the groups of one ``configuration``, where it is named.
+        Of the groups of one ``configuration``, where it is named. Without any group
+        columns are named as the machine's channels are.
         """
         logs: list[Log] = []
         groups = [
@@ -114,7 +125,10 @@ class Project:
             if configuration in (None, self.spec.configuration(group))
         ]
         for file in files:
-            path, first = Path(file), None
+            path, first = (file if isinstance(file, RawLog) else Path(file)), None
+            if not self.spec.logs and isinstance(path, RawLog):
+                logs += self._read(path, 0, self._by_channel(path))
+                continue
             for group, spec in groups:
                 try:
                     logs += self._read(path, group, spec)
@@ -127,7 +141,21 @@ class Project:
                 raise first or _no_group(self.source)
         return tuple(_uniquely_named(logs))
 
-    def _check_alike(self) -> None:
+    def _configuration(self, group: int) -> int:
+        """The number of the configuration that a group recorded."""
+        spec = self.spec
+        if not spec.logs:
+            return 0
+        return spec.configurations.index(spec.configuration(group))
+
+    def _by_channel(self, log: RawLog) -> LogSpec:
+        """Of columns that are named as the machine's channels and inputs."""
+        channels = (*self.system.physical_states, *self.system.actions)
+        names = [c.name for c in channels if c.name in log.columns]
+        return LogSpec(files=[log.name], columns={name: name for name in names})
+
+    def check_alike(self) -> None:
+        """The machine of all groups is in one configuration, or E160."""
         for group, spec in enumerate(self.spec.logs):
             if spec.fixed or spec.free:
                 raise InputError(
@@ -170,7 +198,7 @@ class Project:
             found.update(dict.fromkeys(Path(match) for match in matches))
         return list(found)
 
-    def _read(self, path: Path, group: int, spec: LogSpec) -> tuple[Log, ...]:
+    def _read(self, path: Path | RawLog, group: int, spec: LogSpec) -> tuple[Log, ...]:
         return read_log(
             path,
             {name: _column(value) for name, value in spec.columns.items()},
@@ -185,7 +213,7 @@ class Project:
             keep_first=spec.keep_first,
             limits={name: (a, b) for name, (a, b) in self.spec.limits.items()},
             fixed=spec.fixed,
-            group=self.spec.configurations.index(self.spec.configuration(group)),
+            group=self._configuration(group),
             longest_delay=self.system.longest_delay,
             budget=self.budget,
         )
@@ -209,7 +237,10 @@ def load_project(
     # Imported late: a misspelt key is reported before the simulators are loaded.
     from sim2gp.project.build import build_own, build_system, check_names
     from sim2gp.project.configure import in_configurations, weighed
+    from sim2gp.systems.machine import as_machine
 
+    if system is not None and spec.system == IN_MEMORY:
+        return Project(path, source, spec, as_machine(system))
     if system is not None:
         system = build_own(spec, source, system)
     elif is_model(spec.system):
@@ -245,7 +276,9 @@ def unknown_system(name: str, where: str) -> InputError:
     """E160 for a system that is neither a bundled machine nor a model's file."""
     close = nearest(name, SYSTEMS)
     file = _PREFIX.sub("", name)
-    if file.lower().endswith(MODEL_FILES):
+    if name == IN_MEMORY:
+        fix = "give the machine: load_run(folder, machine=...)"
+    elif file.lower().endswith(MODEL_FILES):
         fix = f"write the file's name, {json.dumps(file)}"
     elif _PREFIX.match(f"{name}:"):
         fix = 'write the file\'s name, as in "robot.xml"'

@@ -61,7 +61,11 @@ class Source:
 def read_source(path: Path) -> Source:
     """Read and parse a project file (E120, E130, E160, E161, E162)."""
     name = shown(path)
-    text = decode(read_bytes(path, limit=64 * MAX_BYTES), name)
+    return parsed(decode(read_bytes(path, limit=64 * MAX_BYTES), name), name)
+
+
+def parsed(text: str, name: str) -> Source:
+    """Parse the text of a project file that is called ``name`` (E160, E161, E162)."""
     if len(text) > MAX_BYTES:
         raise _refused(name, f"{len(text)} characters", f"at most {MAX_BYTES}")
     # Strings and comments keep their length and lines but lose their content.

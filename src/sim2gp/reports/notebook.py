@@ -1,8 +1,10 @@
 """A run's report inside a notebook: `show` as the last line of a cell."""
 
 import html
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from sim2gp.reports.document import write_report
 from sim2gp.runs import Run
@@ -26,6 +28,40 @@ class Shown:
 
     def __repr__(self) -> str:
         return f"report of {self.name}; a notebook shows it"
+
+
+def brief(summary: Mapping[str, Any]) -> str:
+    """What a notebook shows of a result: its headline, and its main table."""
+    columns, rows = _main_table(summary)
+    head = "".join(f"<th>{html.escape(str(c))}</th>" for c in columns)
+    body = "".join(
+        "<tr>" + "".join(f"<td>{html.escape(str(x))}</td>" for x in row) + "</tr>"
+        for row in rows
+    )
+    said = html.escape(str(summary.get("headline") or summary.get("title") or ""))
+    table = f"<thead><tr>{head}</tr></thead><tbody>{body}</tbody>" if rows else ""
+    return f"<p>{said}</p><table>{table}</table>" if table else f"<p>{said}</p>"
+
+
+def _main_table(summary: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """The constants, or else the first table of the report."""
+    constants = summary.get("parameters")
+    if isinstance(constants, Mapping):
+        columns = ["constant", "mean", "95 % interval", "unit", "verdict"]
+        rows = [
+            [
+                name,
+                f"{p['mean']:.4g}",
+                f"{p['q025']:.4g} to {p['q975']:.4g}",
+                p["unit"],
+                p["verdict"],
+            ]
+            for name, p in constants.items()
+        ]
+        return columns, rows
+    for table in summary.get("tables", ()):
+        return list(table["columns"]), [list(row) for row in table["rows"]]
+    return [], []
 
 
 def show(run: Run | Path | str) -> Shown:

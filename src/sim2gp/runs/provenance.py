@@ -1,7 +1,6 @@
 """What every run says of itself: its command, its versions, how long it took."""
 
 import platform
-import shlex
 import sys
 import time
 from importlib.metadata import version
@@ -13,11 +12,6 @@ PACKAGES = ("sim2gp", "jax", "jaxlib", "equinox", "numpy", "scipy")
 OPTIONAL = ("mujoco",)  # named where a run has used them
 
 
-def command(*words: object) -> str:
-    """A command as it can be typed again; empty words are left out."""
-    return shlex.join(str(word) for word in words if str(word))
-
-
 def reproduce(
     figure: str, seed: int, seeds: int, episodes: int, quick: bool, old: str
 ) -> str:
@@ -27,10 +21,9 @@ def reproduce(
     return f"sim2gp reproduce {figure} {numbers}{options}"
 
 
-def provenance(command_line: str, started: float) -> dict[str, Any]:
+def provenance(started: float) -> dict[str, Any]:
     """Keys of the summary; ``started`` is the `time.perf_counter` of the start."""
     return {
-        "command_line": command_line,
         "versions": {"python": platform.python_version()}
         | {name: version(name) for name in PACKAGES}
         | {name: version(name) for name in OPTIONAL if name in sys.modules},

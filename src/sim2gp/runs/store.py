@@ -183,6 +183,15 @@ def load_run(path: Path | str) -> Run:
     return Run(stored.path, stored.summary, arrays)
 
 
+def read_text(path: Path | str, name: str) -> str:
+    """A further file of a run, checked by its manifest (E130, E183, E185)."""
+    path = Path(path)
+    files = read_manifest(path)["files"]
+    if name not in files:
+        raise not_a_run(path, f"a {MANIFEST} without {name}")
+    return _read_file(path / name, path, files[name]).decode("utf-8")
+
+
 def read_run(path: Path | str) -> Stored:
     """Read a run without building its arrays (E130, E183, E185)."""
     path = Path(path)

@@ -80,7 +80,7 @@ def run(*, out: Path, seed: int, quick: bool, progress: Progress) -> dict[str, A
             table, prior, posterior, key=jax.random.fold_in(key, 3), count=500
         )
         line = f"sim2gp reproduce fig1 --seed {seed}{' --quick' * quick}"
-        summary |= provenance(line, started)
+        summary |= {"command_line": line, **provenance(started)}
         from sim2gp.reports import figure1, figure_bytes, write_report
 
         writer.write_summary(summary)

@@ -107,7 +107,8 @@ def run(
             "claims": check(table, np.random.default_rng(seed)),
             **details,
             "tables": [_table(table, methods)],
-            **provenance(reproduce(figure, seed, seeds, episodes, quick, old), started),
+            "command_line": reproduce(figure, seed, seeds, episodes, quick, old),
+            **provenance(started),
         }
         arrays = {f"figure2/{'/'.join(k)}": v for k, v in table.items()}
         from sim2gp.reports import figure2, figure_bytes, write_report

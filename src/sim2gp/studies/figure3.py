@@ -92,7 +92,8 @@ def run(
             "claims": claims(table, early, np.random.default_rng(seed)),
             **about,
             "tables": _tables(table, methods),
-            **provenance(reproduce(figure, seed, seeds, episodes, quick, old), started),
+            "command_line": reproduce(figure, seed, seeds, episodes, quick, old),
+            **provenance(started),
         }
         arrays = _arrays(table, early)
         from sim2gp.reports import figure3, figure_bytes, write_report

@@ -87,7 +87,8 @@ def run(
             "claims": claims(table, np.random.default_rng(seed)),
             **details,
             "tables": tables(table),
-            **provenance(words, started),
+            "command_line": words,
+            **provenance(started),
         }
         arrays = {f"mismatch/{'/'.join(k)}": v for k, v in table.items()}
         from sim2gp.reports import write_report

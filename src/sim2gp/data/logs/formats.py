@@ -11,11 +11,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from sim2gp.data.logs.arrays import split
+from sim2gp.data.logs.arrays import Entry, split, table_of
 from sim2gp.data.logs.budget import Budget, Meter, readable
 from sim2gp.data.logs.episodes import read_lerobot, read_minari
 from sim2gp.data.logs.file import kind_of, shown
 from sim2gp.data.logs.hdf5 import read_hdf5
+from sim2gp.data.logs.log import RawLog
 from sim2gp.data.logs.npz import read_npz
 from sim2gp.data.logs.parquet import read_parquet
 from sim2gp.data.logs.ros import read_bag
@@ -38,7 +39,7 @@ class Recording:
 
 
 def recordings(
-    path: Path,
+    path: Path | RawLog,
     wanted: Sequence[str] | None,
     *,
     time: str | None = None,
@@ -52,14 +53,17 @@ def recordings(
     ``episode`` a column of episode numbers; ``budget`` is what reading may take, 2 GiB
     and 60 s if None. Raises `InputError` E101 to E140, E180, E182.
     """
-    kind = kind_of(path)
-    meter = Meter(shown(path), budget or Budget())
+    if isinstance(path, RawLog):
+        kind, name = "memory", path.name
+    else:
+        kind, name = kind_of(path), shown(path)
+    meter = Meter(name, budget or Budget())
     with readable(meter):
         return _recordings(path, kind, wanted, time, period, episode, meter)
 
 
 def _recordings(
-    path: Path,
+    path: Path | RawLog,
     kind: str,
     wanted: Sequence[str] | None,
     time: str | None,
@@ -67,6 +71,11 @@ def _recordings(
     episode: str | None,
     meter: Meter,
 ) -> tuple[Recording, ...]:
+    clock = None if period is not None else (time or TIME)
+    if isinstance(path, RawLog):
+        asked = _with(wanted, clock, episode)
+        pieces = [("", _in_memory(path, asked, clock, meter))]
+        return _by_episode(pieces, episode)
     if kind in BAGS:
         _check_bag(path, time, period, episode)
         return (Recording("", tuple(read_bag(path, kind, wanted, time, meter))),)
@@ -76,7 +85,6 @@ def _recordings(
         asked = _with(wanted, time)
         found = read_lerobot(path, asked, time, stamped, meter)
         return tuple(Recording(name, (table,)) for name, table in found)
-    clock = None if period is not None else (time or TIME)
     asked = _with(wanted, clock, episode)
     if kind == "minari":
         _check_no_episode(path, episode, kind)
@@ -86,6 +94,25 @@ def _recordings(
     else:
         read = {"npz": read_npz, "parquet": read_parquet}.get(kind, read_table)
         pieces = [("", read(path, asked, clock, meter))]
+    return _by_episode(pieces, episode)
+
+
+def _in_memory(
+    log: RawLog, wanted: Sequence[str] | None, time: str | None, meter: Meter
+) -> Table:
+    """Columns that are arrays already, checked as those of a file."""
+
+    def entry(values: np.ndarray) -> Entry:
+        return Entry(values.shape, values.dtype, lambda: values)
+
+    entries = {name: entry(values) for name, values in log.columns.items()}
+    return table_of(entries, log.name, wanted, time=time, meter=meter)
+
+
+def _by_episode(
+    pieces: list[tuple[str, Table]], episode: str | None
+) -> tuple[Recording, ...]:
+    """Each piece cut at the borders of its episodes, where a column numbers them."""
     if episode is not None:
         pieces = [
             (f"{name} {number}".strip(), part)

@@ -10,6 +10,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike
 
 
 @runtime_checkable
@@ -46,6 +47,14 @@ class Column:
 
 
 @dataclass(frozen=True)
+class RawLog:
+    """Named columns of a recording that no machine has read yet (`Log.of`)."""
+
+    name: str
+    columns: Mapping[str, np.ndarray]
+
+
+@dataclass(frozen=True)
 class Note:
     """Something worth saying about a log that is no error; ``code`` is stable."""
 
@@ -69,6 +78,24 @@ class Log:
     fixed: Mapping[str, float] = field(default_factory=dict)
     group: int = 0
     notes: tuple[Note, ...] = ()
+
+    @staticmethod
+    def of(
+        columns: Mapping[str, ArrayLike] | None = None,
+        /,
+        *,
+        name: str = "log",
+        **more: ArrayLike,
+    ) -> RawLog:
+        """Columns of NumPy or pandas, such as ``Log.of(time=t, q1=q, torque1=u)``.
+
+        ``time`` in s; the others by the names of the machine's channels and inputs, in
+        their units, or by those that a project file states. A column whose name is no
+        name of Python's is given in a mapping, which a data frame is. They are checked
+        where a machine reads them, as those of a file are.
+        """
+        given = {**(columns if columns is not None else {}), **more}
+        return RawLog(name, {str(k): np.asarray(v) for k, v in given.items()})
 
     def __len__(self) -> int:
         return len(self.time)

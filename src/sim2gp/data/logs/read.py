@@ -20,7 +20,7 @@ from sim2gp.data.logs.alignment import misaligned
 from sim2gp.data.logs.budget import Budget
 from sim2gp.data.logs.file import shown
 from sim2gp.data.logs.formats import BOOKKEEPING, TIME, Recording, recordings
-from sim2gp.data.logs.log import ChannelLike, Column, Log, Note
+from sim2gp.data.logs.log import ChannelLike, Column, Log, Note, RawLog
 from sim2gp.data.logs.resample import Resample, Track, joined
 from sim2gp.data.logs.table import Rows, Table
 from sim2gp.data.logs.units import factor
@@ -56,7 +56,7 @@ class _Plan:
 
 
 def read_log(
-    path: Path | str,
+    path: Path | str | RawLog,
     columns: Mapping[str, Column | float],
     *,
     states: Sequence[ChannelLike],
@@ -74,7 +74,7 @@ def read_log(
     longest_delay: float = 0.0,
     budget: Budget | None = None,
 ) -> tuple[Log, ...]:
-    """Read one file or folder into logs without gaps, episode by episode.
+    """Read a file, a folder or columns into logs without gaps, episode by episode.
 
     A number for an input holds it constant. ``time`` is a column, in a bag "header" or
     "log"; ``period`` in s stands for it where rows are even; ``episode`` is a column of
@@ -84,8 +84,9 @@ def read_log(
     Reading may take the ``budget``: 2 GiB unpacked and 60 s, if None (E126).
     Raises `InputError` with the codes of bad recordings (E101 to E141, E180, E182).
     """
-    path = Path(path)
-    checks.check_names(columns, states, actions, shown(path))
+    path = path if isinstance(path, RawLog) else Path(path)
+    place = path.name if isinstance(path, RawLog) else shown(path)
+    checks.check_names(columns, states, actions, place)
     named = time.column if isinstance(time, Column) else time
     clock = time if isinstance(time, Column) else Column(time or TIME, "s")
     plan = _Plan(
@@ -100,10 +101,10 @@ def read_log(
         )
     except InputError as error:
         raise _or_constant(error, plan) from error
-    about = checks.unused(_left(found[0].tables), shown(path))
+    about = checks.unused(_left(found[0].tables), place)
     logs = _episodes(found, plan, path, dict(fixed or {}), group, about)
     if not logs:
-        raise _too_short(shown(path), 1)
+        raise _too_short(place, 1)
     about += misaligned(max(logs, key=len), states, longest_delay)
     return (replace(logs[0], notes=(*logs[0].notes, *about)), *logs[1:])
 
@@ -111,17 +112,18 @@ def read_log(
 def _episodes(
     found: Sequence[Recording],
     plan: _Plan,
-    path: Path,
+    path: Path | RawLog,
     fixed: dict[str, float],
     group: int,
     about: list[Note],
 ) -> list[Log]:
     """The logs of all recordings of a file; ``about`` gets those of one row."""
-    name = path.name if path.is_dir() else path.stem
+    whole = isinstance(path, RawLog) or path.is_dir()
+    name = path.name if whole else Path(path.name).stem
     logs: list[Log] = []
     for recording in found:
         if len(found) > 1 and min(len(t.rows.numbers) for t in recording.tables) < 2:
-            text = f"episode {recording.episode} of {shown(path)} has one row"
+            text = f"episode {recording.episode} of {name} has one row"
             about.append(Note("W116", f"{text}: it is left out"))
             continue
         called = f"{name}[{recording.episode}]" if recording.episode else name

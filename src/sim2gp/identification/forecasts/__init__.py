@@ -1,1 +1,1 @@
-"""What a posterior predicts of logs, how wide its bands are, and how both are judged."""
+"""What a posterior predicts of logs, its bands, and how both are judged."""

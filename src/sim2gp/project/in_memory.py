@@ -1,0 +1,99 @@
+"""A machine and logs from Python, as a project file would have them."""
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from sim2gp.data.logs import Log, RawLog, none_unused
+from sim2gp.errors import InputError
+from sim2gp.project.project import IN_MEMORY, Project
+from sim2gp.project.source import parsed
+from sim2gp.project.validate import validated
+from sim2gp.systems.base import AbstractSystem
+from sim2gp.systems.machine import as_machine
+
+Logs = Sequence[Log | RawLog] | Log | RawLog
+
+
+def project_of_machine(
+    machine: AbstractSystem,
+    *,
+    name: str = "machine",
+    likelihood: Mapping[str, Any] | None = None,
+    limits: Mapping[str, tuple[float, float]] | None = None,
+    rates: Mapping[str, float] | None = None,
+) -> Project:
+    """A project without a file; the tables are those of the project file.
+
+    Raises `InputError` E141, E144 and E160 as `load_project` does.
+    """
+    tables = {"likelihood": likelihood, "limits": limits, "rates": rates}
+    text = f"system = {json.dumps(IN_MEMORY)}\n"
+    for table, values in tables.items():
+        rows = [f"{json.dumps(k)} = {_toml(v)}" for k, v in (values or {}).items()]
+        text += "\n".join([f"[{table}]", *rows, ""]) if rows else ""
+    source = parsed(text, f"{name} (in memory)")
+    return Project(Path(f"{name}.toml"), source, validated(source), as_machine(machine))
+
+
+def project_and_logs(
+    machine: Project | AbstractSystem, logs: Logs | None, *, alike: bool = False
+) -> tuple[Project, tuple[Log, ...]]:
+    """Both as a command needs them: of a project its own logs, where none are given.
+
+    ``alike``: of a machine in one configuration, or E160.
+    """
+    project = machine if isinstance(machine, Project) else project_of_machine(machine)
+    if logs is None:
+        return project, project.load_logs(alike=alike)
+    if alike:
+        project.check_alike()
+    return project, as_logs(project, logs)
+
+
+def as_logs(project: Project, logs: Logs) -> tuple[Log, ...]:
+    """Logs as they are, columns read and checked by the project (E101 to E160)."""
+    given = (logs,) if isinstance(logs, Log | RawLog) else tuple(logs)
+    found: list[Log] = []
+    for log in given:
+        found += [log] if isinstance(log, Log) else project.read_logs([log])
+    if not found:
+        raise InputError(
+            "E160",
+            "no logs",
+            where="logs",
+            got="an empty list",
+            expected="at least one",
+            fix="give Log.of(time=..., ...), or what read_logs returns",
+        )
+    return tuple(found)
+
+
+def read_logs(
+    files: Iterable[Path | str] | Path | str,
+    machine: Project,
+    configuration: str | None = None,
+    *,
+    strict: bool = False,
+) -> tuple[Log, ...]:
+    """Files of a project's machine, read as its own logs are (E101 to E141).
+
+    ``configuration`` names the machine's, where it has several; ``strict`` refuses
+    columns that nothing takes (E105).
+    """
+    given = [files] if isinstance(files, Path | str) else list(files)
+    found = machine.read_logs(given, configuration)
+    if strict:
+        none_unused(found)
+    return found
+
+
+def _toml(value: Any) -> str:
+    """A number, a word, a pair, or a table of them."""
+    if isinstance(value, Mapping):
+        inner = (f"{json.dumps(str(k))} = {_toml(v)}" for k, v in value.items())
+        return "{" + ", ".join(inner) + "}"
+    if isinstance(value, tuple | list):
+        return "[" + ", ".join(_toml(x) for x in value) + "]"
+    return json.dumps(value) if isinstance(value, str | bool) else repr(float(value))
