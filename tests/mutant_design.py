@@ -187,8 +187,8 @@ DESIGN = (
     Mutant(
         "export: the plain posterior leaves without being asked for",
         "commands/export.py",
-        'if posterior == "corrected" else fit.plain',
-        'if posterior == "plain" else fit.plain',
+        'if posterior == "corrected" else found.plain',
+        'if posterior == "plain" else found.plain',
         ("test_project_model.py", "as_wide_as_its_report"),
     ),
     Mutant(

@@ -249,8 +249,8 @@ ON_THE_HOST = (
     Mutant(
         "apply: the file may be another one",
         "commands/identification.py",
-        "    _check_fitted(project.spec.system, project.system.parameters, x)\n",
-        "",
+        "    _check_fitted(project.spec.system, project.system.parameters, stored",
+        "    print(stored",
         ("test_project_model.py", "changed_in_place"),
     ),
     Mutant(

@@ -50,10 +50,12 @@ def identify(
                 p.name: {"sd": p.sd} for p in project.system.parameters.free
             },
             "seed": seed,
-            "check": check,
-            "nuts": nuts,
-            "longer": longer,
-            "held_out": held_out,
+            "asked": {
+                "check": check,
+                "nuts": nuts,
+                "longer": longer,
+                "held_out": held_out,
+            },
             "warnings": note_lines(logs),
         }
     )

@@ -254,10 +254,10 @@ def test_identify_of_a_small_project(
     assert said.err == ""
     stored = Path("runs", "arm", "summary.json").read_text()
     assert json.loads(stored) == json.loads(said.out)
-    assert not json.loads(stored)["check"]
+    assert not json.loads(stored)["asked"]["check"]
     words = ["identify", "arm.toml", "--check", "--json", "--quiet", "--out", "two"]
     assert main(words) == 0
-    said = json.loads(capsys.readouterr().out)
+    said = json.loads(capsys.readouterr().out)["asked"]
     assert (said["check"], said["held_out"]) == (True, True)
     words = ["identify", "arm.toml", "--quick", "--longer", "--nuts", "--json"]
     assert main([*words, "--quiet", "--out", "three"]) == 0

@@ -9,11 +9,12 @@ import sim2gp as sg
 
 NAMES = """
 AbstractBelief AbstractModel AbstractPlanner AbstractSystem Auto Box Channel
-FunctionSpace Gaussian ICEM InputError MPC MPPI NLM Parameter Parameters PointEstimate
-PriorMean Residual ResidualFunctionSpace SAC Sim2GP Sim2GPError Task Transitions Windows
-World __version__ bounded cut diagnose episode fit_windows load_project load_run
-log_bounded optimism positive posterior_sampling psal psrl rollout show signed sinks
-systems tasks
+FunctionSpace Gaussian ICEM InputError Limits Log MPC MPPI Machine NLM Parameter
+Parameters PointEstimate PriorMean Progress Residual ResidualFunctionSpace SAC Sim2GP
+Sim2GPError Task Transitions Windows World __version__ apply bounded compare cut demo
+design diagnose episode evaluate explain export fit_windows identify init load_project
+load_run log_bounded optimism positive posterior_sampling project_of_machine psal psrl
+read_logs reproduce rollout selftest show signed sinks systems tasks
 """
 #: Of `sim2gp.systems`, what a system of one's own is made with.
 SYSTEMS = """

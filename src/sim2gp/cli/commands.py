@@ -243,21 +243,16 @@ class Design(Writes, Chosen):
             source = import_module("sim2gp.project").load_project(path)
         else:
             source = identification(path)
-        bounds = import_module("sim2gp.experiment_design.verdict").Limits
-        asked: dict[str, Any] = {
-            "limits": bounds(
+        limits = function("experiment_design.verdict", "Limits")
+        names = "seconds kind about predict within period starts configuration seed"
+        asked = {name: getattr(self, name) for name in names.split()} | {
+            "limits": limits(
                 pairs("--limit", self.limit), rates=numbers("--rate", self.rate)
             ),
             "start": numbers("--start", self.start),
+            "progress": call.progress,
         }
-        for name in (
-            *("seconds", "kind", "about", "predict", "within", "period", "starts"),
-            *("configuration", "seed"),
-        ):
-            asked[name] = getattr(self, name)
-        return call.saved(
-            out, lambda: command("design")(source, **asked, progress=call.progress)
-        )
+        return call.saved(out, lambda: command("design")(source, **asked))
 
 
 @dataclass(kw_only=True)

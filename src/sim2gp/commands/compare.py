@@ -44,8 +44,8 @@ from sim2gp.inference.estimate import Estimate
 from sim2gp.models import NLM, FunctionSpace, Residual, ResidualFunctionSpace, Sim2GP
 from sim2gp.models.auto import log_scores
 from sim2gp.models.ensemble import ensemble
-from sim2gp.project import Project, project_and_logs
-from sim2gp.project.in_memory import Logs
+from sim2gp.project import Project
+from sim2gp.project.in_memory import Logs, project_and_logs
 from sim2gp.project.training_windows import cut_logs
 from sim2gp.runs import Progress
 from sim2gp.runs.provenance import provenance

@@ -40,8 +40,8 @@ from sim2gp.identification.forecasts.prediction import (
     units,
 )
 from sim2gp.inference.gaussian import Gaussian
-from sim2gp.project import Project, project_and_logs
-from sim2gp.project.in_memory import Logs, as_logs
+from sim2gp.project import Project
+from sim2gp.project.in_memory import Logs, as_logs, project_and_logs
 from sim2gp.project.training_windows import cut_logs
 from sim2gp.reports.motion import film
 from sim2gp.runs import Progress

@@ -68,7 +68,8 @@ class MissingPhysics(AbstractResult):
         if self.winner is None:
             notes.append(f"nothing was added to {file}: {self.answer}")
             return self.with_entries(warnings=notes)
-        gain = max(row["evidence_gain"] for row in self.candidates)
+        known = (row["evidence_gain"] for row in self.candidates)
+        gain = max(gain for gain in known if gain is not None)
         amend(
             file,
             self.winner,

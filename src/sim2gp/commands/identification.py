@@ -162,6 +162,7 @@ def physical(table: Parameters, tt: AnyArray) -> np.ndarray:
     return np.asarray(table.constrain(np.asarray(tt, float)))
 
 
+@in_float64
 def _posterior(x: Mapping[str, np.ndarray], which: Width) -> Gaussian:
     """One of the two posteriors of an identification, over virtual values."""
     prefix = _PREFIX[which]

@@ -17,7 +17,8 @@ from sim2gp.data.logs import Log, note_lines
 from sim2gp.data.windows import Windows
 from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.identification.fit import fit_windows
-from sim2gp.project import Project, project_and_logs
+from sim2gp.project import Project
+from sim2gp.project.in_memory import Logs, project_and_logs
 from sim2gp.project.training_windows import cut_places
 from sim2gp.runs import Progress
 from sim2gp.runs.provenance import provenance
@@ -27,7 +28,7 @@ from sim2gp.systems.host import simulator_of
 
 def identify(
     machine: Project | AbstractSystem,
-    logs: Sequence[Log] | Log | None = None,
+    logs: Logs | None = None,
     *,
     seed: int = 0,
     check: bool = False,

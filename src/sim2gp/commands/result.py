@@ -4,7 +4,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from sim2gp.runs import new_run
 from sim2gp.runs.store import ARRAYS, Writer, check_absent
 
 REPORT = "report.html"
+R = TypeVar("R", bound="AbstractResult")
 PROJECT = "project.toml"  # the project file's name in a run
 
 
@@ -48,7 +49,7 @@ class AbstractResult:
 
         return write_report(self.summary, self.arrays)
 
-    def with_entries(self, **entries: Any) -> Self:
+    def with_entries(self: R, **entries: Any) -> R:
         """The same with more, or other, entries of the summary."""
         return replace(self, summary=self.summary | entries)
 
@@ -68,7 +69,7 @@ class AbstractResult:
             self.at(folder).write(writer)
         return folder
 
-    def at(self, folder: Path) -> Self:
+    def at(self: R, folder: Path) -> R:
         """The same, its summary as it will stand in ``folder``."""
         if self.project is None:
             return self

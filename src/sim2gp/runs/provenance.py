@@ -21,9 +21,12 @@ def reproduce(
     return f"sim2gp reproduce {figure} {numbers}{options}"
 
 
-def provenance(started: float) -> dict[str, Any]:
-    """Keys of the summary; ``started`` is the `time.perf_counter` of the start."""
-    return {
+def provenance(started: float, line: str | None = None) -> dict[str, Any]:
+    """Keys of the summary; ``started`` is the `time.perf_counter` of the start.
+
+    ``line`` is a command that makes the same run, where that is not the one typed.
+    """
+    return ({} if line is None else {"command_line": line}) | {
         "versions": {"python": platform.python_version()}
         | {name: version(name) for name in PACKAGES}
         | {name: version(name) for name in OPTIONAL if name in sys.modules},

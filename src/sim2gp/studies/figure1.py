@@ -80,7 +80,7 @@ def run(*, out: Path, seed: int, quick: bool, progress: Progress) -> dict[str, A
             table, prior, posterior, key=jax.random.fold_in(key, 3), count=500
         )
         line = f"sim2gp reproduce fig1 --seed {seed}{' --quick' * quick}"
-        summary |= {"command_line": line, **provenance(started)}
+        summary |= provenance(started, line)
         from sim2gp.reports import figure1, figure_bytes, write_report
 
         writer.write_summary(summary)

@@ -86,10 +86,14 @@ def run(
         for c in CONDITIONS
         for w in methods
     }
-    numbers = range(seed, seed + seeds)
     with new_run(out, f"reproduce {figure}") as writer:
         table, details = study(
-            groups, numbers, out, workers=workers, progress=progress, old=old
+            groups,
+            range(seed, seed + seeds),
+            out,
+            workers=workers,
+            progress=progress,
+            old=old,
         )
         check = claims if figure == "fig2" else off_policy_claims
         summary: dict[str, Any] = {
@@ -107,8 +111,7 @@ def run(
             "claims": check(table, np.random.default_rng(seed)),
             **details,
             "tables": [_table(table, methods)],
-            "command_line": reproduce(figure, seed, seeds, episodes, quick, old),
-            **provenance(started),
+            **provenance(started, reproduce(figure, seed, seeds, episodes, quick, old)),
         }
         arrays = {f"figure2/{'/'.join(k)}": v for k, v in table.items()}
         from sim2gp.reports import figure2, figure_bytes, write_report

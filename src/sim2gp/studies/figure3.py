@@ -92,8 +92,7 @@ def run(
             "claims": claims(table, early, np.random.default_rng(seed)),
             **about,
             "tables": _tables(table, methods),
-            "command_line": reproduce(figure, seed, seeds, episodes, quick, old),
-            **provenance(started),
+            **provenance(started, reproduce(figure, seed, seeds, episodes, quick, old)),
         }
         arrays = _arrays(table, early)
         from sim2gp.reports import figure3, figure_bytes, write_report

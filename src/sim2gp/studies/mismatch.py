@@ -87,8 +87,7 @@ def run(
             "claims": claims(table, np.random.default_rng(seed)),
             **details,
             "tables": tables(table),
-            "command_line": words,
-            **provenance(started),
+            **provenance(started, words),
         }
         arrays = {f"mismatch/{'/'.join(k)}": v for k, v in table.items()}
         from sim2gp.reports import write_report
