@@ -261,7 +261,7 @@ def test_identify_of_a_small_project(
     assert (said["check"], said["held_out"]) == (True, True)
     words = ["identify", "arm.toml", "--quick", "--longer", "--nuts", "--json"]
     assert main([*words, "--quiet", "--out", "three"]) == 0
-    said = json.loads(capsys.readouterr().out)
+    said = json.loads(capsys.readouterr().out)["asked"]
     asked = [said[key] for key in ("held_out", "longer", "nuts", "check")]
     assert asked == [False, True, True, False]
 

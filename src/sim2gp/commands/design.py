@@ -223,7 +223,7 @@ def setting(
 def widths(fit: Identification) -> dict[str, Any]:
     """Which of an identification's two posteriors was used for what."""
     return used(fit.summary, "corrected") | {
-        "posterior": "LimitBox of the states and the expected motion are those of the "
+        "posterior": "Limits of the states and the expected motion are those of the "
         "corrected posterior, information and expected sd those of the plain one"
     }
 

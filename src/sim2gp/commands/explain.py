@@ -25,6 +25,7 @@ from sim2gp.identification.missing_physics.data import (
     WindowData,
 )
 from sim2gp.identification.missing_physics.explain import explain as search_missing
+from sim2gp.identification.missing_physics.search import REFITS
 from sim2gp.identification.missing_physics.words import candidate_rows, headline, table
 from sim2gp.planning.tasks import MACHINES
 from sim2gp.project import Project, load_project
@@ -88,7 +89,7 @@ def explain(
     """
     started = time.perf_counter()
     data = _data(run)
-    with (progress or Progress()).task("explain", 4) as task:
+    with (progress or Progress()).task("explain", 2 + REFITS) as task:
         found = search_missing(data, on_step=task.advance)
     candidates = candidate_rows(found)
     best = found.search.best

@@ -28,7 +28,7 @@ class Check:
     limit: float
 
 
-#: LimitBox are those of the test suite; -log10 p = 4 is one false alarm in 10,000.
+#: Limits are those of the test suite; -log10 p = 4 is one false alarm in 10,000.
 CHECKS = {
     "exactness": Check(
         "posterior and evidence of linear problems against rational arithmetic "

@@ -92,7 +92,7 @@ class LimitBox(eqx.Module):
 def input_ranges(
     system: AbstractSystem,
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-    """LimitBox of the inputs; a servo's target stays within its joint's range, too."""
+    """Limits of the inputs; a servo's target stays within its joint's range, too."""
     plant = plant_of(system)
     servos, drives = (getattr(plant, name, {}) for name in ("servos", "drives"))
     joints = {c.name: c for c in system.physical_states}
@@ -120,13 +120,16 @@ def servo_rates(system: AbstractSystem) -> dict[str, float]:
 
 
 def excess(limits: LimitBox, states: Float[Array, "T n"]) -> Float[Array, ""]:
-    """How far a trajectory leaves the box at worst, in halves of it; below 0 inside."""
+    """How far a trajectory leaves the box at worst, in halves of it; below 0 inside.
+
+    It is -1 in the middle of the box, and where nothing limits the states.
+    """
     half = 0.5 * (limits.state_high - limits.state_low)
     half = jnp.where(jnp.isfinite(half), half, 1.0)
     over = jnp.maximum(
         states - limits.state_high[None], limits.state_low[None] - states
     )
-    return jnp.max(over / half[None])
+    return jnp.max(jnp.maximum(over / half[None], -1.0))
 
 
 def all_excess(limits: LimitBox, states: Float[Array, "K T n"]) -> Float[Array, " K"]:

@@ -86,14 +86,10 @@ def run(
         for c in CONDITIONS
         for w in methods
     }
+    numbers = range(seed, seed + seeds)
     with new_run(out, f"reproduce {figure}") as writer:
         table, details = study(
-            groups,
-            range(seed, seed + seeds),
-            out,
-            workers=workers,
-            progress=progress,
-            old=old,
+            groups, numbers, out, workers=workers, progress=progress, old=old
         )
         check = claims if figure == "fig2" else off_policy_claims
         summary: dict[str, Any] = {
