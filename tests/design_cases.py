@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from sim2gp import design as d
+import sim2gp.experiment_design as d
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.systems import Delay, free_parts
 from simulated_logs import pendulum

@@ -19,7 +19,7 @@ import pytest
 from PIL import Image
 
 from report_example import Run, a_film, full_run
-from sim2gp import report
+from sim2gp import reports as report
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
 pytestmark = [

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import sim2gp.experiment_design as d
 from descents import estimate_of
 from design_cases import (
     PERIOD,
@@ -20,7 +21,6 @@ from design_cases import (
     experiment,
     limits,
 )
-from sim2gp import design as d
 from sim2gp.data.logs import Log
 from sim2gp.data.split_log import cut
 from sim2gp.data.windows_likelihood import WindowsLikelihood, information_at

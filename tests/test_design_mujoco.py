@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim2gp import design as d
+import sim2gp.experiment_design as d
 from sim2gp.experiment_design import by_samples, search
 from sim2gp.experiment_design.experiment import sensitivity_at
 from sim2gp.experiment_design.limits import excess, servo_rates

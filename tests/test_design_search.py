@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import sim2gp.experiment_design as d
 from design_cases import (
     LIMITS,
     PERIOD,
@@ -17,7 +18,6 @@ from design_cases import (
     experiment,
     limits,
 )
-from sim2gp import design as d
 from sim2gp.errors import InputError
 from sim2gp.experiment_design import by_gradients, search
 from sim2gp.experiment_design.limits import excess

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim2gp import report
+from sim2gp import reports as report
 from sim2gp.errors import NotConverged
 from sim2gp.runs import Progress, load_run
 from sim2gp.studies import figure1 as two_link

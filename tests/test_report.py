@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from report_example import Run, a_film, full_run
-from sim2gp import report
+from sim2gp import reports as report
 from sim2gp.errors import InputError
 from sim2gp.reports import markup
 from sim2gp.runs import store

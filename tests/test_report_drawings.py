@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from report_example import swing_up, two_data_sets
-from sim2gp import report
+from sim2gp import reports as report
 from sim2gp.errors import InputError
 from sim2gp.reports import densities, scenes, svg
 

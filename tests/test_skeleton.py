@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from report_example import a_film
-from sim2gp import report
+from sim2gp import reports as report
 from sim2gp.reports import scenes
 from sim2gp.reports.skeleton import camera_for, figure_entry, overlaid, skeleton
 
