@@ -89,9 +89,9 @@ INPUTS = (
     ),
     Mutant(
         "inputs: a seed may have any number of digits",
-        "cli/arguments.py",
-        "low <= int(value) <= MAX_SEED",
-        "low <= int(value)",
+        "cli/options.py",
+        "self.low <= value <= self.high",
+        "self.low <= value",
         (TESTS, "seed"),
     ),
     Mutant(

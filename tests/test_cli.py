@@ -179,7 +179,7 @@ ARGUMENTS = {
     "identify gone.toml --out there": ("E132", "not a run"),
     "evaluate": ("E160", "missing RUN|PROJECT"),
     "evaluate gone --logs a.csv": ("E130", "not a run in gone"),
-    "evaluate gone --logs": ("E160", "--logs VALUE"),
+    "evaluate gone --logs": ("E130", "not a run"),
     "evaluate there --horizon nan": ("E148", "a positive number"),
     "evaluate gone.toml": ("E130", "no such file"),
     "evaluate gone.toml --logs a.csv": ("E160", "leave --logs out"),
@@ -189,7 +189,7 @@ ARGUMENTS = {
     "reproduce fig1 --workers 2": ("E160", "leave it out"),
     "reproduce fig1 --keep-old": ("E160", "--keep-old with fig1"),
     "reproduce fig2 --refresh --keep-old": ("E160", "leave one out"),
-    "demo --json=maybe": ("E160", "maybe"),
+    "demo --json=maybe": ("E160", "got maybe"),
 }
 
 

@@ -6,22 +6,17 @@ everything else to stderr; a fault is one line, its traceback stands behind ``--
 """
 
 import contextlib
-import io
 import os
-import re
 import shlex
 import sys
 import traceback
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, Union
+from typing import Any, NoReturn
 
-import tyro
-from tyro.conf import subcommand
-
-from sim2gp.cli.arguments import check_arguments, usage_error
-from sim2gp.cli.commands import COMMANDS, Common
+from sim2gp.cli.arguments import parsed
+from sim2gp.cli.commands import COMMANDS
 from sim2gp.cli.interrupts import DONE, interruptible, leave
 from sim2gp.cli.late import Call
 from sim2gp.errors import InputError, Sim2GPError, Sim2GPWarning
@@ -89,10 +84,7 @@ def _run(args: list[str]) -> int:
 
         print(f"sim2gp {__version__}")
         return OK
-    helped = not args or "--help" in args or "-h" in args
-    if not helped:
-        check_arguments(args, COMMANDS)
-    command = _parsed(args or ["--help"])
+    command = parsed(args or ["--help"], COMMANDS)
     if command is None:
         return OK if args else INPUT
     progress = Progress(quiet=command.quiet)
@@ -112,31 +104,6 @@ def _run(args: list[str]) -> int:
         print_summary(summary, f"sim2gp {name}")
     sys.stdout.flush()
     return BUG if summary.get("passed") is False else OK
-
-
-def _parsed(args: list[str]) -> Common | None:
-    """The command as a record; None where tyro printed a help page."""
-    kinds = tuple(
-        Annotated[kind, subcommand(name, description=kind.__doc__)]
-        for name, kind in COMMANDS.items()
-    )
-    errors = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(errors):
-            found: Common = tyro.cli(
-                Union[kinds],  # type: ignore[call-overload]  # noqa: UP007 - a table
-                args=args,
-                prog="sim2gp",
-                description="A posterior sample is a simulator.",
-                config=(tyro.conf.FlagCreatePairsOff,),
-            )
-            return found
-    except SystemExit as stop:
-        if stop.code in (0, None):
-            return None
-    words = re.sub(r"[^\x20-\x7e]+|-{3,}", " ", errors.getvalue())
-    reason = " ".join(words.split("For full helptext")[0].split())
-    raise usage_error("arguments", " ".join(args), reason or "a command", "see --help")
 
 
 def _warner(progress: Progress, other: Callable[..., None]) -> Callable[..., None]:

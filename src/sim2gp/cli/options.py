@@ -1,21 +1,65 @@
-"""Options that several commands share."""
+"""Options that several commands share, and the types of all."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import arg
+
+MAX = 2**32 - 1
+
+
+@dataclass(frozen=True)
+class Range:
+    """Where a number must lie, and the code of an error for one that does not."""
+
+    low: int | float
+    high: int | float
+    words: str
+    code: str = "E148"
+
+    def holds(self, value: int | float) -> bool:
+        """Whether it does; never for NaN."""
+        return math.isfinite(value) and self.low <= value <= self.high
+
+
+def option(metavar: str) -> Any:
+    """How the help shows a value; a default of nothing is not shown."""
+
+    def hint(default: str) -> str:
+        return "" if default in ("None", "") else f"(default: {default})"
+
+    return arg(metavar=metavar, help_behavior_hint=hint)
+
+
+_SEEDS = Range(0, MAX, f"a whole number from 0 to {MAX}", "E149")
+_COUNTS = Range(1, MAX, f"a whole number from 1 to {MAX}")
+_POSITIVE = Range(math.ulp(0.0), math.inf, "a positive number")
+
+Flag = Annotated[bool, arg(help_behavior_hint="")]
+Seed = Annotated[int, option("INT"), _SEEDS]
+Count = Annotated[int, option("N"), _COUNTS]
+SomeCount = Annotated[int | None, option("N"), _COUNTS]
+Seconds = Annotated[float, option("S"), _POSITIVE]
+SomeSeconds = Annotated[float | None, option("S"), _POSITIVE]
+ManySeconds = Annotated[tuple[float, ...], option("S..."), _POSITIVE]
+Percent = Annotated[float, option("PERCENT"), _POSITIVE]
+Factor = Annotated[float, option("FACTOR"), _POSITIVE]
+Folder = Annotated[Path | None, option("DIR")]
+File = Annotated[Path | None, option("FILE")]
+Name = Annotated[str | None, option("NAME")]
 
 
 @dataclass(kw_only=True)
 class Common:
     """Options that every command has."""
 
-    json: bool = False
+    json: Flag = False
     """Print the summary alone, as JSON, on stdout."""
-    quiet: bool = False
+    quiet: Flag = False
     """No progress and no notes."""
-    debug: bool = False
+    debug: Flag = False
     """Show the traceback of an error."""
 
 
@@ -23,7 +67,7 @@ class Common:
 class Writes(Common):
     """Options of a command that writes a run directory."""
 
-    out: Annotated[Path | None, arg(metavar="DIR")] = None
+    out: Folder = None
     """The run directory; default runs/NAME."""
 
 
@@ -31,7 +75,7 @@ class Writes(Common):
 class Chosen(Common):
     """The option of a command that needs the machine as it stands."""
 
-    configuration: Annotated[str | None, arg(metavar="NAME")] = None
+    configuration: Name = None
     """Which one, where groups of logs are of several."""
 
 
@@ -47,7 +91,7 @@ class Wide(Chosen):
 class Budgeted(Common):
     """The option of a command that reads recordings."""
 
-    budget: Annotated[float, arg(metavar="FACTOR")] = 1.0
+    budget: Factor = 1.0
     """Times 2 GiB and 60 s: what a log may unpack to, and how long reading may take."""
 
 
@@ -55,5 +99,5 @@ class Budgeted(Common):
 class Reads(Writes, Budgeted):
     """Options of a command that reads logs."""
 
-    strict: bool = False
+    strict: Flag = False
     """Refuse logs with columns that nothing takes."""

@@ -13,6 +13,7 @@ LONGEST = 12  # numbers of a list that are still printed
 # of its own says some of it better.
 _HIDDEN = (
     *("warnings", "versions", "animation", "figure1", "units", "tables", "command"),
+    "headline",
     *("configurations", "candidates", "misfit_as_it_is", "diff"),
     *(
         "intervals.allowed_for",
@@ -40,6 +41,8 @@ def print_summary(summary: Mapping[str, Any], title: str) -> None:
     # Away from a terminal nothing may be folded: a pipe has no width.
     width = None if sys.stdout.isatty() else 160
     console = Console(file=sys.stdout, width=width, highlight=False)
+    if summary.get("headline"):
+        console.print(str(summary["headline"]), markup=False)
     singles = Table(title=title, show_header=False, title_justify="left")
     for key, text in _singles(summary):
         singles.add_row(key, text)

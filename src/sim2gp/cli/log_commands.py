@@ -1,0 +1,186 @@
+"""The commands on models and logs: init, identify, evaluate, explain, compare."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from tyro.conf import Positional, arg
+
+from sim2gp.cli.arguments import numbers, usage_error
+from sim2gp.cli.late import (
+    Call,
+    FirstFolder,
+    budget,
+    command,
+    function,
+    identification,
+    read_project,
+    read_run,
+    run_directory,
+)
+from sim2gp.cli.options import (
+    Chosen,
+    Common,
+    File,
+    Flag,
+    Folder,
+    ManySeconds,
+    Reads,
+    Seconds,
+    Seed,
+    SomeSeconds,
+    option,
+)  # fmt: skip
+from sim2gp.runs.store import check_absent
+
+
+@dataclass(kw_only=True)
+class Init(Common):
+    """Draft a project file from a model and logs: columns, signs, units, zeros."""
+
+    model: Annotated[Positional[str], arg(metavar="MODEL")]
+    """A bundled machine's name, or an MJCF or URDF file."""
+    logs: Annotated[Positional[tuple[Path, ...]], arg(metavar="LOGS...")] = ()
+    """Recordings of the machine, alike in their columns; none designs the first one."""
+    out: File = None
+    """The project file; default MODEL's name, here."""
+    root: Folder = None
+    """The folder that holds all files of the model; default the model's own."""
+    period: SomeSeconds = None
+    """Time between rows in s, where no column says it."""
+    constant: Annotated[tuple[str, ...], option("NAME=VALUE...")] = ()
+    """Inputs that the logs have no column of, and the number they were held at."""
+    budget: Seconds = 60.0
+    """What it may take; readings that were not tried by then are named in the file."""
+    no_readings: Flag = False
+    """Take signs, zeros and units as they stand."""
+    seed: Seed = 0
+    """Draws the phases of the first experiment."""
+
+    def run(self, call: Call) -> dict[str, Any]:
+        out = self.out or Path(Path(self.model).stem + ".toml")
+        check_absent(out)
+        return command("init")(
+            self.model,
+            self.logs,
+            out=out,
+            root=self.root,
+            period=self.period,
+            constant=numbers("--constant", self.constant),
+            readings=not self.no_readings,
+            seconds=self.budget,
+            seed=self.seed,
+            progress=call.progress,
+        )
+
+
+@dataclass(kw_only=True)
+class Identify(Reads):
+    """Posterior of a machine's constants from its logs."""
+
+    project: Annotated[Positional[Path], arg(metavar="PROJECT")]
+    """The project file (TOML)."""
+    seed: Seed = 0
+    """Draws the starts of the fit."""
+    check: Flag = False
+    """Hold the posterior against the exact one (Pareto k); takes as long again."""
+    nuts: Flag = False
+    """Hold it against draws by NUTS, too (extra mcmc); half an hour and more."""
+    longer: Flag = False
+    """Fit windows five times as long, too: do they tell more?"""
+    quick: Flag = False
+    """No second fit, which forecasts data that it has not seen."""
+
+    def run(self, call: Call) -> dict[str, Any]:
+        out = run_directory(self.out, self.project.stem)
+        read = read_project(self.project, self)
+        first = FirstFolder(out)
+        summary = call.saved(
+            out,
+            lambda: command("identify")(
+                *read,
+                seed=self.seed,
+                check=self.check,
+                nuts=self.nuts,
+                longer=self.longer,
+                held_out=not self.quick,
+                first=first,
+                progress=call.progress,
+            ),
+        )
+        first.replaced()
+        return summary
+
+
+@dataclass(kw_only=True)
+class Evaluate(Reads, Chosen):
+    """Prediction of logs that a fit has not seen."""
+
+    run_or_project: Annotated[Positional[Path], arg(metavar="RUN|PROJECT")]
+    """An identify run to test; a project file leaves out its logs one by one."""
+    logs: Annotated[tuple[Path, ...], option("FILE...")] = ()
+    """The logs to predict (with a run)."""
+    horizon: Seconds = 0.2
+    """Open-loop horizon in s."""
+
+    def run(self, call: Call) -> dict[str, Any]:
+        path = self.run_or_project
+        out = run_directory(self.out, f"evaluate-{path.stem}")
+        how = {"horizon": self.horizon, "progress": call.progress}
+        if path.suffix == ".toml":
+            for option in ("logs", "configuration"):
+                if getattr(self, option):
+                    fix = f"leave --{option} out, or name a run"
+                    expected = "a project file alone: its own logs are left out"
+                    raise usage_error("too much", f"--{option}", expected, fix)
+            read = read_project(path, self)
+            return call.saved(out, lambda: command("evaluate")(*read, **how))
+        read_run(path)
+        if not self.logs:
+            expected, fix = "--logs FILE...", "name the logs to predict"
+            raise usage_error("no logs", "no --logs", expected, fix)
+        fit = identification(path).within(budget(self.budget))
+        tested = fit.read_logs(self.logs, self.configuration, strict=self.strict)
+        return call.saved(out, lambda: command("evaluate")(fit, tested, **how))
+
+
+@dataclass(kw_only=True)
+class Explain(Reads):
+    """What physics a simulator lacks: nothing, an effect, or none of these."""
+
+    path: Annotated[Positional[Path], arg(metavar="RUN")]
+    """The folder of identify or demo."""
+    add: Flag = False
+    """Write the winner into the project file, so that identify fits it."""
+
+    def run(self, call: Call) -> dict[str, Any]:
+        out = run_directory(self.out, f"explain-{self.path.name}")
+        module = "commands.explain"
+        run = function(module, "explainable")(
+            self.path, budget(self.budget), strict=self.strict
+        )
+        file = function(module, "project_file")(run) if self.add else None
+
+        def found() -> Any:
+            missing = command("explain")(run, progress=call.progress)
+            return missing if file is None else missing.add_to(file)
+
+        return call.saved(out, found)
+
+
+@dataclass(kw_only=True)
+class Compare(Reads):
+    """Which model the logs support: simulator, residual, function space, black box."""
+
+    project: Annotated[Positional[Path], arg(metavar="PROJECT")]
+    """The project file (TOML)."""
+    seed: Seed = 0
+    """Draws networks and forecasts."""
+    horizon: ManySeconds = (0.2, 0.5)
+    """Open-loop horizons in s."""
+
+    def run(self, call: Call) -> dict[str, Any]:
+        out = run_directory(self.out, f"compare-{self.project.stem}")
+        read = read_project(self.project, self, alike=True)
+        how = {"horizons": self.horizon, "seed": self.seed, "progress": call.progress}
+        return call.saved(out, lambda: command("compare")(*read, **how))
