@@ -41,7 +41,7 @@ def test_an_effect_becomes_a_free_constant(project: Path) -> None:
     text = project.read_text()
     assert text.startswith(TEXT)
     assert text.endswith(
-        "\n# found on a Monday\n[effects.x.spring]\nmean = 0.0\nsd = 8.0\n"
+        "\n[effects.x.spring]\n# found on a Monday\nmean = 0.0\nsd = 8.0\n"
     )
     table = load_project(project).system.parameters
     assert table.names[-1] == "x.spring"
@@ -68,7 +68,7 @@ def test_a_delay_goes_under_the_header_that_is_there(project: Path) -> None:
     project.write_text(TEXT + '\n[actuators.voltage] # amplifier\ngain = "free"\n')
     amend(project, DELAY)
     assert (
-        "[actuators.voltage] # amplifier\ndelay = {low = 0.0, high = 0.04}\ngain ="
+        '[actuators.voltage] # amplifier\ngain = "free"\ndelay = {low = 0.0, high'
         in project.read_text()
     )
     names = load_project(project).system.parameters.names
@@ -77,7 +77,10 @@ def test_a_delay_goes_under_the_header_that_is_there(project: Path) -> None:
 
 def test_what_is_stated_is_not_overwritten(project: Path) -> None:
     stated = TEXT + "\n[actuators.voltage]\ndelay = 0.01\n"
-    with pytest.raises(InputError, match=r"E160.*stated already.*line 15.*by hand"):
+    with pytest.raises(
+        InputError,
+        match=r"E160.*stated already.*actuators.voltage.delay.*got 0.01.*by hand",
+    ):
         amended(stated, DELAY)
     project.write_text(stated)
     with pytest.raises(InputError, match=r"E160.*stated already"):
@@ -87,12 +90,37 @@ def test_what_is_stated_is_not_overwritten(project: Path) -> None:
         amended(TEXT, Candidate(sy.Lag("voltage", 0.04)))
 
 
-def test_a_file_that_cannot_take_a_table_stays_as_it_was(project: Path) -> None:
-    inline = TEXT.replace(
-        "\n[parameters]", "effects = {x = {drag = 1.0}}\n[parameters]"
+def test_an_inline_table_is_edited_in_place(project: Path) -> None:
+    project.write_text(
+        TEXT.replace("\n[parameters]", "effects = {x = {drag = 1.0}}\n[parameters]")
     )
-    project.write_text(inline)
-    with pytest.raises(InputError, match=r"E160.*\[effects\.x\.spring\]"):
+    amend(project, SPRING)
+    assert "effects = {x = {drag = 1.0, spring = {mean = 0.0, sd = 8.0}}}\n" in (
+        project.read_text()
+    )
+    assert load_project(project).system.parameters.names[-1] == "x.spring"
+
+
+def test_a_table_goes_next_to_its_likes(project: Path) -> None:
+    drag = "[effects.theta.drag]  # of the hinge\nvalue = 0.1\n\n"
+    drag += "[likelihood]\nwindow = 1\n"
+    project.write_text(f"{TEXT}\n{drag}")
+    amend(project, SPRING)
+    rest = drag.replace(
+        "\n[l", "\n[effects.x.spring]\n# added by sim2gp\nmean = 0.0\nsd = 8.0\n[l"
+    )
+    assert project.read_text().split() == f"{TEXT}\n{rest}".split()
+
+
+def test_a_file_that_became_no_project_stays_as_it_was(
+    project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "sim2gp.project.amend.amended", lambda *given: TEXT + "[effects.x.sprng]\n"
+    )
+    with pytest.raises(
+        InputError, match=r"E160.*cannot be added.*\[effects\.x\.spring\]"
+    ):
         amend(project, SPRING)
-    assert project.read_text() == inline
+    assert project.read_text() == TEXT
     assert [p.name for p in project.parent.iterdir()] == ["cart.toml"]

@@ -1,70 +1,88 @@
-"""A project file gets one more line of physics: text in, checked text out.
+"""A project file gets one more piece of physics; all else in it stays as it is.
 
-The file stays the user's: comments and order are kept, a table is appended or one line
-is put under the header of a table that is there. The new text is read like any project
-file before it replaces the old one, whole or not at all.
+tomlkit keeps comments, order and layout. The new text is read like any project file
+before it replaces the old one, whole or not at all.
 """
 
 import dataclasses
 from pathlib import Path
+from typing import Any
+
+import tomlkit
+from tomlkit.items import AbstractTable, InlineTable
 
 from sim2gp.errors import InputError, Sim2GPError
 from sim2gp.project.project import Project
-from sim2gp.project.replace import key, replace_project
+from sim2gp.project.replace import replace_project
 from sim2gp.project.schema import EFFECT_OPTIONS
 from sim2gp.systems import Candidate, Delay, Lag
 
+_NOTE = "added by sim2gp"
 
-def lines_for(candidate: Candidate) -> tuple[str, list[str]]:
-    """Header and lines of the table that frees a candidate (E160 for a lag)."""
+
+def addition(candidate: Candidate) -> tuple[tuple[str, ...], dict[str, Any]]:
+    """The table that frees a candidate, and its entries (E160 for a lag)."""
     effect = candidate.effect
-    where = key(effect.where)
     if not isinstance(effect, Delay | Lag):
-        lines = ["mean = 0.0", f"sd = {effect.magnitude!r}"]
+        entries: dict[str, Any] = {"mean": 0.0, "sd": effect.magnitude}
         for field in dataclasses.fields(effect):
             value = getattr(effect, field.name)
             if field.name in EFFECT_OPTIONS and value != field.default:
-                lines.append(f"{field.name} = {value!r}")
-        return f"[effects.{where}.{effect.what}]", lines
+                entries[field.name] = value
+        return ("effects", effect.where, effect.what), entries
     if isinstance(effect, Delay):
-        box = f"{{low = 0.0, high = {effect.magnitude!r}}}"
-        return f"[actuators.{where}]", [f"delay = {box}"]
+        bounds = tomlkit.inline_table()
+        bounds.update({"low": 0.0, "high": effect.magnitude})
+        return ("actuators", effect.where), {"delay": bounds}
     raise InputError(
         "E160",
         "a lag in a project file",
         got=candidate.name,
         expected="an effect or a delay",
-        fix=f'use delay = "free" under [actuators.{where}]',
+        fix=f'use delay = "free" under [actuators.{effect.where}]',
     )
 
 
-def amended(text: str, candidate: Candidate, note: str = "") -> str:
-    """The text with the candidate as a free constant (E160 where it is stated)."""
-    header, lines = lines_for(candidate)
-    rows = text.split("\n")
-    bare = header.replace(" ", "")
-    plain = [row.split("#")[0].replace(" ", "").strip() for row in rows]
-    at = [i for i, row in enumerate(plain) if row == bare]
-    if not at:
-        remark = [f"# {note}"] if note else []
-        return "\n".join([text.rstrip("\n"), "", *remark, header, *lines, ""])
-    key = lines[0].split("=")[0].strip()
-    for i, row in enumerate(rows[at[0] + 1 :], at[0] + 1):
-        if row.lstrip().startswith("["):
-            break
-        if row.split("=")[0].strip() == key:
-            raise InputError(
-                "E160",
-                f"{candidate.name} is stated already",
-                where=f"line {i + 1}",
-                got=row.strip(),
-                expected=lines[0],
-                fix="replace the line by hand",
-            )
-    return "\n".join([*rows[: at[0] + 1], *lines, *rows[at[0] + 1 :]])
+def amended(text: str, candidate: Candidate, note: str = _NOTE) -> str:
+    """The text with the candidate as a free parameter (E160 where it is stated)."""
+    place, entries = addition(candidate)
+    document = tomlkit.parse(text)
+    table: Any = document
+    for depth, name in enumerate(place):
+        if name not in table:
+            table.append(name, _table_in(table, note * (depth == len(place) - 1)))
+        table = table[name]
+        if not isinstance(table, AbstractTable):
+            raise _stated(candidate, ".".join(place[: depth + 1]), table)
+    for key, value in entries.items():
+        if key in table:
+            raise _stated(candidate, ".".join([*place, key]), table[key])
+        table.append(key, value)
+    return tomlkit.dumps(document)
 
 
-def amend(path: Path, candidate: Candidate, note: str = "") -> None:
+def _table_in(parent: Any, note: str) -> Any:
+    """A new table: inline where its parent is, else with a header or parts below."""
+    if isinstance(parent, InlineTable):
+        return tomlkit.inline_table()
+    table = tomlkit.table(is_super_table=not note)
+    if note:
+        table.add(tomlkit.comment(note))
+    return table
+
+
+def _stated(candidate: Candidate, key: str, value: Any) -> InputError:
+    return InputError(
+        "E160",
+        f"{candidate.name} is stated already",
+        where=f"key {key}",
+        got=tomlkit.item(value).as_string(),
+        expected="a key that is not there",
+        fix="replace the line by hand",
+    )
+
+
+def amend(path: Path, candidate: Candidate, note: str = _NOTE) -> None:
     """Add a candidate to a project file (E160 where the result is not one)."""
     text = amended(path.read_text(encoding="utf-8"), candidate, note)
 
@@ -75,12 +93,13 @@ def amend(path: Path, candidate: Candidate, note: str = "") -> None:
     try:
         replace_project(path, text, freed)
     except Sim2GPError as error:
-        header, lines = lines_for(candidate)
+        place, entries = addition(candidate)
+        lines = [f"{key} = {tomlkit.item(v).as_string()}" for key, v in entries.items()]
         raise InputError(
             "E160",
             f"{candidate.name} cannot be added",
             where=str(path),
             got=f"{error.code} {error.what}",
-            expected="a file that can end with a table more",
-            fix="add by hand: " + ", ".join([header, *lines]),
+            expected="a file that can take one more table",
+            fix="add by hand: " + ", ".join([f"[{'.'.join(place)}]", *lines]),
         ) from error
