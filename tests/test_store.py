@@ -4,8 +4,10 @@ import contextlib
 import errno
 import json
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,7 @@ from hypothesis.extra import numpy as hnp
 from sim2gp.errors import InputError, Sim2GPError
 from sim2gp.runs import DiskError, Progress, load_run, new_run
 from sim2gp.runs.plain import to_json
+from sim2gp.runs.progress import time_left
 from sim2gp.runs.sealed import seal, unseal
 
 
@@ -282,3 +285,37 @@ def test_progress_lines(capsys: pytest.CaptureFixture[str]) -> None:
     assert list(quiet.track("abc", "letters")) == ["a", "b", "c"]
     quiet.say("nothing")
     assert capsys.readouterr().err == ""
+
+
+def test_time_left_is_at_the_same_pace() -> None:
+    assert time_left(1, 4, 20.0) == "60 s left"
+    assert time_left(2, 4, 600.0) == "10 min left"
+    assert [time_left(n, 4, 1.0) for n in (0, 4)] == ["", ""]
+    assert time_left(9, 10, 1.0) == ""
+
+
+def test_a_notebook_has_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stand-in for IPython: what is displayed, and how it changes."""
+    pages: list[str] = []
+
+    class Shown:
+        def update(self, page: str) -> None:
+            pages.append(page)
+
+    def display(page: str, *, display_id: bool) -> Shown:
+        assert display_id
+        pages.append(page)
+        return Shown()
+
+    module = ModuleType("IPython.display")
+    module.HTML = str  # type: ignore[attr-defined]
+    module.display = display  # type: ignore[attr-defined]
+    for name in ("ipykernel", "IPython"):
+        monkeypatch.setitem(sys.modules, name, ModuleType(name))
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    with Progress().task("fit", 2) as task:
+        task.advance("cost <1.5>")
+    assert '<progress value="0" max="2">' in pages[0]
+    assert '<progress value="1" max="2"></progress> 1/2 cost &lt;1.5&gt;' in pages[1]
+    Progress(quiet=True).say("nothing")
+    assert len(pages) == 2

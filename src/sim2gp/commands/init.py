@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -46,15 +47,16 @@ def init(
         budget=Budget().times(max(1.0, seconds / 60.0)),  # of reading: more on request
     )
     if logs:
-        progress.say("matching columns, then trying readings of them on the machine")
-        return told(draft_project(asked), out)
+        with progress.task("init", 3) as task:
+            return told(draft_project(replace(asked, step=task.advance)), out)
     table = out.with_name(f"{out.stem}-experiment.csv")
     check_absent(table)
-    draft = draft_project(asked)
-    summary = told(draft, out)
-    progress.say("simulating a first experiment")
-    until = asked.started + seconds
-    found = safe_excitation(draft.system, key=jax.random.key(seed), until=until)
+    with progress.task("init", 2) as task:
+        draft = draft_project(replace(asked, step=task.advance))
+        summary = told(draft, out)
+        until = asked.started + seconds
+        found = safe_excitation(draft.system, key=jax.random.key(seed), until=until)
+        task.advance("a first experiment")
     summary["experiment"] = found.words
     if found.commands is not None and found.states is not None:
         replace_file(table, _csv(draft.system, found).encode(), lambda _: None)

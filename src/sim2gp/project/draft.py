@@ -7,7 +7,7 @@ its place. Without recordings the file says which columns they need.
 """
 
 import time
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -62,6 +62,7 @@ class Request:
     constant: inputs that have no column, and the number that each was held at.
     readings: whether signs, zeros and units are tried; ``seconds`` that the whole draft
         may take from ``started`` (of `time.monotonic`).
+    step: gets the name of each stage that is done: three with logs, one without.
     """
 
     model: str
@@ -74,6 +75,7 @@ class Request:
     seconds: float = 60.0
     started: float = field(default_factory=time.monotonic)
     budget: Budget = field(default_factory=Budget)
+    step: Callable[[str], None] = lambda done: None
 
 
 @dataclass(frozen=True)
@@ -97,8 +99,10 @@ def draft_project(asked: Request) -> Draft:
     if not asked.files:
         bare = Contents(asked.model, (), asked.out, system, asked.root)
         replace_project(asked.out, draft_text(bare), lambda _: None)
+        asked.step("project file")
         return Draft(system, draft_text(bare), {}, Found({}))
     time_, columns, travel = _columns(asked, system)
+    asked.step("columns matched; trying readings")
     options = _options(system, columns, travel)
     read = {n: _in_unit(n, m.column, options) for n, m in columns.items()}
     logs, mended = _mended_logs(asked, system, read, time_)
@@ -107,6 +111,7 @@ def draft_project(asked: Request) -> Draft:
     if not asked.readings:
         until = -np.inf
     found = find_readings(system, question, until=until)
+    asked.step("readings tried; choosing what is open")
     reason = f"the {asked.seconds:g} s were over" if asked.readings else "--no-readings"
     said = {n: _as_read(n, m, found, options, reason) for n, m in columns.items()}
     contents = Contents(
@@ -128,6 +133,7 @@ def draft_project(asked: Request) -> Draft:
         contents = replace(contents, selection=selection, unselected=why)
         text = draft_text(contents)
         replace_project(asked.out, text, lambda _: None)
+    asked.step("project file")
     return Draft(system, text, said, found, contents.selection)
 
 

@@ -1,14 +1,16 @@
-"""Progress for people: bars on a terminal, plain lines elsewhere, nothing when quiet.
+"""Progress for people: a bar on a terminal or in a notebook, plain lines elsewhere.
 
-Everything goes to the error stream, so that ``--json`` leaves stdout to the summary.
+Nothing is shown when quiet. Everything goes to the error stream, so that ``--json``
+leaves stdout to the summary.
 """
 
+import html
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from sim2gp import cleanup
 
@@ -36,7 +38,7 @@ def _silent(task: Task, note: str) -> None:
 
 def _lines(seconds: float = 2.0) -> Callable[[Task, str], None]:
     """A line for the last part, and before it at most one every two seconds."""
-    last = float("-inf")
+    last, started = float("-inf"), time.monotonic()
 
     def show(task: Task, note: str) -> None:
         nonlocal last
@@ -44,8 +46,9 @@ def _lines(seconds: float = 2.0) -> Callable[[Task, str], None]:
         if task.done < task.total and now - last < seconds:
             return
         last = now
-        text = f"{task.label}: {task.done}/{task.total}"
-        print(f"{text}  {note}".rstrip(), file=sys.stderr, flush=True)
+        text = f"{task.label}: {task.done}/{task.total}  {note}".rstrip()
+        left = time_left(task.done, task.total, now - started)
+        print(f"{text}, {left}" if left else text, file=sys.stderr, flush=True)
 
     return show
 
@@ -66,6 +69,8 @@ class Progress:
         """A job of ``total`` parts: a bar while the block runs, or plain lines."""
         if self.quiet:
             yield Task(label, total, _silent)
+        elif "ipykernel" in sys.modules:
+            yield Task(label, total, _in_notebook(label, total))
         elif sys.stderr.isatty():
             with _bar(label, total) as task:
                 yield task
@@ -79,6 +84,36 @@ class Progress:
             for item in items:
                 yield item
                 task.advance()
+
+
+def time_left(done: int, total: int, seconds: float) -> str:
+    """How long the rest takes at the same pace; nothing below a second, or unknown."""
+    if not 0 < done < total:
+        return ""
+    left = seconds * (total - done) / done
+    if left < 1.0:
+        return ""
+    return f"{left:.0f} s left" if left < 90.0 else f"{left / 60.0:.0f} min left"
+
+
+def _in_notebook(label: str, total: int) -> Callable[[Task, str], None]:
+    """One line of the cell's output, drawn again after each part."""
+    from IPython.display import HTML, display
+
+    started = time.monotonic()
+
+    def page(done: int, note: str) -> Any:
+        left = time_left(done, total, time.monotonic() - started)
+        words = " &middot; ".join(html.escape(x) for x in (note, left) if x)
+        bar = f'<progress value="{done}" max="{total}"></progress>'
+        return HTML(f"{html.escape(label)} {bar} {done}/{total} {words}")
+
+    shown = display(page(0, ""), display_id=True)
+
+    def show(task: Task, note: str) -> None:
+        shown.update(page(task.done, note))
+
+    return show
 
 
 @contextmanager
@@ -97,13 +132,16 @@ def _bar(label: str, total: int) -> Iterator[Task]:
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
+        TextColumn("{task.fields[left]}"),
         TextColumn("{task.fields[note]}"),
     )
     bars = Bars(*columns, console=Console(stderr=True))
     with bars, cleanup.registered(bars.stop):  # or the cursor stays hidden
-        number = bars.add_task(label, total=total, note="")
+        number = bars.add_task(label, total=total, note="", left="")
+        started = time.monotonic()
 
         def show(task: Task, note: str) -> None:
-            bars.update(number, completed=task.done, note=note)
+            left = time_left(task.done, total, time.monotonic() - started)
+            bars.update(number, completed=task.done, note=note, left=left)
 
         yield Task(label, total, show)
