@@ -21,7 +21,7 @@ class Frames(HTMLParser):
 
 
 def test_a_notebook_gets_the_whole_report(tmp_path: Path) -> None:
-    summary = {"command": "identify", "headline": "a < b & \"c\" 'd'"}
+    summary = {"command": "evaluate", "headline": "a < b & \"c\" 'd'"}
     with new_run(tmp_path / "run", "identify") as writer:
         writer.write_summary(summary)
         writer.write_arrays("arrays.npz", {})

@@ -28,10 +28,12 @@ from sim2gp.cli.options import (
     Reads,
     Seconds,
     Seed,
+    SomeCount,
     SomeSeconds,
     option,
 )  # fmt: skip
 from sim2gp.runs.store import check_absent
+from sim2gp.runs.workers import cores
 
 
 @dataclass(kw_only=True)
@@ -122,11 +124,13 @@ class Evaluate(Reads, Chosen):
     """The logs to predict (with a run)."""
     horizon: Seconds = 0.2
     """Open-loop horizon in s."""
+    workers: SomeCount = None
+    """Processes (with a project file); default one per core."""
 
     def run(self, call: Call) -> dict[str, Any]:
         path = self.run_or_project
         out = run_directory(self.out, f"evaluate-{path.stem}")
-        how = {"horizon": self.horizon, "progress": call.progress}
+        how: dict[str, Any] = {"horizon": self.horizon, "progress": call.progress}
         if path.suffix == ".toml":
             for option in ("logs", "configuration"):
                 if getattr(self, option):
@@ -134,6 +138,7 @@ class Evaluate(Reads, Chosen):
                     expected = "a project file alone: its own logs are left out"
                     raise usage_error("too much", f"--{option}", expected, fix)
             read = read_project(path, self)
+            how["workers"] = self.workers or cores()
             return call.saved(out, lambda: command("evaluate")(*read, **how))
         read_run(path)
         if not self.logs:
@@ -178,9 +183,16 @@ class Compare(Reads):
     """Draws networks and forecasts."""
     horizon: ManySeconds = (0.2, 0.5)
     """Open-loop horizons in s."""
+    workers: SomeCount = None
+    """Processes; default one per core."""
 
     def run(self, call: Call) -> dict[str, Any]:
         out = run_directory(self.out, f"compare-{self.project.stem}")
         read = read_project(self.project, self, alike=True)
-        how = {"horizons": self.horizon, "seed": self.seed, "progress": call.progress}
+        how = {
+            "horizons": self.horizon,
+            "seed": self.seed,
+            "workers": self.workers or cores(),
+            "progress": call.progress,
+        }
         return call.saved(out, lambda: command("compare")(*read, **how))

@@ -9,7 +9,9 @@ to the training logs alone.
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -19,7 +21,7 @@ from sim2gp.commands.identification import Identification
 from sim2gp.commands.result import AbstractResult, numbers
 from sim2gp.data.grid import CURVE, Grid, evaluation_windows, steps_of
 from sim2gp.data.logs import Log, Note, note_lines, shared_rows
-from sim2gp.data.windows import Windows
+from sim2gp.data.split_log import measured_states
 from sim2gp.errors import InputError
 from sim2gp.identification.forecasts.baselines import (
     forecast_sentence,
@@ -40,12 +42,13 @@ from sim2gp.identification.forecasts.prediction import (
     units,
 )
 from sim2gp.inference.gaussian import Gaussian
-from sim2gp.project import Project
+from sim2gp.project import Project, load_project
 from sim2gp.project.in_memory import Logs, as_logs, project_and_logs
 from sim2gp.project.training_windows import cut_logs
 from sim2gp.reports.motion import film
 from sim2gp.runs import Progress
 from sim2gp.runs.provenance import provenance
+from sim2gp.runs.workers import spread
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import in_float64
 
@@ -80,18 +83,21 @@ def evaluate(
     logs: Logs | None = None,
     *,
     horizon: float = 0.2,
+    workers: int = 1,
     progress: Progress | None = None,
 ) -> Evaluation:
     """Open-loop forecasts over ``horizon`` s of logs that a fit has not seen.
 
     Of an identification the ``logs`` are forecast. Of a project, or of a machine and
-    its logs, all recordings but one are fitted and that one is forecast, in turn.
+    its logs, all recordings but one are fitted and that one is forecast, in turn; of a
+    project file in so many processes, ``workers``, with the same result.
     Raises `InputError` E116 where no log is as long as the horizon, E160.
     """
     check_horizon(horizon)
     progress = progress or Progress()
     if not isinstance(fit, Identification):
-        return _leave_one_out(*project_and_logs(fit, logs), horizon, progress)
+        found = project_and_logs(fit, logs)
+        return _leave_one_out(*found, horizon, workers, progress)
     if logs is None:
         raise InputError(
             "E160",
@@ -145,8 +151,21 @@ def _forecast(
     return _evaluation(summary, arrays, found, started)
 
 
+class FoldJob(NamedTuple):
+    """One fold of a leave-one-out, as another process needs it."""
+
+    path: Path
+    logs: tuple[Log, ...]
+    horizon: float
+    left: tuple[int, ...]
+
+
 def _leave_one_out(
-    project: Project, logs: Sequence[Log], horizon: float, progress: Progress
+    project: Project,
+    logs: tuple[Log, ...],
+    horizon: float,
+    workers: int,
+    progress: Progress,
 ) -> Evaluation:
     """Each recording predicted by a fit of the others."""
     started = time.perf_counter()
@@ -160,27 +179,28 @@ def _leave_one_out(
             expected="at least two files",
             fix="record once more, or identify and evaluate RUN --logs",
         )
-    with progress.task("logs", len(files)) as task:
-        windows, of = cut_logs(project, logs)
-        grid = windows_for(logs, project, max(horizon, CURVE[-1]), horizon)
-        names = channels(project.system, windows)
-        parts: list[Judged] = []
-        arrays: dict[str, np.ndarray] = {}
-        constants = []
-        for file in files:
-            left = [k for k, source in enumerate(recordings(logs)) if source == file]
-            part, traced, values = _fold(
-                project, logs, windows, of, grid, left, horizon
-            )
-            parts.append(part)
-            arrays |= traced
-            constants.append(values)
-            task.advance(f"without {logs[left[0]].name}")
-    whole = joined(parts)
+    of_file = (
+        tuple(k for k, source in enumerate(recordings(logs)) if source == file)
+        for file in files
+    )
+    jobs = [FoldJob(project.path, logs, horizon, left) for left in of_file]
+    apart = workers if project.path.is_file() else 1
+    work = _fold_of if apart > 1 else partial(_fold, project)
+    found = {}
+    with progress.task("logs", len(jobs)) as task:
+        for job, part in spread(work, [[job] for job in jobs], apart):
+            found[job.left] = part
+            task.advance(f"without {logs[job.left[0]].name}")
+    parts, traced, constants = zip(*(found[job.left] for job in jobs), strict=True)
+    arrays: dict[str, np.ndarray] = {}
+    for each in traced:
+        arrays |= each
+    names = measured_states(logs, project.system)
+    whole = joined(list(parts))
     summary, curves = scores(whole, names, logs, horizon)
     summary["calibration"], shares = calibration(whole, names, logs, horizon)
     arrays |= shares
-    summary["tables"].append(_constants_table(project, files, logs, constants))
+    summary["tables"].append(_constants_table(project, files, logs, list(constants)))
     summary |= {
         "command": "evaluate",
         "title": f"{project.name}: each log predicted by a fit of the others",
@@ -191,23 +211,27 @@ def _leave_one_out(
 
 
 def _fold(
-    project: Project,
-    logs: Sequence[Log],
-    windows: Windows,
-    of: np.ndarray,
-    grid: Grid,
-    left: Sequence[int],
-    horizon: float,
+    project: Project, job: FoldJob
 ) -> tuple[Judged, dict[str, np.ndarray], np.ndarray]:
-    """One fold: forecasts, traces and constants of the fit without logs ``left``."""
-    part = without(left, logs, of, grid)
+    """Forecasts, traces and parameters of the fit without the logs ``job.left``."""
+    windows, of = cut_logs(project, job.logs)
+    longest = max(job.horizon, CURVE[-1])
+    grid = windows_for(job.logs, project, longest, job.horizon)
+    part = without(job.left, job.logs, of, grid)
     # One start: the folds are small changes of one problem.
     key = jax.random.key(0)
-    found = fold(project, windows, grid, part, horizon, key=key, starts=1)
+    found = fold(project, windows, grid, part, job.horizon, key=key, starts=1)
     picture = drawn(found.forecast, found.band, found.tested)
     names = channels(project.system, windows)
-    traced = trace_arrays(picture, found.tested, logs, names)
+    traced = trace_arrays(picture, found.tested, job.logs, names)
     return found.judged, traced, _constrain(project.system, found.posterior)
+
+
+def _fold_of(
+    job: FoldJob,
+) -> tuple[Judged, dict[str, np.ndarray], np.ndarray]:
+    """The same in a process of its own."""
+    return _fold(load_project(job.path), job)
 
 
 @in_float64

@@ -7,7 +7,7 @@ from sim2gp.commands.demo import Demonstration
 from sim2gp.commands.design import FILE, NextExperiment
 from sim2gp.commands.evaluate import Evaluation
 from sim2gp.commands.explain import MissingPhysics
-from sim2gp.commands.identification import restored
+from sim2gp.commands.identification import Identification, restored
 from sim2gp.commands.result import AbstractResult
 from sim2gp.commands.selftest import SelfTest
 from sim2gp.runs import store
@@ -23,6 +23,7 @@ KINDS: dict[str, type[AbstractResult]] = {
     "demo": Demonstration,
     "design": NextExperiment,
     "evaluate": Evaluation,
+    "identify": Identification,  # a first answer, without a posterior
     "explain": MissingPhysics,
     "selftest": SelfTest,
 }
@@ -40,7 +41,7 @@ def load_run(
     folder = Path(folder)
     stored = store.load_run(folder)
     command = str(stored.summary.get("command"))
-    if command == "identify":
+    if command == "identify" and not stored.summary.get("first_answer"):
         return restored(folder, machine)
     kind = KINDS.get(command, StudyRun)
     files = {}

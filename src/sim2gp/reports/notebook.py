@@ -4,11 +4,22 @@ import html
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
 
 from sim2gp.reports.document import write_report
-from sim2gp.runs import Run
 from sim2gp.runs import load_run as loaded
+
+
+@runtime_checkable
+class Reported(Protocol):
+    """Whatever a report can be drawn of."""
+
+    @property
+    def summary(self) -> dict[str, Any]: ...
+    @property
+    def arrays(self) -> dict[str, np.ndarray]: ...
 
 
 @dataclass(frozen=True)
@@ -64,10 +75,11 @@ def _main_table(summary: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]
     return [], []
 
 
-def show(run: Run | Path | str) -> Shown:
-    """The report of a run, of its folder or as `load_run` reads it, for a notebook.
+def show(run: Reported | Path | str) -> Shown:
+    """The report of a result, or of a run's folder, for a notebook.
 
     Raises E130, E183 or E185 for a folder that is not a finished run.
     """
-    found = run if isinstance(run, Run) else loaded(run)
-    return Shown(write_report(found.summary, found.arrays), str(found.path))
+    found = loaded(run) if isinstance(run, Path | str) else run
+    name = str(found.summary.get("title") or found.summary.get("command"))
+    return Shown(write_report(found.summary, found.arrays), name)
