@@ -1,6 +1,7 @@
 """compare from end to end: a planted missing term must be found, a whole model kept."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -11,7 +12,7 @@ import scipy.integrate
 
 import machines
 from sim2gp.cli import main
-from sim2gp.commands import compare
+from sim2gp.commands import compare, compare_setup
 from sim2gp.errors import InputError
 from sim2gp.models import ResidualFunctionSpace
 from sim2gp.project import load_project
@@ -98,7 +99,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def compared(folder: Path, name: str) -> Path:
     """The run on the logs of one of the two arms, left out two at a time."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(compare, "MOST_FOLDS", 2)
+        patch.setattr(compare_setup, "MOST_FOLDS", 2)
         project = load_project(project_in(folder, name))
         found = compare.compare(
             project, progress=QUIET, horizons=(0.2, 0.4), models=SOME
@@ -176,10 +177,10 @@ def test_what_a_comparison_stores(cable: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--horizon", "nan"], ["E160", "--horizon"]),
+        (["--horizon", "nan"], ["E148", "--horizon"]),
         (["--horizon", "0.2", "100"], ["E160", "100 s"]),
         (["--horizon", "0.2", "5"], ["E116", "shorten --horizon"]),
-        (["--horizon", "soon"], ["E160", "soon"]),
+        (["--horizon", "soon"], ["E148", "soon"]),
         (["--horizn", "0.2"], ["E160", "did you mean --horizon"]),
         (["--seed", "-1"], ["E149"]),
     ],
@@ -236,7 +237,7 @@ def test_many_recordings_are_left_out_in_six_groups(folder: Path) -> None:
     found = load_project(project_in(folder, "cable"))
     log = found.load_logs()[0]
     named = [
-        compare.replace(log, name=str(k), source=str(k // 2)) for k in range(16)
+        replace(log, name=str(k), source=str(k // 2)) for k in range(16)
     ]  # eight files in two pieces each
     _, folds = compare.prepare(found, named, (0.2,))
     assert len(folds) == 6

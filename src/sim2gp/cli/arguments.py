@@ -75,6 +75,8 @@ def _refuse(text: str, args: Sequence[str], commands: Sequence[str]) -> NoReturn
         expected = "a whole number" if kind == "int" else "a number"
         code = "E149" if option == "--seed" else "E148"
         raise usage_error(option, word, expected, "correct the number", code)
+    if found := re.search(r"Error parsing (\S+): .*arguments: \['(.*?)'", text):
+        raise usage_error(found[1], found[2], "numbers", "correct the number", "E148")
     raise usage_error("arguments", " ".join(args), text[:200], f"see {PROGRAM} --help")
 
 

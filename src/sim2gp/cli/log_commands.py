@@ -21,6 +21,7 @@ from sim2gp.cli.late import (
 from sim2gp.cli.options import (
     Chosen,
     Common,
+    Count,
     File,
     Flag,
     Folder,
@@ -124,8 +125,8 @@ class Evaluate(Reads, Chosen):
     """The logs to predict (with a run)."""
     horizon: Seconds = 0.2
     """Open-loop horizon in s."""
-    workers: SomeCount = None
-    """Processes (with a project file); default one per core."""
+    workers: Count = 1
+    """Processes (with a project file)."""
 
     def run(self, call: Call) -> dict[str, Any]:
         path = self.run_or_project
@@ -138,7 +139,7 @@ class Evaluate(Reads, Chosen):
                     expected = "a project file alone: its own logs are left out"
                     raise usage_error("too much", f"--{option}", expected, fix)
             read = read_project(path, self)
-            how["workers"] = self.workers or cores()
+            how["workers"] = self.workers
             return call.saved(out, lambda: command("evaluate")(*read, **how))
         read_run(path)
         if not self.logs:

@@ -21,7 +21,6 @@ import numpy as np
 from sim2gp.belief import AbstractModel
 from sim2gp.commands.compare_setup import Setup, prepare
 from sim2gp.commands.compare_summary import Held, summarise
-from sim2gp.commands.evaluate import check_horizon
 from sim2gp.commands.result import AbstractResult
 from sim2gp.data.logs import Log, note_lines
 from sim2gp.data.one_step_log import (
@@ -41,6 +40,7 @@ from sim2gp.models.ensemble import ensemble
 from sim2gp.project import Project, load_project
 from sim2gp.project.in_memory import Logs, project_and_logs
 from sim2gp.runs import Progress
+from sim2gp.runs.progress import Task
 from sim2gp.runs.provenance import provenance
 from sim2gp.runs.workers import spread
 from sim2gp.systems.base import AbstractSystem
@@ -105,15 +105,13 @@ def compare(
 
     ``logs`` None are the project's own. ``models`` are given from simple to complex,
     the simulator first; ``seed`` draws networks and forecasts. Of a project file the
-    folds go to so many processes, ``workers``: the same numbers, but for the rounding of
-    networks, whose sums depend on the cores of a process.
+    folds go to so many processes, ``workers``; networks then differ by the rounding of
+    their sums, which depends on the cores of a process.
 
     Raises `InputError` E103 for a position that no log measures, E116 for too short
     logs, E160 for several configurations.
     """
     started = time.perf_counter()
-    for horizon in horizons:
-        check_horizon(horizon)
     project, logs = project_and_logs(machine, logs, alike=True)
     setup, folds = prepare(project, logs, horizons)
     jobs = [
@@ -122,16 +120,11 @@ def compare(
     ]
     total = len(folds) * len(models) + 1
     with (progress or Progress()).task("compare", total) as task:
-        if workers > 1 and models is MODELS and project.path.is_file():
-            held = {}
-            for job, part in spread(_fold_of, [[job] for job in jobs], workers):
-                held[job.number] = part
-                task.advance(f"without {logs[job.left[0]].name}", len(models))
-            parts = [held[job.number] for job in jobs]
+        if workers > 1 and models is MODELS and project.can_be_loaded:
+            parts = _in_processes(jobs, workers, task)
         else:
             parts = [_fold(setup, job, models, task.advance) for job in jobs]
-        key = jax.random.key(seed)
-        whole = _fit(setup, [], jax.random.fold_in(key, len(folds)))
+        whole = _fit(setup, [], _key(seed, len(folds)))
         task.advance("evidence")
     names = channels(project.system, setup.windows)
     units = {c.name: c.unit for c in project.system.physical_states}
@@ -171,11 +164,23 @@ class FoldJob(NamedTuple):
     left: list[int]
 
 
+def _in_processes(jobs: Sequence[FoldJob], workers: int, task: Task) -> list[Held]:
+    """The folds in their order, computed as processes are free."""
+    held = {}
+    for job, part in spread(_fold_of, [[job] for job in jobs], workers):
+        held[job.number] = part
+        task.advance(f"without {job.logs[job.left[0]].name}", len(MODELS))
+    return [held[job.number] for job in jobs]
+
+
 def _fold(
     setup: Setup, job: FoldJob, models: Learners, done: Callable[[str], None]
 ) -> Held:
-    key = jax.random.fold_in(jax.random.key(job.seed), job.number)
-    return fold(setup, job.left, models, key, done)
+    return fold(setup, job.left, models, _key(job.seed, job.number), done)
+
+
+def _key(seed: int, number: int) -> jax.Array:
+    return jax.random.fold_in(jax.random.key(seed), number)
 
 
 def _fold_of(job: FoldJob) -> Held:

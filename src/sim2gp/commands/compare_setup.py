@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sim2gp.commands.evaluate import windows_for
+from sim2gp.commands.evaluate import check_horizon, windows_for
 from sim2gp.data.grid import CURVE, PERIOD, Grid
 from sim2gp.data.logs import Log
 from sim2gp.data.one_step_log import (
@@ -52,6 +52,8 @@ def prepare(
     project: Project, logs: Sequence[Log], horizons: Sequence[float]
 ) -> tuple[Setup, list[list[int]]]:
     """Windows, one-step data and folds (each the indices of the logs left out)."""
+    for horizon in horizons:
+        check_horizon(horizon)
     system = project.system
     logs, folds = _folds(logs)
     _check_measured(logs, system, project)

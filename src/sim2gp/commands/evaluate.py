@@ -184,7 +184,7 @@ def _leave_one_out(
         for file in files
     )
     jobs = [FoldJob(project.path, logs, horizon, left) for left in of_file]
-    apart = workers if project.path.is_file() else 1
+    apart = workers if project.can_be_loaded else 1
     work = _fold_of if apart > 1 else partial(_fold, project)
     found = {}
     with progress.task("logs", len(jobs)) as task:

@@ -34,7 +34,8 @@ def project_of_machine(
         rows = [f"{json.dumps(k)} = {_toml(v)}" for k, v in (values or {}).items()]
         text += "\n".join([f"[{table}]", *rows, ""]) if rows else ""
     source = parsed(text, f"{name} (in memory)")
-    return Project(Path(f"{name}.toml"), source, validated(source), as_machine(machine))
+    spec, path = validated(source), Path(f"{name}.toml")
+    return Project(path, source, spec, as_machine(machine), own=True)
 
 
 def project_and_logs(

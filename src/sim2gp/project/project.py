@@ -54,13 +54,24 @@ _PREFIX = re.compile(r"(?i)^(mujoco|mjcf|mjx|urdf|xml)\s*:\s*")
 
 @dataclass(frozen=True)
 class Project:
-    """A validated project file; ``budget`` is what reading one of its logs may take."""
+    """A validated project file; ``budget`` is what reading one of its logs may take.
+
+    ``own`` is one whose machine was given from Python.
+    """
 
     path: Path
     source: Source
     spec: ProjectSpec
     system: "AbstractSystem"
     budget: Budget = field(default_factory=Budget)
+    own: bool = False
+
+    @property
+    def can_be_loaded(self) -> bool:
+        """Whether another process gets the same project from its file."""
+        if self.own or not self.path.is_file():
+            return False
+        return self.path.read_text(encoding="utf-8") == self.source.text
 
     @property
     def name(self) -> str:
@@ -240,7 +251,8 @@ def load_project(
     from sim2gp.systems.machine import as_machine
 
     if system is not None and spec.system == IN_MEMORY:
-        return Project(path, source, spec, as_machine(system))
+        return Project(path, source, spec, as_machine(system), own=True)
+    own = system is not None
     if system is not None:
         system = build_own(spec, source, system)
     elif is_model(spec.system):
@@ -252,7 +264,7 @@ def load_project(
         system = build_system(spec, source, system_class(spec.system))
     check_names(spec, source, system)
     system = weighed(spec, source, in_configurations(spec, source, system))
-    return Project(path, source, spec, system)
+    return Project(path, source, spec, system, own=own)
 
 
 def read_spec(path: Path | str, *, own: bool = False) -> tuple[Source, ProjectSpec]:
