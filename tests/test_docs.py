@@ -22,6 +22,7 @@ from house_rules import LAYERS
 from sim2gp import cli
 from sim2gp.cli.commands import COMMANDS
 from sim2gp.data.logs.arrays import missing
+from sim2gp.errors import catalogue
 from sim2gp.project.project import SYSTEMS, system_class
 from sim2gp.project.schema import ProjectSpec
 from sim2gp.systems.effects.registry import NAMES
@@ -173,7 +174,7 @@ def spoken_codes() -> set[str]:
                 code = node.value[:4]
                 if CODE.fullmatch(code) and node.value[4:5] in ("", " "):
                     found.add(code)
-    return found
+    return found | {entry.code for entry in catalogue().values()}
 
 
 def test_every_code_is_told_once_and_none_that_is_not_spoken() -> None:

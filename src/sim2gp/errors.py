@@ -1,15 +1,24 @@
 """Typed errors with stable codes: what is wrong, where, and what to do about it.
 
 Compiled code cannot raise; it returns status codes, and the host raises once per call.
-A code is never reused for another meaning.
+A code is never reused for another meaning. What each code means, and the words of each
+error, are data: `catalogue/*.toml`.
 """
 
 import difflib
+import functools
 import re
+import string
+import tomllib
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
 
+CATALOGUE = Path(__file__).parent / "catalogue"
+CODES = CATALOGUE / "codes.toml"  # what each code means
 COMPARED = 2_000_000  # pairs of characters that are looked at for a misspelt name
 _OF_CALLBACK = re.compile(r"^(?:\S+\.)?InputError: (E\d{3}) (.*)$", re.MULTILINE)
 
@@ -71,6 +80,61 @@ class NotFinite(Sim2GPError):
 
 class Sim2GPWarning(UserWarning):
     """A typed warning; its text starts with its code (W110 and so on)."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """The words of one error; ``$name`` stands for a field that is given with it."""
+
+    code: str
+    title: str
+    expected: str = ""
+    fix: str = ""
+
+
+@functools.cache
+def catalogue() -> dict[str, Entry]:
+    """Every error of the catalogue by its key."""
+    found: dict[str, Entry] = {}
+    for file in sorted(CATALOGUE.glob("*.toml")):
+        if file != CODES:
+            entries = tomllib.loads(file.read_text(encoding="utf-8"))
+            found |= {key: Entry(**words) for key, words in entries.items()}
+    return found
+
+
+Kind = TypeVar("Kind", bound=Sim2GPError)
+
+
+def error(
+    key: str,
+    kind: type[Kind] = InputError,  # type: ignore[assignment]
+    /,
+    *,
+    where: str = "",
+    got: object = None,
+    expected: str | None = None,
+    fix: str | None = None,
+    **fields: object,
+) -> Kind:
+    """An error of the catalogue: ``raise error("no_transition", where=source, got=2)``.
+
+    ``fields`` fill its templates; ``expected`` and ``fix`` replace them where they are
+    found out, such as the name that was meant.
+    """
+    entry = catalogue()[key]
+
+    def filled(template: str) -> str:
+        return string.Template(template).substitute(fields)
+
+    return kind(
+        entry.code,
+        filled(entry.title),
+        where=where,
+        got=got,
+        expected=filled(entry.expected) if expected is None else expected,
+        fix=filled(entry.fix) if fix is None else fix,
+    )
 
 
 def missing_extra(what: str, error: ImportError, extra: str) -> InputError:

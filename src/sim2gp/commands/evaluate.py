@@ -22,7 +22,7 @@ from sim2gp.commands.result import AbstractResult, numbers
 from sim2gp.data.grid import CURVE, Grid, evaluation_windows, steps_of
 from sim2gp.data.logs import Log, Note, note_lines, shared_rows
 from sim2gp.data.split_log import measured_states
-from sim2gp.errors import InputError
+from sim2gp.errors import InputError, error
 from sim2gp.identification.forecasts.baselines import (
     forecast_sentence,
     regression_errors,
@@ -99,14 +99,8 @@ def evaluate(
         found = project_and_logs(fit, logs)
         return _leave_one_out(*found, horizon, workers, progress)
     if logs is None:
-        raise InputError(
-            "E160",
-            "no logs",
-            where="logs",
-            got="an identification alone",
-            expected="the logs to forecast",
-            fix="evaluate(found, logs), or evaluate(project) to leave out its own",
-        )
+        got = "an identification alone"
+        raise error("no_logs_to_evaluate", where="logs", got=got)
     assert fit.project is not None
     return _forecast(fit, as_logs(fit.project, logs), horizon, progress)
 
@@ -171,14 +165,8 @@ def _leave_one_out(
     started = time.perf_counter()
     files = list(dict.fromkeys(recordings(logs)))
     if len(files) < 2:
-        raise InputError(
-            "E160",
-            "one recording cannot be left out",
-            where=project.source.where("logs"),
-            got=f"{len(files)} file",
-            expected="at least two files",
-            fix="record once more, or identify and evaluate RUN --logs",
-        )
+        where, got = project.source.where("logs"), f"{len(files)} file"
+        raise error("one_recording", where=where, got=got)
     of_file = (
         tuple(k for k, source in enumerate(recordings(logs)) if source == file)
         for file in files
@@ -266,13 +254,8 @@ def windows_for(
         grid = evaluation_windows(logs, project.system, longest=longest)
         if np.asarray(grid.windows.mask)[:, steps_of(horizon)].any():
             return grid
-    raise InputError(
-        "E116",
-        "no window to predict",
-        got=f"{max(log.duration for log in logs):.3g} s",
-        expected=f"an unmasked stretch longer than the horizon of {horizon:g} s",
-        fix="shorten --horizon, or record longer",
-    )
+    got = f"{max(log.duration for log in logs):.3g} s"
+    raise error("no_window_to_predict", got=got, horizon=f"{horizon:g}")
 
 
 def _repeated(logs: Sequence[Log], files: Sequence[str]) -> list[Note]:
@@ -296,14 +279,7 @@ def _training(fit: Identification) -> tuple[Log, ...] | None:
 def check_horizon(horizon: float) -> None:
     """E160 for a horizon that is not some seconds."""
     if not 0.0 < horizon <= 60.0:
-        raise InputError(
-            "E160",
-            "horizon out of range",
-            where="--horizon",
-            got=f"{horizon:g} s",
-            expected="more than 0 and at most 60 s",
-            fix="choose some tenths of a second",
-        )
+        raise error("horizon_out_of_range", where="--horizon", got=f"{horizon:g} s")
 
 
 def _evaluation(
