@@ -4,6 +4,7 @@ Chromium reads a copy of the page into which a few lines were put that measure i
 they found is read back from the text of the page around it.
 """
 
+import csv
 import html
 import io
 import json
@@ -74,7 +75,9 @@ addEventListener("load", () => setTimeout(() => {
       film.lines = there(figure) && !there(canvas);
     }
   }
+  const copy = document.querySelector(".copy");
   parent.postMessage(JSON.stringify({
+    csv: copy && copy.csv(), paper: getComputedStyle(document.body).backgroundColor,
     wrong, wide, film, inner: innerWidth, scroll: root.scrollWidth,
     title: document.title,
     sections: [...document.querySelectorAll("section")].map(node => node.id),
@@ -130,10 +133,12 @@ def measured(page: Path, width: int) -> dict[str, Any]:
     return told
 
 
-def picture(page: Path, width: int) -> np.ndarray:
+def picture(page: Path, width: int, *options: str) -> np.ndarray:
     """The screenshot, which stays beside the page."""
     out = page.with_name(f"{page.stem}_{width}.png")
-    chromium(page, width, f"--screenshot={out}", f"--window-size={width},2400")
+    chromium(
+        page, width, f"--screenshot={out}", f"--window-size={width},4000", *options
+    )
     with Image.open(io.BytesIO(out.read_bytes())) as image:
         return np.asarray(image.convert("RGB"))
 
@@ -141,8 +146,12 @@ def picture(page: Path, width: int) -> np.ndarray:
 def runs() -> dict[str, Run]:
     """One of everything that a report can show, and the film of a robot."""
     bare = {"command": "demo", "title": "An empty run"}
+    summary, arrays = full_run()
+    path = "/home/somebody/" + "recordings_of_the_arm/" * 5 + "a_very_long_name.parquet"
+    warnings = [*summary["warnings"], f"W127 fewer episodes than announced in {path}"]
+    everything = summary | {"warnings": warnings, "title": f"what {path} determines"}
     return {
-        "everything": full_run(), "figure": a_film(pictures=False),
+        "everything": (everything, arrays), "figure": a_film(pictures=False),
         "rendered": a_film(), "empty": (bare, {}),
     }  # fmt: skip
 
@@ -202,3 +211,23 @@ def test_a_screenshot_shows_the_machine(
     shown = (frame < 30) if name == "rendered" else orange
     assert shown.sum() > (20_000 if name == "rendered" else 200)
     assert len(np.unique(seen.reshape(-1, 3), axis=0)) > 20
+
+
+def test_a_table_is_copied_as_csv(pages: dict[str, Path]) -> None:
+    text = measured(pages["everything"], 1280)["csv"]
+    rows = list(csv.reader(io.StringIO(text)))
+    assert len({len(row) for row in rows}) == 1
+    assert len(rows) > 2
+    assert measured(pages["empty"], 390)["csv"] is None
+
+
+@pytest.mark.parametrize(("scheme", "dark"), [(0, True), (1, False)])
+def test_the_page_follows_the_scheme(
+    pages: dict[str, Path], scheme: int, dark: bool
+) -> None:
+    """Paper and ink are those of the reader's choice, far apart in brightness."""
+    option = f"--blink-settings=preferredColorScheme={scheme}"
+    seen = picture(pages["everything"], 1280, option)
+    paper = float(np.median(seen[:200]))
+    assert (paper < 60.0) is dark
+    assert np.ptp(seen[:200].astype(float)) > 150.0

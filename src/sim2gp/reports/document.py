@@ -8,6 +8,7 @@ from typing import Any
 from sim2gp.reports import data, parameters
 from sim2gp.reports.animation import player
 from sim2gp.reports.experiment import experiment
+from sim2gp.reports.glance import glance, has_glance, unique
 from sim2gp.reports.markup import (
     Raw,
     asset,
@@ -74,7 +75,7 @@ def _problems(summary: Summary) -> list[tuple[str, str]]:
         text = f"{len(flat)} {noun} left open by the data (see Combinations)"
         found.append(("warn", f"{text}."))
     found += [("warn", _said(item)) for item in summary.get("warnings") or ()]
-    return found
+    return unique(found)
 
 
 def _status(summary: Summary) -> Raw:
@@ -225,16 +226,18 @@ def write_report(summary: Summary, arrays: Arrays) -> str:
         _made(summary),
     ]
     name = f"sim2gp {summary.get('command') or 'run'}"
-    learned = _learned(summary)
+    learned = "" if has_glance(summary) else _learned(summary)
     body = "".join(
         [
             f"<header>\n<h1>{esc(summary.get('title') or name)}</h1>\n",
             _status(summary),
             paragraph(learned, "lead") if learned else "",
+            glance(summary) if has_glance(summary) else "",
             _contents(sections),
             "</header>\n",
             *sections,
         ]
     )
     script = asset("player.js") if 'class="player"' in body else ""
+    script += asset("tables.js") if "<table" in body else ""
     return page(name, body, script)

@@ -1,0 +1,112 @@
+"""The first screen of an identification: five questions, and an answer to each."""
+
+from collections.abc import Mapping, Sequence
+from statistics import median
+from typing import Any
+
+from sim2gp.reports.markup import Raw, esc, number
+
+Summary = Mapping[str, Any]
+MANY = 4  # names that a sentence lists
+
+
+def glance(summary: Summary) -> Raw:
+    """What was learned, how sure, does it predict, what is missing, what next."""
+    found = {
+        "What was learned": summary.get("headline"),
+        "How sure": _sure(summary),
+        "Does it predict": _predicts(summary),
+        "What is missing": _missing(summary),
+        "What next": _next(summary),
+    }
+    rows = "".join(
+        f"<dt>{question}</dt><dd>{esc(answer)}</dd>\n"
+        for question, answer in found.items()
+        if answer
+    )
+    return Raw(f'<dl class="glance">\n{rows}</dl>\n')
+
+
+def _entries(summary: Summary) -> Mapping[str, Mapping[str, Any]]:
+    found: Mapping[str, Mapping[str, Any]] = summary.get("parameters") or {}
+    return found
+
+
+def _sure(summary: Summary) -> str:
+    """How wide the intervals are, and what they allow for."""
+    shares = [
+        100.0 * entry["sd"] / abs(entry["mean"])
+        for entry in _entries(summary).values()
+        if entry.get("verdict") == "identified" and entry.get("mean")
+    ]
+    said = []
+    if shares:
+        words = f"Standard deviations are {number(median(shares), 2)} % of the values"
+        if len(shares) > 1:
+            words += f" (median; at most {number(max(shares), 2)} %)"
+        said.append(f"{words}.")
+    which = (summary.get("intervals") or {}).get("which")
+    if which == "corrected":
+        said.append("The intervals allow for errors of the model.")
+    elif which:
+        said.append("The intervals take the model for right: there are few windows.")
+    check = summary.get("check") or {}
+    if check.get("text"):
+        said.append(str(check["text"]))
+    return " ".join(said)
+
+
+def _predicts(summary: Summary) -> str:
+    """Of data that the fit has not seen."""
+    about = summary.get("held_out") or {}
+    return str(about.get("headline") or about.get("text") or "Not asked (--quick).")
+
+
+def _missing(summary: Summary) -> str:
+    """What the residuals say; the corrected intervals may name effects."""
+    misfit = summary.get("misfit") or {}
+    if misfit.get("alarm"):
+        return "Something: the residuals contradict the model, as said above."
+    return str(misfit.get("verdict") or "")
+
+
+def _next(summary: Summary) -> str:
+    """The command that helps most."""
+    misfit = summary.get("misfit") or {}
+    if misfit.get("alarm"):
+        return "sim2gp explain RUN says which physics may be missing."
+    open_ = [
+        name
+        for name, entry in _entries(summary).items()
+        if entry.get("verdict") not in ("identified", "dead")
+    ]
+    if open_:
+        names = _listed(open_)
+        return f"sim2gp design RUN: an experiment that tells more of {names}."
+    longer = summary.get("longer") or {}
+    if longer.get("advised") and longer.get("text"):
+        return str(longer["text"])
+    return (
+        "sim2gp evaluate RUN --logs FILE: does it predict another recording? "
+        "sim2gp export RUN hands it on."
+    )
+
+
+def _listed(names: Sequence[str]) -> str:
+    shown = ", ".join(names[:MANY])
+    rest = len(names) - MANY
+    return f"{shown} and {number(rest)} more" if rest > 0 else shown
+
+
+def has_glance(summary: Summary) -> bool:
+    """Whether the run is an identification that came to its end."""
+    finished = summary.get("command") == "identify" and not summary.get("first_answer")
+    return finished and bool(_entries(summary))
+
+
+def unique(problems: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Each sentence once, in the order of their first places."""
+    kept: dict[str, str] = {}
+    for weight, words in problems:
+        kept.setdefault(words, weight)
+    return [(weight, words) for words, weight in kept.items()]
