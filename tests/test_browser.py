@@ -147,7 +147,7 @@ def runs() -> dict[str, Run]:
     """One of everything that a report can show, and the film of a robot."""
     bare = {"command": "demo", "title": "An empty run"}
     summary, arrays = full_run()
-    path = "/home/somebody/" + "recordings_of_the_arm/" * 5 + "a_very_long_name.parquet"
+    path = "/data/somebody/" + "recordings_of_the_arm/" * 5 + "a_very_long_name.parquet"
     warnings = [*summary["warnings"], f"W127 fewer episodes than announced in {path}"]
     everything = summary | {"warnings": warnings, "title": f"what {path} determines"}
     return {
