@@ -21,7 +21,7 @@ from sim2gp.commands.identification import (
     used,
 )
 from sim2gp.commands.result import AbstractResult
-from sim2gp.errors import InputError
+from sim2gp.errors import InputError, error
 from sim2gp.project import Project
 from sim2gp.project.project import is_model
 from sim2gp.runs import Progress, load_run
@@ -121,14 +121,8 @@ def _with_model(found: Identification) -> Project:
     project = found.project
     assert project is not None
     if not is_model(project.spec.system):
-        raise InputError(
-            "E130",
-            "no model's file",
-            where=str(found.path or found.name),
-            got=f"the bundled machine {project.spec.system}",
-            expected="a project whose system is an MJCF or URDF file",
-            fix="copy its constants from summary.json",
-        )
+        where, got = str(found.path or found.name), "the bundled machine "
+        raise error("no_model_file", where=where, got=got + project.spec.system)
     return project
 
 

@@ -18,7 +18,7 @@ from sim2gp.data.one_step_log import (
 )
 from sim2gp.data.split_log import measured_states
 from sim2gp.data.windows import Windows
-from sim2gp.errors import InputError
+from sim2gp.errors import error
 from sim2gp.identification.forecasts.prediction import recordings
 from sim2gp.project import Project
 from sim2gp.project.training_windows import cut_logs
@@ -72,13 +72,12 @@ def prepare(
         trained = int(np.sum(~np.isin(row_log, left)))
         tested = int(np.sum(steps.valid[np.isin(steps.log, left)][:, -1]))
         if not trained or not tested:
-            raise InputError(
-                "E116",
-                "nothing to learn from or to predict",
+            got = f"{trained} smoothed steps without it, {tested} windows in it"
+            raise error(
+                "nothing_to_compare",
                 where=logs[left[0]].source,
-                got=f"{trained} smoothed steps without it, {tested} windows in it",
-                expected=f"stretches longer than the horizon of {longest:g} s",
-                fix="shorten --horizon, or record longer",
+                got=got,
+                horizon=f"{longest:g}",
             )
     reach = _reach(stepper, samples)
     return Setup(
@@ -146,13 +145,11 @@ def _check_measured(
         if name not in measured and name.removesuffix(".velocity") not in measured
     ]
     if missing:
-        raise InputError(
-            "E103",
-            "unmeasured position",
+        raise error(
+            "unmeasured_position",
             where=project.source.where("logs", 0, "columns"),
             got=", ".join(measured),
-            expected=f"also {missing[0].removesuffix('.velocity')}",
-            fix="name its column; a network cannot learn from a state it never sees",
+            position=missing[0].removesuffix(".velocity"),
         )
 
 

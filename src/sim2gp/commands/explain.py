@@ -18,7 +18,7 @@ from sim2gp.commands.demo import Demonstration
 from sim2gp.commands.identification import Identification, project_of
 from sim2gp.commands.result import PROJECT, AbstractResult
 from sim2gp.data.logs import Budget, Log
-from sim2gp.errors import InputError
+from sim2gp.errors import InputError, error
 from sim2gp.identification.missing_physics.data import (
     AbstractData,
     OneStepData,
@@ -176,36 +176,18 @@ def explainable(
 
 
 def _nothing_to_explain(where: object, summary: Mapping[str, Any]) -> InputError:
-    return InputError(
-        "E130",
-        "nothing to explain",
-        where=str(where),
-        got=str(summary.get("command", "a run without data")),
-        expected="the folder of sim2gp identify or sim2gp demo",
-        fix="run one of them first",
-    )
+    got = str(summary.get("command", "a run without data"))
+    return error("nothing_to_explain", where=str(where), got=got)
 
 
 def project_file(run: AbstractResult) -> Path:
     """The file to add to, unchanged since the run (E160 if there is none)."""
     where = str(run.path or run.name)
     if run.project is None:
-        raise InputError(
-            "E160",
-            "--add without a project file",
-            where=where,
-            got=str(run.summary.get("command")),
-            expected="the folder of sim2gp identify",
-            fix="leave --add out",
-        )
+        got = str(run.summary.get("command"))
+        raise error("no_project_to_add_to", where=where, got=got)
     place = run.project.path
     if load_project(place).source.text != run.project.source.text:
-        raise InputError(
-            "E160",
-            "project file changed since the run",
-            where=str(place),
-            got="another text than the run's copy",
-            expected="the file that was identified",
-            fix="run sim2gp identify again",
-        )
+        got = "another text than the run's copy"
+        raise error("project_changed_since_run", where=str(place), got=got)
     return place

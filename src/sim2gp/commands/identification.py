@@ -15,7 +15,7 @@ import numpy as np
 
 from sim2gp.commands.result import PROJECT, AbstractResult
 from sim2gp.data.logs import Budget, Log, none_unused
-from sim2gp.errors import InputError
+from sim2gp.errors import error
 from sim2gp.identification.forecasts.forecast import Band
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.parameters import Parameters
@@ -238,14 +238,8 @@ def check_identified(run: Path, stored: Run) -> None:
     found = {"belief/mean", "intervals/mean"} <= set(stored.arrays)
     if found and (run / PROJECT).exists():
         return
-    raise InputError(
-        "E130",
-        "not an identification",
-        where=str(run),
-        got=str(stored.summary.get("command", "a run without a belief")),
-        expected="the folder of sim2gp identify",
-        fix="run sim2gp identify first (again, if an older version made the run)",
-    )
+    got = str(stored.summary.get("command", "a run without a belief"))
+    raise error("not_an_identification", where=str(run), got=got)
 
 
 def _check_constants(run: Path, project: Project, summary: dict[str, Any]) -> None:
@@ -253,14 +247,10 @@ def _check_constants(run: Path, project: Project, summary: dict[str, Any]) -> No
     now, fitted = project.system.parameters.names, tuple(summary["parameters"])
     if now == fitted:
         return
-    raise InputError(
-        "E184",
-        "another set of constants than was fitted",
-        where=str(run / PROJECT),
-        got=", ".join(n for n in now if n not in fitted) or ", ".join(now),
-        expected=", ".join(n for n in fitted if n not in now) or ", ".join(fitted),
-        fix="identify again, or take back the change of the run's project file",
-    )
+    got = ", ".join(n for n in now if n not in fitted) or ", ".join(now)
+    expected = ", ".join(n for n in fitted if n not in now) or ", ".join(fitted)
+    where = str(run / PROJECT)
+    raise error("other_parameters_than_fitted", where=where, got=got, expected=expected)
 
 
 def _check_fitted(where: str, table: Parameters, x: Mapping[str, np.ndarray]) -> None:
@@ -269,11 +259,10 @@ def _check_fitted(where: str, table: Parameters, x: Mapping[str, np.ndarray]) ->
     theta = x.get("belief/theta", now)
     for name, is_, was in zip(table.names, np.asarray(now), theta, strict=True):
         if not np.isclose(is_, was, rtol=1e-9, atol=1e-12):
-            raise InputError(
-                "E170",
-                f"another machine than was fitted: {name}",
+            raise error(
+                "another_machine_than_fitted",
                 where=where,
                 got=f"{is_:.9g} at the posterior's mode",
                 expected=f"{was:.9g}",
-                fix="identify again, or take back the change of the model's file",
+                name=name,
             )

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from sim2gp.commands.load_run import StudyRun
-from sim2gp.errors import InputError
+from sim2gp.errors import InputError, error
 from sim2gp.runs import Progress
 from sim2gp.runs.cells import Old
 from sim2gp.runs.store import load_run
@@ -67,11 +67,4 @@ def reproduce(
 
 def _of_cells(name: str, value: object) -> InputError:
     """E160: figure 1 has no cells."""
-    return InputError(
-        "E160",
-        f"--{name} with fig1",
-        where="the command line",
-        got=str(value),
-        expected="one run in one process",
-        fix="leave it out",
-    )
+    return error("no_cells", where="the command line", got=str(value), name=name)
