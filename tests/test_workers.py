@@ -12,7 +12,7 @@ import pytest
 
 from sim2gp.errors import InputError, Sim2GPError
 from sim2gp.runs import workers
-from sim2gp.runs.workers import spread
+from sim2gp.runs.workers import in_order, spread
 
 
 def square(job: int) -> tuple[int, int]:
@@ -32,6 +32,20 @@ def test_every_job_is_done_once_and_groups_stay_together() -> None:
     for group in groups:
         assert len({found[job][1] for job in group}) <= 1
     assert os.getpid() not in {pid for _, pid in found.values()}
+
+
+def late(job: tuple[float, int]) -> int:
+    time.sleep(job[0])
+    return job[1]
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_results_have_the_order_of_their_jobs(count: int) -> None:
+    """Of two processes the second is done first."""
+    jobs, finished = [(2.0, 7), (0.0, 8), (0.0, 9)], []
+    assert in_order(late, jobs, count, lambda job: finished.append(job[1])) == [7, 8, 9]
+    assert sorted(finished) == [7, 8, 9]
+    assert finished[0] == (7 if count == 1 else 8)
 
 
 def cores_of_threads(job: int) -> list[list[int]]:

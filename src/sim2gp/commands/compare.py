@@ -42,7 +42,7 @@ from sim2gp.project.in_memory import Logs, project_and_logs
 from sim2gp.runs import Progress
 from sim2gp.runs.progress import Task
 from sim2gp.runs.provenance import provenance
-from sim2gp.runs.workers import spread
+from sim2gp.runs.workers import in_order
 from sim2gp.systems.base import AbstractSystem
 
 HORIZONS = (0.2, 0.5)  # s
@@ -165,12 +165,12 @@ class FoldJob(NamedTuple):
 
 
 def _in_processes(jobs: Sequence[FoldJob], workers: int, task: Task) -> list[Held]:
-    """The folds in their order, computed as processes are free."""
-    held = {}
-    for job, part in spread(_fold_of, [[job] for job in jobs], workers):
-        held[job.number] = part
+    """The folds, computed as processes are free."""
+
+    def done(job: FoldJob) -> None:
         task.advance(f"without {job.logs[job.left[0]].name}", len(MODELS))
-    return [held[job.number] for job in jobs]
+
+    return in_order(_fold_of, jobs, workers, done)
 
 
 def _fold(

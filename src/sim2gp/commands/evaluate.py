@@ -21,7 +21,7 @@ from sim2gp.commands.identification import Identification
 from sim2gp.commands.result import AbstractResult, numbers
 from sim2gp.data.grid import CURVE, Grid, evaluation_windows, steps_of
 from sim2gp.data.logs import Log, Note, note_lines, shared_rows
-from sim2gp.data.split_log import measured_states
+from sim2gp.data.windows import Windows
 from sim2gp.errors import InputError, error
 from sim2gp.identification.forecasts.baselines import (
     forecast_sentence,
@@ -48,7 +48,7 @@ from sim2gp.project.training_windows import cut_logs
 from sim2gp.reports.motion import film
 from sim2gp.runs import Progress
 from sim2gp.runs.provenance import provenance
-from sim2gp.runs.workers import spread
+from sim2gp.runs.workers import in_order
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import in_float64
 
@@ -145,6 +145,14 @@ def _forecast(
     return _evaluation(summary, arrays, found, started)
 
 
+class Cut(NamedTuple):
+    """What all folds share: windows to fit, the log of each, windows to forecast."""
+
+    windows: Windows
+    of: np.ndarray
+    grid: Grid
+
+
 class FoldJob(NamedTuple):
     """One fold of a leave-one-out, as another process needs it."""
 
@@ -173,17 +181,20 @@ def _leave_one_out(
     )
     jobs = [FoldJob(project.path, logs, horizon, left) for left in of_file]
     apart = workers if project.can_be_loaded else 1
-    work = _fold_of if apart > 1 else partial(_fold, project)
-    found = {}
+    cut = _cut(project, jobs[0])
+    work = _fold_of if apart > 1 else partial(_fold, project, cut)
     with progress.task("logs", len(jobs)) as task:
-        for job, part in spread(work, [[job] for job in jobs], apart):
-            found[job.left] = part
-            task.advance(f"without {logs[job.left[0]].name}")
-    parts, traced, constants = zip(*(found[job.left] for job in jobs), strict=True)
+        found = in_order(
+            work,
+            jobs,
+            apart,
+            lambda job: task.advance(f"without {logs[job.left[0]].name}"),
+        )
+    parts, traced, constants = zip(*found, strict=True)
     arrays: dict[str, np.ndarray] = {}
     for each in traced:
         arrays |= each
-    names = measured_states(logs, project.system)
+    names = channels(project.system, cut.windows)
     whole = joined(list(parts))
     summary, curves = scores(whole, names, logs, horizon)
     summary["calibration"], shares = calibration(whole, names, logs, horizon)
@@ -198,13 +209,17 @@ def _leave_one_out(
     return _evaluation(summary, curves | arrays, project, started)
 
 
-def _fold(
-    project: Project, job: FoldJob
-) -> tuple[Judged, dict[str, np.ndarray], np.ndarray]:
-    """Forecasts, traces and parameters of the fit without the logs ``job.left``."""
+def _cut(project: Project, job: FoldJob) -> Cut:
     windows, of = cut_logs(project, job.logs)
     longest = max(job.horizon, CURVE[-1])
-    grid = windows_for(job.logs, project, longest, job.horizon)
+    return Cut(windows, of, windows_for(job.logs, project, longest, job.horizon))
+
+
+def _fold(
+    project: Project, cut: Cut, job: FoldJob
+) -> tuple[Judged, dict[str, np.ndarray], np.ndarray]:
+    """Forecasts, traces and parameters of the fit without the logs ``job.left``."""
+    windows, of, grid = cut
     part = without(job.left, job.logs, of, grid)
     # One start: the folds are small changes of one problem.
     key = jax.random.key(0)
@@ -219,7 +234,8 @@ def _fold_of(
     job: FoldJob,
 ) -> tuple[Judged, dict[str, np.ndarray], np.ndarray]:
     """The same in a process of its own."""
-    return _fold(load_project(job.path), job)
+    project = load_project(job.path)
+    return _fold(project, _cut(project, job), job)
 
 
 @in_float64

@@ -68,6 +68,24 @@ def spread(
                 process.join()
 
 
+def in_order(
+    work: Callable[[Job], Result],
+    jobs: Sequence[Job],
+    workers: int,
+    done: Callable[[Job], object],
+) -> list[Result]:
+    """``work(job)`` of every job, in their order; ``done(job)`` as each is finished.
+
+    As `spread` does it, a job at a time; no two jobs may be the same object.
+    """
+    place = {id(job): k for k, job in enumerate(jobs)}
+    found: dict[int, Result] = {}
+    for job, result in spread(work, [[job] for job in jobs], workers):
+        found[place[id(job)]] = result
+        done(job)
+    return [found[k] for k in range(len(jobs))]
+
+
 def _kill(processes: Sequence[Any]) -> list[Any]:
     """End those that were started; nothing of theirs is half-written."""
     started = [process for process in processes if process.pid is not None]
