@@ -16,7 +16,7 @@ from sim2gp import checks
 from sim2gp.data.clock import on_even_clock
 from sim2gp.data.logs import Log
 from sim2gp.data.windows import Windows
-from sim2gp.errors import InputError
+from sim2gp.errors import error
 from sim2gp.systems.base import DELAY_BLUR, AbstractSystem, index_of, steps_in
 
 HALF_WIDTH = 0.025  # s, half the span of the local parabola that guesses a start
@@ -67,12 +67,10 @@ def cut(
             pieces += [(k, i, j) for i, j in _consecutive(log.time, window, past)]
     pieces = [p for p in pieces if _has_data(logs[p[0]], measured, p)]
     if not pieces:
-        raise InputError(
-            "E116",
-            "no window to learn from",
+        raise error(
+            "no_window_to_learn_from",
             got=f"{sum(len(log) for log in logs)} rows",
-            expected=f"logs of at least {window:g} s",
-            fix="shorten likelihood.window, or record longer",
+            window=f"{window:g}",
         )
     windows = assemble(logs, system, pieces, measured, start)
     if window == 0.0:  # the first row is the start itself, not a measurement of it
@@ -95,13 +93,11 @@ def measured_states(
     measured = [name for name in names if any(name in log.channels for log in logs)]
     missing = [name for name in names if name not in measured]
     if (every and missing) or not measured:
-        raise InputError(
-            "E103",
-            "unmeasured state",
+        raise error(
+            "unmeasured_state",
             where="the one-step likelihood" if every else "the logs",
             got=", ".join(measured) or "no state",
-            expected=f"also {', '.join(missing)}",
-            fix="set likelihood.window to some tenths of a second",
+            missing=", ".join(missing),
         )
     return measured
 

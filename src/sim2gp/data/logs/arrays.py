@@ -17,7 +17,7 @@ from jaxtyping import Float, Shaped
 from sim2gp.data.logs.budget import Meter
 from sim2gp.data.logs.log import Note
 from sim2gp.data.logs.table import Rows, Table
-from sim2gp.errors import InputError, nearest
+from sim2gp.errors import InputError, error, nearest
 
 MAX_WIDTH = 256  # columns of one array; above, it is a picture or a cloud of points
 EXACT = 2**53  # whole numbers beyond lose digits in float64
@@ -109,12 +109,11 @@ def missing(
     close = entries[0] if entries else nearest(name, header)
     listed = ", ".join(header[:60])
     fix = f"did you mean {close}" if close else "name a column of the file"
-    return InputError(
-        "E103",
-        f"missing column {name}",
+    return error(
+        "missing_column",
         where=source,
         got=(listed if len(listed) <= 120 else listed[:117] + "...") or "no columns",
-        expected=f"a column named {name}",
+        name=name,
         fix=fix + (", or state period (in s)" if is_time else ""),
     )
 
@@ -123,13 +122,11 @@ def distinct(names: Sequence[str], source: str) -> None:
     """Each column is named once (E104)."""
     twice = next((n for n, count in Counter(names).items() if count > 1), None)
     if twice is not None:
-        raise InputError(
-            "E104",
-            f"column {twice} stands twice",
+        raise error(
+            "column_stands_twice",
             where=source,
             got=f"{names.count(twice)} of this name",
-            expected="each name once",
-            fix="rename one of them",
+            name=twice,
         )
 
 
@@ -137,50 +134,15 @@ def _check_kind(entry: Entry, name: str, source: str) -> None:
     """Real numbers with digits enough, in rows and columns (E121, E123, E124, E140)."""
     where, kind = f"{source}:column {name}", entry.dtype.kind
     if kind == "O":
-        raise InputError(
-            "E180",
-            "array of Python objects refused",
-            where=where,
-            got="dtype object",
-            expected="an array of numbers",
-            fix="save it as float64",
-        )
+        raise error("array_of_objects", where=where, got="dtype object")
     if kind in "SUT":
-        raise InputError(
-            "E121",
-            "text in a numeric column",
-            where=where,
-            got=f"dtype {entry.dtype}",
-            expected="numbers",
-            fix="save it as float64",
-        )
+        raise error("text_in_array", where=where, got=f"dtype {entry.dtype}")
     if kind not in "fiumM":
-        raise InputError(
-            "E123",
-            "truth values, complex numbers or records",
-            where=where,
-            got=f"dtype {entry.dtype}",
-            expected="real numbers",
-            fix="save it as float64",
-        )
+        raise error("array_not_real", where=where, got=f"dtype {entry.dtype}")
     if kind == "f" and entry.dtype.itemsize < 4:
-        raise InputError(
-            "E124",
-            "too few digits",
-            where=where,
-            got=f"{entry.dtype} (three digits)",
-            expected="float32 or float64",
-            fix="record in float32 or float64",
-        )
+        raise error("too_few_digits", where=where, got=f"{entry.dtype} (three digits)")
     if not entry.is_flat:
-        raise InputError(
-            "E140",
-            "not a table",
-            where=where,
-            got=f"shape {entry.shape}",
-            expected="rows, or rows by columns",
-            fix="save one array per episode, without further axes",
-        )
+        raise error("not_a_table", where=where, got=f"shape {entry.shape}")
 
 
 def _count(
@@ -190,38 +152,28 @@ def _count(
     shapes = {base: entries[base].shape for base in bases}
     rows = entries[time].shape[0] if time else max(s[0] for s in shapes.values())
     if rows == 0:
-        raise InputError(
-            "E115",
-            "no rows",
-            where=source,
-            got="0 rows",
-            expected="at least two",
-            fix="record the log again",
-        )
+        raise error("no_rows", where=source, got="0 rows")
     for base, shape in shapes.items():
         wide = len(shape) == 2 and shape[0] < shape[1]
         if wide and (time is None or shape[1] == rows):
-            raise InputError(
-                "E140",
-                f"{base} looks transposed",
+            raise error(
+                "array_transposed",
                 where=source,
                 got=f"{shape[0]} rows of {shape[1]} columns",
-                expected=f"{shape[1]} rows of {shape[0]} columns",
-                fix=f"save {base}.T",
+                base=base,
+                rows=shape[1],
+                columns=shape[0],
             )
     other = next((base for base, shape in shapes.items() if shape[0] != rows), None)
     if other is None:
         return rows
     first = time or next(base for base, shape in shapes.items() if shape[0] == rows)
     off = " (one more observation than actions is Minari's alone)"
-    raise InputError(
-        "E140",
-        "columns of different lengths",
+    raise error(
+        "columns_of_different_lengths",
         where=source,
         got=f"{rows} rows of {first}, {shapes[other][0]} of {other}",
-        expected="one row of every column for each time"
-        + (off if abs(rows - shapes[other][0]) == 1 else ""),
-        fix="drop the row without an action, or save what belongs together",
+        hint=off if abs(rows - shapes[other][0]) == 1 else "",
     )
 
 
@@ -250,29 +202,16 @@ def split(table: Table, episode: str) -> list[tuple[int, Table]]:
     ids = table.columns[episode]
     bad = np.flatnonzero(~(np.isfinite(ids) & (ids == np.round(ids))))
     if bad.size:
-        raise _episodes(
-            "episode id missing", table.rows.at(int(bad[0])), f"{ids[bad[0]]:g}"
-        )
+        where, got = table.rows.at(int(bad[0])), f"{ids[bad[0]]:g}"
+        raise error("episode_id_missing", where=where, got=got)
     edges = [0, *(np.flatnonzero(np.diff(ids)) + 1).tolist(), len(ids)]
     pieces: dict[int, Table] = {}
     for start, end in pairwise(edges):
         number = int(ids[start])
         if number in pieces:
-            raise _episodes(
-                "episodes interleaved", table.rows.at(start), f"{number} again"
-            )
+            where, got = table.rows.at(start), f"{number} again"
+            raise error("episodes_interleaved", where=where, got=got)
         piece = table.kept(slice(start, end))
         source = f"{table.rows.source} episode {number}"
         pieces[number] = replace(piece, rows=replace(piece.rows, source=source))
     return list(pieces.items())
-
-
-def _episodes(what: str, where: str, got: str) -> InputError:
-    return InputError(
-        "E127",
-        what,
-        where=where,
-        got=got,
-        expected="a whole number in every row, the rows of an episode together",
-        fix="sort the rows by episode, or save one file per episode",
-    )

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 
 from jaxtyping import TypeCheckError
 
-from sim2gp.errors import InputError, Sim2GPError
+from sim2gp.errors import InputError, Sim2GPError, error
 
 PIECES = 32  # one piece may take this share of the bytes
 GRACE = 1.0  # s: a reader looks at the clock itself; then its thread is interrupted
@@ -33,24 +33,14 @@ class Budget:
 
     def __post_init__(self) -> None:
         if not (self.bytes > 0 and 0 < self.seconds < math.inf):
-            raise InputError(
-                "E148",
-                "budget for reading a file",
-                got=f"{self.bytes} bytes and {self.seconds:g} s",
-                expected="numbers above zero",
-                fix="leave the budget out, or raise it",
+            raise error(
+                "budget_not_positive", got=f"{self.bytes} bytes and {self.seconds:g} s"
             )
 
     def times(self, factor: float) -> "Budget":
         """Both, multiplied by a number (E148 unless it is positive and finite)."""
         if not 0 < factor < math.inf:
-            raise InputError(
-                "E148",
-                "factor of the budget",
-                got=f"{factor:g}",
-                expected="a number above zero",
-                fix="leave --budget out, or raise it",
-            )
+            raise error("budget_factor_not_positive", got=f"{factor:g}")
         return Budget(math.ceil(self.bytes * factor), self.seconds * factor)
 
 
@@ -138,13 +128,8 @@ class Meter:
 
     def over(self, what: str, got: str, expected: str) -> InputError:
         """E126: more than the budget."""
-        return InputError(
-            "E126",
-            what,
-            where=self.at,
-            got=got,
-            expected=expected,
-            fix="split the file, name fewer columns, or raise --budget if you trust it",
+        return error(
+            "beyond_the_budget", where=self.at, got=got, what=what, expected=expected
         )
 
 
@@ -171,20 +156,17 @@ def readable(meter: Meter) -> Iterator[None]:
     except _OutOfTime:
         watch.stop()  # the interrupt may have come before the first call ended
         raise meter.over_time() from None
-    except MemoryError as error:
-        raise meter.over("does not fit in memory", "no more", "less") from error
-    except Exception as error:
+    except MemoryError as caught:
+        raise meter.over("does not fit in memory", "no more", "less") from caught
+    except Exception as caught:
         if watch.asked:
-            raise meter.over_time() from error
-        text = " ".join(str(error).split())
-        raise InputError(
-            "E125",
-            "file incomplete or damaged",
+            raise meter.over_time() from caught
+        text = " ".join(str(caught).split())
+        raise error(
+            "file_incomplete_or_damaged",
             where=meter.at,
-            got=(text or type(error).__name__)[:120].rstrip("."),
-            expected="a whole file",
-            fix="copy or record it again, once the recorder has closed it",
-        ) from error
+            got=(text or type(caught).__name__)[:120].rstrip("."),
+        ) from caught
 
 
 class _Watch:

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 
 from sim2gp.data.logs.log import ChannelLike, Column, Log, Note
 from sim2gp.data.logs.table import Rows
-from sim2gp.errors import InputError, nearest
+from sim2gp.errors import error, nearest
 
 Values = Float[np.ndarray, " N"]
 Mask = Bool[np.ndarray, " N"]
@@ -46,13 +46,10 @@ def finite(columns: Mapping[str, Values], rows: Rows, skip: Mask) -> None:
     value = columns[name][first]
     some = ", ".join(str(r) for r in numbers[:5])
     some += ", ..." if len(numbers) > 5 else ""
-    raise InputError(
-        "E101",
-        "value that is not finite",
+    raise error(
+        "value_not_finite",
         where=f"{rows.at(first)}, column {name}",
         got=f"{value:g} ({count} such on {len(numbers)} {rows.word}s: {some})",
-        expected="finite numbers",
-        fix="mend the rows, exclude their times, or set drop_nonfinite = true",
     )
 
 
@@ -71,47 +68,29 @@ def stamps(time: Values, rows: Rows) -> None:
     lost = float(np.spacing(np.float32(np.max(np.abs(time)))))
     single = bool(np.all(time.astype(np.float32).astype(np.float64) == time))
     if bad.size and np.max(np.abs(time)) > 1e5 and single and lost > 0.5 * period:
-        raise InputError(
-            "E112",
-            "time stamps lost their resolution in float32",
+        raise error(
+            "stamps_lost_resolution",
             where=where,
             got=f"{got}, resolved to {lost:.3g} s",
-            expected="stamps finer than the period",
-            fix="write seconds since the start, or float64 stamps",
         )
     stays = i + 2 < len(time) and time[i + 2] <= time[i]
     back = 0 < GAP * period < -steps[i] and stays
     if not bad.size or back:
-        raise InputError(
-            "E109",
-            "clock jump",
-            where=where,
-            got=f"{got}, a jump of {steps[i]:.9g} s",
-            expected="one clock for the whole file",
-            fix="split the file there",
-        )
-    same = steps[i] == 0
-    raise InputError(
-        "E108",
-        "duplicate time stamp" if same else "time does not increase",
-        where=where,
-        got=f"{got} ({bad.size} such rows)",
-        expected="increasing time",
-        fix="set keep_first = true" if same else "sort or split the file",
-    )
+        raise error("clock_jump", where=where, got=f"{got}, a jump of {steps[i]:.9g} s")
+    got = f"{got} ({bad.size} such rows)"
+    if steps[i] == 0:
+        raise error("duplicate_time_stamp", where=where, got=got)
+    raise error("time_does_not_increase", where=where, got=got)
 
 
 def plain_clock(column: Column, source: str) -> None:
     """A recording with stamps of its own needs no unit or sign of them (E160)."""
     if column in (Column(column.column), Column(column.column, "s")):
         return
-    raise InputError(
-        "E160",
-        "unit of a recording's own clock",
+    raise error(
+        "unit_of_own_clock",
         where=source,
         got=f"time as a column, {column.column}, with its unit",
-        expected="seconds, as the recording has them",
-        fix='write time = "header" or "log", or leave it out',
     )
 
 
@@ -123,13 +102,11 @@ def rate(time: Values, cuts: Mask, source: str, *, in_seconds: bool) -> list[Not
     steps = np.diff(time)
     period = float(np.median(steps))
     if period >= 0.5 and not in_seconds:
-        raise InputError(
-            "E107",
-            "time in another unit",
+        raise error(
+            "time_in_another_unit",
             where=source,
             got=f"a median period of {period:g} s",
-            expected="less than 0.5 s",
-            fix=f'say time = {{column = "...", unit = "{_guess(period)}"}}',
+            unit=_guess(period),
         )
     steady = steps[(steps <= GAP * period) & ~cuts[1:]]
     spread = float(np.max(np.abs(steady - period), initial=0.0)) / period
@@ -151,13 +128,11 @@ def _guess(period: float) -> str:
 def period_matches(log: Log, dt: float) -> None:
     """For likelihoods of one fixed period only: the log has that period (E113)."""
     if abs(log.period - dt) > 1e-3 * dt:
-        raise InputError(
-            "E113",
-            "period differs from the model's step",
+        raise error(
+            "period_differs_from_step",
             where=log.source,
             got=f"{log.period:g} s",
-            expected=f"{dt:g} s",
-            fix="use a likelihood over windows (window > 0), or that period",
+            dt=f"{dt:g}",
         )
 
 
@@ -177,13 +152,10 @@ def sentinels(values: Values, name: str, rows: Rows) -> tuple[Mask, list[Note]]:
     share = float(np.mean(bad))
     where = f"{rows.at(first)}, column {name}"
     if share > 0.01:
-        raise InputError(
-            "E102",
-            "sentinel instead of a measurement",
+        raise error(
+            "sentinel_in_column",
             where=where,
             got=f"{values[first]:g} in {100 * share:.1f} % of the rows",
-            expected="measurements in at least 99 % of the rows",
-            fix="exclude those times or record again",
         )
     masked = f"{bad.sum()} samples ({100 * share:.2g} %) masked"
     text = f"{values[first]:g} means no value at {where}: {masked}"
@@ -213,14 +185,16 @@ def in_reach(values: Values, channel: ChannelLike, source: str) -> None:
         return
     travel = float(np.ptp(values))
     if travel > 10 * allowed:
-        raise InputError(
-            "E107",
-            f"{channel.name} in another unit",
+        raise error(
+            "travel_beyond_limits",
             where=source,
             got=f"a travel of {travel:g} {channel.unit}",
-            expected=f"about {allowed:g} {channel.unit}",
-            fix="state the unit of the column"
-            + {"m": ', perhaps "mm"', "rad": ', perhaps "deg"'}.get(channel.unit, ""),
+            name=channel.name,
+            allowed=f"{allowed:g}",
+            unit=channel.unit,
+            perhaps={"m": ', perhaps "mm"', "rad": ', perhaps "deg"'}.get(
+                channel.unit, ""
+            ),
         )
 
 
@@ -254,30 +228,22 @@ def velocity_agrees(
         return
     got = f"slope {slope:.3g}, correlation {correlation:.2f}"
     where = f"{source}: {name} and {name}.velocity"
-    expected = f"{name}.velocity to be the rate of {name} (slope 1)"
     swapped = follows(time, dq, q)
     if swapped and swapped[1] > 0.9 and 2 / 3 < swapped[0] < 1.5:
-        what, fix = "columns swapped", "exchange the two columns"
-        raise InputError("E106", what, where=where, got=got, expected=expected, fix=fix)
+        raise error("columns_swapped", where=where, got=got, name=name)
     if correlation > 0.8:
         for ratio, meaning in _FACTORS.items():
             if abs(slope / ratio - 1) < 0.15:
-                raise InputError(
-                    "E107",
-                    "wrong unit",
+                raise error(
+                    "velocity_in_wrong_unit",
                     where=where,
                     got=got,
-                    expected=expected,
-                    fix=f"state the unit: it looks as if {meaning}",
+                    name=name,
+                    meaning=meaning,
                 )
     fix = "set sign = -1 on one of them" if correlation < -0.8 else "check the columns"
-    raise InputError(
-        "E106",
-        "position and velocity disagree",
-        where=where,
-        got=got,
-        expected=expected,
-        fix=fix,
+    raise error(
+        "position_and_velocity_disagree", where=where, got=got, name=name, fix=fix
     )
 
 
@@ -312,13 +278,10 @@ def none_unused(logs: Sequence[Log]) -> None:
     for log in logs:
         for note in log.notes:
             if note.code == "W105":
-                raise InputError(
-                    "E105",
-                    "columns that nothing takes",
+                raise error(
+                    "columns_nothing_takes",
                     where=log.source,
                     got=note.text.split(": ", 1)[1],
-                    expected="every column to be a channel's, as --strict says",
-                    fix="name them in the project's columns, or remove them",
                 )
 
 
@@ -356,30 +319,26 @@ def check_names(
     for name in columns:
         if name not in (*measurable, *commands):
             close = nearest(name, [*measurable, *commands])
-            raise InputError(
-                "E160",
-                f"unknown channel {name}",
+            raise error(
+                "unknown_channel",
                 where=f"columns for {where}",
                 got=name,
-                expected="one of " + ", ".join([*measurable, *commands]),
+                name=name,
+                known=", ".join([*measurable, *commands]),
                 fix=f"did you mean {close}" if close else "use a name of the system",
             )
     for name in commands:
         if name not in columns:
-            raise InputError(
-                "E160",
-                f"no column for input {name}",
+            raise error(
+                "no_column_for_input",
                 where=f"columns for {where}",
                 got=", ".join(columns) or "no columns",
-                expected=f"{name} = a column, or a constant number",
-                fix=f"add {name} to the columns",
+                name=name,
             )
     if not any(name in columns for name in measurable):
-        raise InputError(
-            "E160",
-            "nothing measured",
+        raise error(
+            "nothing_measured",
             where=f"columns for {where}",
             got=", ".join(columns),
-            expected="at least one of " + ", ".join(measurable),
-            fix="add a measured channel to the columns",
+            measurable=", ".join(measurable),
         )

@@ -12,7 +12,7 @@ from typing import BinaryIO
 
 from sim2gp.data.logs.budget import Meter
 from sim2gp.data.logs.unpack import pieces
-from sim2gp.errors import InputError
+from sim2gp.errors import InputError, error
 
 #: Kinds of records of MCAP (https://mcap.dev/spec).
 _HEADER, _FOOTER, _CHUNK, _INDEX, _ATTACHMENT, _DATA_END = 1, 2, 6, 8, 9, 15
@@ -216,11 +216,8 @@ def _check_tables(base: sqlite3.Connection, meter: Meter) -> None:
             columns = base.execute(f"PRAGMA table_xinfo({quoted})").fetchall()
             ok = not any(column[6] for column in columns)
         if not ok:
-            raise InputError(
-                "E136",
-                "database with more than tables",
+            raise error(
+                "more_than_tables",
                 where=meter.where,
                 got=repr((text or name)[:60].decode("utf-8", "replace")),
-                expected="the tables that ROS 2 writes",
-                fix="record again, or convert with ros2 bag convert",
             )

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from sim2gp.data.logs.budget import Meter
-from sim2gp.errors import InputError
+from sim2gp.errors import InputError, error
 
 NUMBERS = {
     **dict.fromkeys(("bool", "byte", "char", "int8", "uint8"), 1),
@@ -296,11 +296,9 @@ def _parts(
 
 
 def _refused(got: str, expected: str, meter: Meter) -> InputError:
-    return InputError(
-        "E136",
-        "message definition refused",
+    return error(
+        "message_definition_refused",
         where=meter.at,
         got=repr(got[:60]),
         expected=expected,
-        fix="record the topic again, or convert it to JSON",
     )

@@ -22,7 +22,7 @@ from sim2gp.data.logs.hdf5 import entries_of
 from sim2gp.data.logs.log import Note
 from sim2gp.data.logs.parquet import read_parquet
 from sim2gp.data.logs.table import Rows, Table
-from sim2gp.errors import InputError
+from sim2gp.errors import error
 
 MAX_JSON = 16 * 1024**2
 TOLERANCE = 1e-4  # s: how far LeRobot lets stamps be from frame_index / fps
@@ -48,23 +48,15 @@ def read_lerobot(
         "v2",
         "v3",
     ):
-        raise InputError(
-            "E136",
-            "dataset in another format",
+        raise error(
+            "not_lerobot_format",
             where=f"{where}/meta/info.json",
             got=f"{version or 'no version'}, {info.get('storage_format', 'parquet')}",
-            expected="LeRobot v2 or v3 in Parquet files",
-            fix="convert it with LeRobot's own tools",
         )
     files = sorted((path / "data").glob("chunk-*/*.parquet"))
     if not files:
-        raise InputError(
-            "E130",
-            "no data",
-            where=where,
-            got="no file data/chunk-*/*.parquet",
-            expected="at least one",
-            fix="download the data of the dataset too",
+        raise error(
+            "lerobot_without_data", where=where, got="no file data/chunk-*/*.parquet"
         )
     own = ["episode_index", "frame_index", "timestamp"] if stamped else []
     asked = None if wanted is None else [*dict.fromkeys([*wanted, *own])]
@@ -153,13 +145,10 @@ def read_minari(
     info = _json(folder / "metadata.json", meter)
     kind = info.get("data_format", "hdf5")
     if kind != "hdf5" or not (folder / "main_data.hdf5").is_file():
-        raise InputError(
-            "E136",
-            "dataset in another format",
+        raise error(
+            "not_minari_format",
             where=f"{shown(folder)}/metadata.json",
             got=f"data_format {kind!r}",
-            expected="Minari's hdf5, with main_data.hdf5",
-            fix="write the dataset with data_format='hdf5'",
         )
     h5py = library("h5py", "hdf5", "a Minari dataset")
     main = folder / "main_data.hdf5"
@@ -177,14 +166,7 @@ def read_minari(
             pieces.append((str(number), table))
     notes = _announced(info.get("total_episodes"), [*episodes], where)
     if not pieces:
-        raise InputError(
-            "E115",
-            "no episodes",
-            where=where,
-            got="no group episode_0",
-            expected="at least one",
-            fix="collect the dataset again",
-        )
+        raise error("no_episodes", where=where, got="no group episode_0")
     name, first = pieces[0]
     pieces[0] = (name, replace(first, notes=(*first.notes, *notes)))
     return pieces
@@ -199,13 +181,10 @@ def _aligned(entries: Mapping[str, Entry], source: str) -> dict[str, Entry]:
     acted = {e.shape[0] for n, e in entries.items() if _is(n, "actions")}
     rows, steps = max(seen, default=0), max(acted, default=0)
     if len(seen) != 1 or len(acted) != 1 or rows != steps + 1:
-        raise InputError(
-            "E140",
-            "episode of unequal lengths",
+        raise error(
+            "episode_of_unequal_lengths",
             where=source,
             got=f"{rows} observations, {steps} actions",
-            expected="one observation more than actions",
-            fix="collect the episode again",
         )
     kept = {n: e for n, e in entries.items() if _is(n, "observations", "infos")}
     held = {n: _held(e) for n, e in entries.items() if _is(n, "actions")}

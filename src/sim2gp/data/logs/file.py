@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from sim2gp.errors import InputError, nearest
+from sim2gp.errors import InputError, error, nearest
 
 SUFFIXES = {
     ".npz": "npz",
@@ -75,26 +75,18 @@ def _check_magic(first: bytes, kind: str, where: str) -> None:
     if first.startswith(MAGIC[kind]):
         return
     if not first:
-        raise InputError(
-            "E115",
-            "empty file",
-            where=where,
-            got="0 bytes",
-            expected=f"a recording as {kind}",
-            fix="record the log again",
-        )
+        raise error("empty_recording", where=where, got="0 bytes", format=kind)
     if first.startswith(PICKLED):
         raise pickled(where, "a pickle")
     if first.startswith(COMPRESSED) and not first.startswith(MAGIC["npz"]):
         raise compressed(where, first)
     other = [name for name, magic in MAGIC.items() if first.startswith(magic)]
-    raise InputError(
-        "E120",
-        f"not what its name says ({kind})",
+    raise error(
+        "not_what_its_name_says",
         where=where,
         got=f"the first bytes of {other[0]}" if other else f"first bytes {first[:4]!r}",
-        expected=f"first bytes {MAGIC[kind][:6]!r}",
-        fix="rename the file, or record it again",
+        format=kind,
+        magic=repr(MAGIC[kind][:6]),
     )
 
 
@@ -102,38 +94,22 @@ def _tensors(first: bytes, where: str) -> InputError:
     """E181: no header of a format that nothing here writes is believed."""
     if first.startswith((*PICKLED, MAGIC["npz"])):  # as PyTorch saves objects
         return pickled(where, "a pickle")
-    return InputError(
-        "E181",
-        "safetensors file refused",
+    return error(
+        "safetensors_refused",
         where=where,
         got=f"first bytes {first[:8].hex() or 'none'}",
-        expected="a recording: " + ", ".join(["CSV", *MAGIC]),
-        fix="save the arrays with numpy.savez",
+        formats=", ".join(["CSV", *MAGIC]),
     )
 
 
 def pickled(where: str, got: str) -> InputError:
     """E180: loading a pickle runs the code in it, so none is ever opened."""
-    return InputError(
-        "E180",
-        "pickle refused",
-        where=where,
-        got=got,
-        expected="plain numbers",
-        fix="save arrays of numbers, with numpy.savez or as Parquet",
-    )
+    return error("pickle_refused", where=where, got=got)
 
 
 def compressed(where: str, first: bytes) -> InputError:
     """E126: what a compressed text would unpack to is not known."""
-    return InputError(
-        "E126",
-        "compressed file",
-        where=where,
-        got=f"first bytes {first[:2].hex()}",
-        expected="the file itself",
-        fix="unpack the file first",
-    )
+    return error("compressed_file", where=where, got=f"first bytes {first[:2].hex()}")
 
 
 def read_bytes(path: Path, limit: int | None = None, first: int | None = None) -> bytes:
@@ -160,24 +136,16 @@ def steady(path: Path, limit: int | None = None) -> Iterator[int]:
     if not stat.S_ISREG(before.st_mode):
         raise _not_a_file(where, before.st_mode)
     if limit is not None and before.st_size > limit:
-        raise InputError(
-            "E126",
-            "file too large",
-            where=where,
-            got=f"{before.st_size} bytes",
-            expected=f"at most {limit} bytes",
-            fix="split the file",
+        raise error(
+            "file_too_large", where=where, got=f"{before.st_size} bytes", limit=limit
         )
     yield before.st_size
     after = _status(path)
     if (before.st_size, before.st_mtime_ns) != (after.st_size, after.st_mtime_ns):
-        raise InputError(
-            "E129",
-            "file changed while it was read",
+        raise error(
+            "file_changed_while_read",
             where=where,
             got=f"{before.st_size} then {after.st_size} bytes",
-            expected="a finished recording",
-            fix="wait until the recording has ended",
         )
 
 
@@ -192,26 +160,19 @@ def library(module: str, extra: str, what: str) -> Any:
     """A module of an optional package, imported when a file needs it (E135)."""
     try:
         return importlib.import_module(module)
-    except ImportError as error:
-        raise InputError(
-            "E135",
-            f"{what} cannot be read",
-            got=str(error),
+    except ImportError as caught:
+        raise error(
+            "package_missing",
+            got=str(caught),
+            what=what,
+            extra=extra,
             expected=module.split(".")[0],
-            fix=f"pip install 'sim2gp[{extra}]'",
-        ) from error
+        ) from caught
 
 
 def _check_nul(path: Path) -> None:
     if "\x00" in str(path):
-        raise InputError(
-            "E131",
-            "NUL in a path",
-            where=repr(shown(path)),
-            got="a NUL character",
-            expected="a plain path",
-            fix="remove the character",
-        )
+        raise error("nul_in_path", where=repr(shown(path)), got="a NUL character")
 
 
 def _not_a_file(where: str, mode: int) -> InputError:
@@ -222,33 +183,26 @@ def _not_a_file(where: str, mode: int) -> InputError:
         stat.S_IFCHR: "a device",
         stat.S_IFBLK: "a device",
     }
-    return InputError(
-        "E130",
-        "not a file",
-        where=where,
-        got=kinds.get(stat.S_IFMT(mode), "something else"),
-        expected="a regular file, or a folder of LeRobot, Minari or rosbag2",
-        fix="name the file itself",
+    return error(
+        "not_a_file", where=where, got=kinds.get(stat.S_IFMT(mode), "something else")
     )
 
 
-def _unreadable(path: Path, error: OSError) -> InputError:
+def _unreadable(path: Path, caught: OSError) -> InputError:
     folder = path.parent
     hint = "check the path"
-    if isinstance(error, FileNotFoundError):
+    if isinstance(caught, FileNotFoundError):
         if path.is_symlink():
             hint = f"the link points to {os.readlink(path)}, which is not there"
         elif folder.is_dir():
             stems = [p.stem for p in folder.iterdir() if p.suffix == path.suffix]
             close = nearest(path.stem, stems)
             hint = f"did you mean {close}{path.suffix}" if close else hint
-    elif isinstance(error, PermissionError):
+    elif isinstance(caught, PermissionError):
         hint = "give yourself the right to read it"
-    return InputError(
-        "E130",
-        "file cannot be read",
+    return error(
+        "file_cannot_be_read",
         where=shown(path),
-        got=(error.strerror or str(error)).lower(),
-        expected="a readable file",
+        got=(caught.strerror or str(caught)).lower(),
         fix=hint,
     )

@@ -21,7 +21,7 @@ from sim2gp.data.logs.npz import read_npz
 from sim2gp.data.logs.parquet import read_parquet
 from sim2gp.data.logs.ros import read_bag
 from sim2gp.data.logs.table import Table, read_table
-from sim2gp.errors import InputError
+from sim2gp.errors import error
 
 BAGS = ("rosbag1", "rosbag2", "mcap")
 CLOCKS = ("header", "log")  # what ``time`` may be in a bag
@@ -144,33 +144,22 @@ def _check_bag(
     path: Path, time: str | None, period: float | None, episode: str | None
 ) -> None:
     if period is not None:
-        raise InputError(
-            "E160",
-            "period for a recording with stamps",
+        raise error(
+            "period_with_stamps",
             where=shown(path),
             got=f"period = {period:g}",
-            expected="the stamps of the messages",
-            fix=f"write resample = {{period = {period:g}}} instead",
+            period=f"{period:g}",
         )
     if time is not None and time not in CLOCKS:
-        raise InputError(
-            "E160",
-            "no such clock",
-            where=shown(path),
-            got=f"time = {time!r}",
-            expected='"header" or "log", or nothing',
-            fix="leave time out",
-        )
+        raise error("no_such_clock", where=shown(path), got=f"time = {time!r}")
     _check_no_episode(path, episode, "bag")
 
 
 def _check_no_episode(path: Path, episode: str | None, kind: str) -> None:
     if episode is not None:
-        raise InputError(
-            "E160",
-            "column of episodes",
+        raise error(
+            "column_of_episodes_unneeded",
             where=shown(path),
             got=f"episode = {episode!r}",
-            expected=f"nothing: a {kind} tells its episodes itself",
-            fix="leave episode out",
+            format=kind,
         )

@@ -19,7 +19,7 @@ from sim2gp.data.logs.budget import Meter
 from sim2gp.data.logs.file import library, shown, steady
 from sim2gp.data.logs.table import Table
 from sim2gp.data.logs.unpack import inflated, lzf_pieces
-from sim2gp.errors import InputError
+from sim2gp.errors import error
 
 #: Groups whose names are one of these words and a number hold an episode each.
 _EPISODE = re.compile(
@@ -77,13 +77,10 @@ def entries_of(file: Any, where: str, meter: Meter) -> dict[str, Entry]:
 def _entry(dataset: Any, where: str, meter: Meter) -> Entry:
     def values() -> Shaped[np.ndarray, "..."]:
         if dataset.external or dataset.is_virtual:
-            raise InputError(
-                "E131",
-                "data in another file",
+            raise error(
+                "data_in_another_file",
                 where=where,
                 got="an external or virtual dataset",
-                expected="data inside the file",
-                fix="copy the data into the file (h5repack)",
             )
         size = math.prod(dataset.shape) * dataset.dtype.itemsize
         meter.claim(size)
@@ -116,13 +113,11 @@ def _check_chunks(dataset: Any, where: str, meter: Meter) -> None:
     used = [plist.get_filter(i)[0] for i in range(plist.get_nfilters())]
     other = next((number for number in used if number not in _FILTERS), None)
     if other is not None:
-        raise InputError(
-            "E136",
-            "data compressed in a way that is not read",
+        raise error(
+            "unread_hdf5_filter",
             where=where,
             got=f"HDF5 filter {other}",
-            expected=", ".join(_FILTERS.values()) + ", or none",
-            fix="h5repack -f GZIP=4",
+            filters=", ".join(_FILTERS.values()),
         )
     packed = [number for number in used if number in (_GZIP, _LZF)]
     if len(packed) > 1:

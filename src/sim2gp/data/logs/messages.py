@@ -15,7 +15,7 @@ from sim2gp.data.logs.arrays import MAX_WIDTH
 from sim2gp.data.logs.budget import Meter
 from sim2gp.data.logs.log import Note
 from sim2gp.data.logs.table import Rows, Table
-from sim2gp.errors import InputError
+from sim2gp.errors import error
 
 NEAR = 1_000_000_000  # ns: clocks further apart than this are not one clock
 #: Bytes of a message while it is collected, and of each of its numbers.
@@ -86,13 +86,10 @@ def _check_steady_fields(streams: Sequence[Stream], where: str) -> None:
         for name in stream.names:
             other = owners.setdefault(name, stream)
             if other is not stream:
-                raise InputError(
-                    "E140",
-                    "field that comes and goes",
+                raise error(
+                    "field_comes_and_goes",
                     where=f"{where} {stream.topic}:message {stream.numbers[0]}",
                     got=f"{name} beside other fields than before",
-                    expected="the same fields in every message that has it",
-                    fix="record the nodes that publish there on topics of their own",
                 )
 
 
@@ -111,13 +108,10 @@ def clocked(
     stamped = [np.asarray(stream.stamped, dtype=np.int64) for stream in streams]
     stated = [bool(np.all(stamps > 0)) for stamps in stamped]
     if clock == "header" and not all(stated):
-        raise InputError(
-            "E103",
-            "no header stamps",
+        raise error(
+            "no_header_stamps",
             where=f"{where} {streams[stated.index(False)].topic}",
             got="messages without a stamp, or with a stamp of zero",
-            expected="header.stamp in every message",
-            fix='leave time out, or set time = "log"',
         )
     apart = [
         abs(int(np.median(a - b)))
@@ -196,26 +190,16 @@ def _joints(
     found: Fields,
 ) -> None:
     if len(set(joints)) != len(joints):
-        raise InputError(
-            "E104",
-            "joint named twice",
-            where=where,
-            got=", ".join(joints)[:80],
-            expected="each name once",
-            fix="rename one of them",
-        )
+        raise error("joint_named_twice", where=where, got=", ".join(joints)[:80])
     for part in parts:
         values = _get(content, part)
         if len(values) == 0:
             continue
         if len(values) != len(joints):
-            raise InputError(
-                "E140",
-                "names and values differ",
+            raise error(
+                "names_and_values_differ",
                 where=where,
                 got=f"{len(joints)} names, {len(values)} of {part}",
-                expected="one value for each name",
-                fix="record again with complete messages",
             )
         for joint, value in zip(joints, values, strict=True):
             found[f"{topic}/{joint}/{part}"] = _number(value)

@@ -20,7 +20,7 @@ from sim2gp.data.logs.arrays import Entry, distinct, table_of
 from sim2gp.data.logs.budget import Meter
 from sim2gp.data.logs.file import pickled, shown, steady
 from sim2gp.data.logs.table import Table
-from sim2gp.errors import InputError
+from sim2gp.errors import error
 
 MAX_HEADER = 10_000  # bytes; numpy's own limit
 STEP = 2**20  # bytes that are unpacked at once
@@ -58,33 +58,16 @@ def _checked(info: zipfile.ZipInfo, where: str) -> zipfile.ZipInfo:
     name = info.filename.replace("\\", "/")
     path = PurePosixPath(name)
     if path.is_absolute() or ".." in path.parts or ":" in path.parts[0]:
-        raise InputError(
-            "E182",
-            "archive entry outside the archive",
-            where=where,
-            got=repr(info.filename)[:60],
-            expected="names of arrays",
-            fix="do not use this file: it was made to overwrite others",
-        )
+        raise error("entry_outside_archive", where=where, got=repr(info.filename)[:60])
     if path.suffix == ".pkl" or "data.pkl" in path.parts:
         raise pickled(where, info.filename)
     if path.suffix != ".npy":
-        raise InputError(
-            "E125",
-            "not an array",
-            where=where,
-            got=repr(info.filename)[:60],
-            expected="members that end with .npy",
-            fix="save the arrays with numpy.savez",
-        )
+        raise error("member_not_an_array", where=where, got=repr(info.filename)[:60])
     if info.compress_type not in _PLAIN:
-        raise InputError(
-            "E126",
-            "archive compressed in another way",
+        raise error(
+            "unknown_archive_compression",
             where=where,
             got=f"method {info.compress_type} of {info.filename!r}"[:80],
-            expected="numpy's own, deflate",
-            fix="save the arrays with numpy.savez_compressed",
         )
     return info
 
@@ -99,13 +82,11 @@ def _entry(archive: zipfile.ZipFile, info: zipfile.ZipInfo, meter: Meter) -> Ent
     count = math.prod(shape)
     claimed = count * dtype.itemsize
     if claimed != info.file_size - start:
-        raise InputError(
-            "E126",
-            "array header and size differ",
+        raise error(
+            "array_header_and_size_differ",
             where=meter.at,
             got=f"shape {shape} in {info.file_size} bytes",
-            expected=f"{start + claimed} bytes",
-            fix="save the array again",
+            size=start + claimed,
         )
 
     def values() -> Shaped[np.ndarray, "..."]:

@@ -15,7 +15,7 @@ from sim2gp.data.logs.arrays import Entry, distinct, table_of
 from sim2gp.data.logs.budget import Meter
 from sim2gp.data.logs.file import MAGIC, library, shown, steady
 from sim2gp.data.logs.table import Table
-from sim2gp.errors import InputError
+from sim2gp.errors import error
 
 Labels = Mapping[str, Sequence[str]]
 BATCH = 2**20  # numbers that are decoded at once
@@ -58,14 +58,7 @@ def _check_end(path: Path, size: int, where: str) -> None:
         file.seek(max(size - 4, 0))
         end = file.read()
     if end != MAGIC["parquet"] or size < 12:
-        raise InputError(
-            "E125",
-            "file incomplete",
-            where=where,
-            got=f"{size} bytes without a footer",
-            expected="a footer at the end",
-            fix="close the writer before copying, or record it again",
-        )
+        raise error("no_footer", where=where, got=f"{size} bytes without a footer")
 
 
 def _leaves(kind: Any) -> int:
@@ -159,13 +152,10 @@ def _array(chunk: Any, name: str, where: str) -> Shaped[np.ndarray, "..."]:
         widths = chunk.value_lengths() if hasattr(chunk, "value_lengths") else None
         if widths is None or set(widths.unique().to_pylist()) == {width}:
             return _plain(inner).reshape(len(chunk), width)
-    raise InputError(
-        "E140",
-        "lists of different lengths",
+    raise error(
+        "lists_of_different_lengths",
         where=f"{where}:column {name}",
         got=f"{chunk.null_count} empty rows" if chunk.null_count else "ragged rows",
-        expected="the same number of entries in every row",
-        fix="write fixed-size lists",
     )
 
 

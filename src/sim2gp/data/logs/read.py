@@ -24,7 +24,7 @@ from sim2gp.data.logs.log import ChannelLike, Column, Log, Note, RawLog
 from sim2gp.data.logs.resample import Resample, Track, joined
 from sim2gp.data.logs.table import Rows, Table
 from sim2gp.data.logs.units import factor
-from sim2gp.errors import InputError
+from sim2gp.errors import InputError, error
 
 Values = Float[np.ndarray, " N"]
 Mask = Bool[np.ndarray, " N"]
@@ -201,14 +201,7 @@ def _usable(table: Table, plan: _Plan) -> tuple[Table, Values, Mask, list[Note]]
     out = np.zeros(len(time), dtype=bool)
     for low, high in plan.exclude:
         if not low < high:
-            raise InputError(
-                "E141",
-                "excluded interval",
-                where=source,
-                got=f"[{low:g}, {high:g}]",
-                expected="[start, end] in s with start < end",
-                fix="swap the two",
-            )
+            raise error("excluded_interval", where=source, got=f"[{low:g}, {high:g}]")
         out |= (time >= low) & (time <= high)
     if plan.drop_nonfinite:
         commands = plan.held(plan.actions, table).values()
@@ -260,13 +253,10 @@ def _or_constant(error: InputError, plan: _Plan) -> InputError:
 
 
 def _too_short(source: str, rows: int) -> InputError:
-    return InputError(
-        "E116",
-        "no transition",
+    return error(
+        "no_transition",
         where=source,
         got=f"{rows} usable row" + ("" if rows == 1 else "s"),
-        expected="at least 2 per episode",
-        fix="record longer, or exclude less",
     )
 
 

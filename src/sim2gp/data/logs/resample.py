@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from sim2gp.data.logs.checks import GAP
 from sim2gp.data.logs.log import Note
 from sim2gp.data.logs.table import Rows
-from sim2gp.errors import InputError, nearest
+from sim2gp.errors import InputError, error, nearest
 
 Values = Float[np.ndarray, " N"]
 Mask = Bool[np.ndarray, " N"]
@@ -75,13 +75,10 @@ def joined(
         if resample is None:
             return tracks[0], []
         if resample.period is None and resample.stamps is None:
-            raise InputError(
-                "E160",
-                "nothing to resample",
+            raise error(
+                "nothing_to_resample",
                 where=source,
                 got="one stream, and neither period nor stamps",
-                expected="rows at a period, or several streams",
-                fix="remove resample, or add period to it",
             )
     rule = resample or Resample()
     at, cuts, place = _clock(tracks, rule, source)
@@ -200,12 +197,11 @@ def _clock(
         named = {track.stream: track for track in tracks}
         if rule.stamps not in named:
             close = nearest(rule.stamps, named)
-            raise InputError(
-                "E103",
-                f"no stream {rule.stamps}",
+            raise error(
+                "no_stream",
                 where=source,
                 got=", ".join(named) or "one clock",
-                expected="a stream that holds one of the columns",
+                name=rule.stamps,
                 fix=f"did you mean {close}" if close else "state a period instead",
             )
         chosen = named[rule.stamps]
@@ -263,11 +259,4 @@ def _only(track: Track, valid: Mask) -> Track:
 def _apart(tracks: Sequence[Track], source: str) -> InputError:
     spans = [f"{t.stream or 'rows'} {t.time[0]:.6g} to {t.time[-1]:.6g} s"
              for t in tracks]  # fmt: skip
-    return InputError(
-        "E116",
-        "streams that do not overlap",
-        where=source,
-        got="; ".join(spans),
-        expected="at least two rows at which every column is known",
-        fix="record the topics together, or state one clock for all",
-    )
+    return error("streams_do_not_overlap", where=source, got="; ".join(spans))

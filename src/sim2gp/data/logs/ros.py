@@ -20,7 +20,7 @@ from sim2gp.data.logs.file import MAGIC, compressed, library, read_bytes, shown,
 from sim2gp.data.logs.messages import Message, clocked, collected
 from sim2gp.data.logs.table import Table
 from sim2gp.data.logs.unpack import STEP, pieces
-from sim2gp.errors import InputError
+from sim2gp.errors import InputError, error
 
 #: What a byte of a message may become in Python: lists of JSON, and of small messages.
 JSON, NESTED = 16, 128
@@ -47,14 +47,7 @@ def read_bag(
             known = seen if wanted is None else _names(path, kind, meter)
             raise missing(name, known, where)
     if not streams:
-        raise InputError(
-            "E115",
-            "no messages",
-            where=where,
-            got="no numbers",
-            expected="messages with numbers",
-            fix="record the topics of the robot",
-        )
+        raise error("no_messages", where=where, got="no numbers")
     return clocked(streams, start, clock, where, seen)
 
 
@@ -219,14 +212,7 @@ class _Decoders:
 
 
 def _unknown(where: str, got: str, expected: str) -> InputError:
-    return InputError(
-        "E136",
-        "messages that cannot be decoded",
-        where=where,
-        got=got,
-        expected=expected,
-        fix="record as rosbag2 with MCAP storage, or convert the topic to JSON",
-    )
+    return error("messages_not_decodable", where=where, got=got, expected=expected)
 
 
 def _mcap(

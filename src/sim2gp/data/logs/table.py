@@ -26,7 +26,7 @@ from sim2gp.data.logs.file import (
     shown,
 )
 from sim2gp.data.logs.log import Note
-from sim2gp.errors import InputError, nearest
+from sim2gp.errors import InputError, error, nearest
 
 _BINARY = (*(m for k, m in MAGIC.items() if k != "npz"), b"\x93NUMPY")
 BLOCK = 20_000  # rows that are parsed at once
@@ -84,18 +84,15 @@ def decode(content: bytes, where: str) -> str:
     faults = [0] if content.startswith(_BINARY) else [nul] if nul >= 0 else []
     try:
         text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        faults.append(error.start)
+    except UnicodeDecodeError as caught:
+        faults.append(caught.start)
     if not faults:
         return text
     offset = min(faults)
-    raise InputError(
-        "E120",
-        "not UTF-8 text",
+    raise error(
+        "not_utf8_text",
         where=f"{where}:byte {offset}",
         got=f"byte 0x{content[offset]:02x}",
-        expected="text in UTF-8",
-        fix="save the file as UTF-8 text, or give it the suffix of its format",
     )
 
 
@@ -111,25 +108,11 @@ def read_table(
     lines = text.splitlines()
     filled = [i for i, line in enumerate(lines) if line and not line.isspace()]
     if not filled:
-        raise InputError(
-            "E115",
-            "empty file",
-            where=where,
-            got="no text",
-            expected="a header and at least two rows",
-            fix="record the log again",
-        )
+        raise error("empty_table", where=where, got="no text")
     numbers = np.asarray(filled, dtype=np.int64) + 1
     header = _header(lines[filled[0]], Rows(where, numbers[:1]))
     if len(filled) == 1:
-        raise InputError(
-            "E115",
-            "no rows below the header",
-            where=where,
-            got="0 rows",
-            expected="at least two rows",
-            fix="record the log again",
-        )
+        raise error("no_rows_below_header", where=where, got="0 rows")
     table = Rows(where, numbers[1:])
     rows = [lines[i] for i in filled[1:]]
     if wanted is None:
@@ -157,16 +140,14 @@ def _fields(lines: Sequence[str], table: Rows) -> Iterator[list[str]]:
     reader = csv.reader(lines, skipinitialspace=True)
     try:
         yield from reader
-    except csv.Error as error:
+    except csv.Error as caught:
         i = min(max(reader.line_num, 1), len(lines)) - 1
-        raise InputError(
-            "E121",
-            "line that cannot be split into fields",
+        raise error(
+            "line_not_split",
             where=table.at(i),
-            got=f"{error}, in a line of {len(lines[i])} characters",
-            expected=f"fields of at most {csv.field_size_limit()} characters",
-            fix="remove the line, or the quotes in it",
-        ) from error
+            got=f"{caught}, in a line of {len(lines[i])} characters",
+            limit=csv.field_size_limit(),
+        ) from caught
 
 
 def _header(line: str, table: Rows) -> tuple[str, ...]:
@@ -178,24 +159,15 @@ def _header(line: str, table: Rows) -> tuple[str, ...]:
             if mark in line:
                 raise _delimiter(line, where, word)
     if all(_is_number(name) for name in names if name):
-        raise InputError(
-            "E103",
-            "no header",
-            where=where,
-            got=repr(_cut(line)),
-            expected="a first line with the names of the columns",
-            fix="add the names as the first line",
-        )
+        raise error("no_header", where=where, got=repr(_cut(line)))
     first: dict[str, int] = {}
     for i, name in enumerate(names):
         if name and first.setdefault(name, i) != i:
-            raise InputError(
-                "E104",
-                f"column {name} stands twice",
+            raise error(
+                "column_stands_twice",
                 where=where,
                 got=f"columns {first[name] + 1} and {i + 1}",
-                expected="each name once",
-                fix="rename one of them",
+                name=name,
             )
     return tuple(names)
 
@@ -208,24 +180,16 @@ def _numeric(header: tuple[str, ...], row: str, table: Rows) -> list[str]:
 
 
 def _delimiter(line: str, where: str, word: str) -> InputError:
-    return InputError(
-        "E119",
-        "wrong delimiter",
-        where=where,
-        got=f"{word} in {_cut(line)!r}",
-        expected="values separated by commas, decimals by points",
-        fix="save the table with commas and decimal points",
-    )
+    return error("wrong_delimiter", where=where, got=f"{word} in {_cut(line)!r}")
 
 
 def _missing(name: str, header: tuple[str, ...], where: str) -> InputError:
     close = nearest(name, header)
-    return InputError(
-        "E103",
-        f"missing column {name}",
+    return error(
+        "missing_column",
         where=f"{where}:line 1",
         got=_cut(", ".join(header[:60]), 120),
-        expected=f"a column named {name}",
+        name=name,
         fix=f"did you mean {close}" if close else "name a column of the file",
     )
 
@@ -244,13 +208,10 @@ def _check_widths(
             meter.tick()
             widths.append(len(fields))
         if len(widths) != len(rows):
-            raise InputError(
-                "E121",
-                "quote that never closes",
+            raise error(
+                "quote_never_closes",
                 where=table.source,
                 got=f"{len(widths)} records on {len(rows)} lines",
-                expected="one record per line",
-                fix="remove the quotes",
             )
     else:
         widths = [row.count(",") + 1 for row in rows]
@@ -265,13 +226,12 @@ def _check_widths(
             raise _delimiter(line, place, "semicolons or tabs")
         if set(widths) == {2 * want}:
             raise _delimiter(line, place, "decimal commas")
-    raise InputError(
-        "E121",
-        "ragged row",
+    raise error(
+        "ragged_row",
         where=place,
         got=f"{widths[i]} fields",
-        expected=f"{want} fields",
-        fix=f"mend or delete the line ({wrong.size} such in the file)",
+        want=want,
+        count=wrong.size,
     )
 
 
@@ -312,20 +272,14 @@ def _parse(
 
 
 def _not_a_number(cell: str, place: str, is_time: bool) -> InputError:
-    code, what, expected = "E121", "text in a numeric column", "a number"
-    fix = "mend the cell, or leave it empty and set drop_nonfinite"
+    got = repr(_cut(cell))
     if is_time and _DATE.search(cell):
-        code, what = "E114", "time written as a date or clock"
-        expected = "seconds as a number, such as 12.345"
-        fix = "write the time as seconds since the start"
-    elif cell.lower() in ("true", "false") or _is_complex(cell):
-        code, what, expected = "E123", "truth value or complex number", "a real number"
-        fix = "write real numbers"
-    elif "," in cell:
-        fix = "write numbers without thousands separators, such as 1234"
-    return InputError(
-        code, what, where=place, got=repr(_cut(cell)), expected=expected, fix=fix
-    )
+        return error("time_as_date", where=place, got=got)
+    if cell.lower() in ("true", "false") or _is_complex(cell):
+        return error("truth_or_complex_cell", where=place, got=got)
+    if "," in cell:
+        return error("thousands_separators", where=place, got=got)
+    return error("text_in_cell", where=place, got=got)
 
 
 def _is_number(cell: str) -> bool:

@@ -6,7 +6,7 @@ the base unit of its kind, and two units convert when their kinds agree.
 
 from math import pi
 
-from sim2gp.errors import InputError, nearest
+from sim2gp.errors import error, nearest
 
 #: unit -> (kind, factor to the base unit of the kind)
 UNITS: dict[str, tuple[str, float]] = {
@@ -43,21 +43,18 @@ def factor(unit: str | None, target: str, where: str) -> float:
         return 1.0
     if unit not in UNITS:
         close = nearest(unit, UNITS)
-        raise InputError(
-            "E160",
-            "unknown unit",
+        raise error(
+            "unknown_unit",
             where=where,
             got=repr(unit),
-            expected="one of " + ", ".join(UNITS),
+            known=", ".join(UNITS),
             fix=f"did you mean {close!r}" if close else f"use {target!r}",
         )
     if target not in UNITS or UNITS[unit][0] != UNITS[target][0]:
-        raise InputError(
-            "E107",
-            "unit of another kind",
+        raise error(
+            "unit_of_another_kind",
             where=where,
             got=f"{unit!r}, a unit of {UNITS[unit][0]}",
-            expected=f"a unit that converts to {target!r}",
-            fix="name the unit of the column in the file",
+            target=repr(target),
         )
     return UNITS[unit][1] / UNITS[target][1]
