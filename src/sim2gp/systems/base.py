@@ -341,7 +341,7 @@ def index_of(name: str, channels: Sequence[Channel], *, where: str = "") -> int:
         close = nearest(name, names)
         fix = f"did you mean {close}?" if close else ""
         known = ", ".join(names)
-        raise error("unknown_channel", where=where, got=name, fix=fix, known=known)
+        raise error("no_such_channel", where=where, got=name, fix=fix, known=known)
     return names.index(name)
 
 
