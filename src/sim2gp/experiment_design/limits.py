@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sim2gp.errors import InputError
+from sim2gp.errors import InputError, error
 from sim2gp.systems.base import AbstractSystem, index_of
 from sim2gp.systems.machine import plant_of
 
@@ -65,13 +65,7 @@ class LimitBox(eqx.Module):
                 )
             if not rates.get(channel.name, math.inf) > 0.0:
                 got = f"{rates[channel.name]:g} {channel.unit}/s"
-                raise InputError(
-                    "E150",
-                    f"rate of {channel.name} admits no motion",
-                    got=got,
-                    expected="more than 0",
-                    fix="raise it",
-                )
+                raise error("rate_admits_no_motion", got=got, name=channel.name)
         for channel, x in zip(states, start.tolist(), strict=True):
             low, high = box[channel.name]
             if not low < x < high:
@@ -166,10 +160,5 @@ def kept(
 def _no_motion(
     name: str, low: float, high: float, expected: str, fix: str
 ) -> InputError:
-    return InputError(
-        "E150",
-        f"limits of {name} admit no motion",
-        got=f"[{low:g}, {high:g}]",
-        expected=expected,
-        fix=fix,
-    )
+    got = f"[{low:g}, {high:g}]"
+    return error("no_motion_in_limits", got=got, expected=expected, fix=fix, name=name)

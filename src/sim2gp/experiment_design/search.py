@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sim2gp import checks
-from sim2gp.errors import InputError, NotFinite
+from sim2gp.errors import InputError, NotFinite, error
 from sim2gp.experiment_design import by_gradients, by_samples
 from sim2gp.experiment_design.experiment import Experiment
 from sim2gp.experiment_design.goals import AbstractGoal
@@ -103,12 +103,7 @@ def design(
     found = _of_starts(one, search, starts)
     best = max(found, key=lambda f: f.nats if math.isfinite(f.nats) else -math.inf)
     if not math.isfinite(best.nats):
-        raise NotFinite(
-            "E203",
-            "information of the experiment",
-            got=best.nats,
-            fix="narrow the limits of the states: the simulation is lost within them",
-        )
+        raise error("information_not_finite", NotFinite, got=best.nats)
     return best
 
 
@@ -136,13 +131,8 @@ def _kept(
         if bad <= ALLOWED:
             return U, states, bad
         U = SMALLER * U
-    raise InputError(
-        "E150",
-        "no commands keep the limits",
-        got=f"{bad:.0%} of {len(states)} draws leave them however small the commands",
-        expected=f"at most {ALLOWED:.0%}",
-        fix="widen the limits of the states, or know the machine better first",
-    )
+    got = f"{bad:.0%} of {len(states)} draws leave them however small the commands"
+    raise error("no_commands_keep_limits", got=got, share=f"{ALLOWED:.0%}")
 
 
 @in_float64
@@ -155,13 +145,8 @@ def prediction_rows(
     """
     periods = max(1, round(horizon / experiment.period))
     if periods > experiment.steps:
-        raise InputError(
-            "E151",
-            "prediction longer than the experiment",
-            got=f"{horizon:g} s",
-            expected=f"at most {experiment.period * experiment.steps:g} s",
-            fix="predict less far, or design more seconds",
-        )
+        longest = f"{experiment.period * experiment.steps:g}"
+        raise error("prediction_too_long", got=f"{horizon:g} s", longest=longest)
     experiment, limits = jax.tree.map(jnp.asarray, (experiment, limits))
     signal = Multisine(experiment.period, experiment.steps)
     U = signal.commands(MILD * signal.random(key, limits.low.size), limits)

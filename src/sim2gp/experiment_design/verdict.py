@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from sim2gp.errors import InputError
+from sim2gp.errors import error
 from sim2gp.identification.words import digits, listed
 
 NARROWER = 0.05  # an experiment must narrow what is asked by this share
@@ -36,8 +36,7 @@ def _pair(name: str, limit: float | tuple[float, float]) -> tuple[float, float]:
     low, high = (-limit, limit) if isinstance(limit, int | float) else limit
     if low < high:
         return float(low), float(high)
-    got, fix = f"{low:g} to {high:g}", "swap the two, or give a positive number"
-    raise InputError("E141", f"limits of {name}", got=got, fix=fix)
+    raise error("limits_out_of_order", got=f"{low:g} to {high:g}", name=name)
 
 
 @dataclass(frozen=True)

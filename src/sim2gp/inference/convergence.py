@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from sim2gp.errors import DeadParameters, NotConverged, NotFinite
+from sim2gp.errors import DeadParameters, NotConverged, NotFinite, error
 from sim2gp.types import AnyArray, AnyScalar
 
 CONVERGED, STALLED, NOT_FINITE, DEAD = 0, 1, 2, 3
@@ -35,32 +35,22 @@ class Convergence(eqx.Module):
         """Raise a typed error on the host, naming what to look at."""
         status = int(self.status)
         if status == NOT_FINITE:
-            raise NotFinite(
-                "E203",
-                "the simulation is not finite at any start of the fit",
-                where=where,
-                fix="narrow the priors, or shorten the step",
-            )
+            raise error("fit_not_finite", NotFinite, where=where)
         if status == DEAD:
-            raise DeadParameters(
-                "E146",
-                "no parameter reaches the data",
-                where=where,
-                got=f"zero sensitivity to {', '.join(names)}",
-                expected="data that depend on one of them at least",
-                fix="check the columns, the excitation and what is fixed",
+            got = f"zero sensitivity to {', '.join(names)}"
+            raise error(
+                "no_parameter_reaches_data", DeadParameters, where=where, got=got
             )
         if status == STALLED:
             step = f"{float(self.newton_step_sd):.1e} posterior sd"
-            raise NotConverged(
-                "E201",
-                "the MAP did not converge",
-                where=where,
-                got=f"scaled gradient {float(self.gradient):.1e} "
+            got = (
+                f"scaled gradient {float(self.gradient):.1e} "
                 f"({step}) after {int(self.steps)} steps; farthest off: "
-                f"{self._farthest(names)}",
-                expected=f"at most {NEAR:g} posterior sd",
-                fix="hold these, or check units, bounds and columns",
+                f"{self._farthest(names)}"
+            )
+            near = f"{NEAR:g}"
+            raise error(
+                "map_not_reached", NotConverged, where=where, got=got, near=near
             )
 
     def _farthest(self, names: tuple[str, ...]) -> str:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sim2gp.errors import InputError
+from sim2gp.errors import InputError, error
 from sim2gp.inference.linalg import library, solve_triangular, triangular
 from sim2gp.types import AnyArray, Key, Scalar
 
@@ -116,14 +116,7 @@ def from_covariance(
 
 
 def _no_covariance(where: str, got: str, expected: str) -> InputError:
-    return InputError(
-        "E143",
-        "not a covariance",
-        where=where,
-        got=got,
-        expected=expected,
-        fix="give the matrix with all its digits, or a Gaussian with a scale",
-    )
+    return error("not_a_covariance", where=where, got=got, expected=expected)
 
 
 def lower_factor(scale: Float[Array, "n k"]) -> Float[Array, "n n"]:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sim2gp import checks
-from sim2gp.errors import InputError
+from sim2gp.errors import error
 from sim2gp.types import Scalar
 
 
@@ -35,13 +35,12 @@ class LinearMeasurement:
             for pick in (min, max)
         )
         if not low < self.value < high:
-            raise InputError(
-                "E142",
-                "a measured sum that the bounds rule out",
+            raise error(
+                "measured_sum_out_of_bounds",
                 where=" + ".join(self.of),
                 got=f"{self.value:g}",
-                expected=f"more than {low:g} and less than {high:g}",
-                fix="widen the bounds of its constants, or correct the sum",
+                low=f"{low:g}",
+                high=f"{high:g}",
             )
 
 

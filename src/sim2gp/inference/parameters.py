@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sim2gp import checks
-from sim2gp.errors import InputError, nearest
+from sim2gp.errors import InputError, error, nearest
 from sim2gp.inference import bijections
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.linalg import library
@@ -55,28 +55,15 @@ class Parameter:
 
     def __post_init__(self) -> None:
         if self.map not in bijections.MAPS:
-            raise InputError(
-                "E141",
-                f"unknown map of parameter {self.name}",
-                got=self.map,
-                expected=f"one of {', '.join(bijections.MAPS)}",
-            )
+            known = ", ".join(bijections.MAPS)
+            raise error("unknown_map", got=self.map, name=self.name, known=known)
         boxed = self.map in ("bounded", "log_bounded")
         where = self.name or "a parameter"
         checks.bounds(where, self.low, self.high, unbounded=not boxed)
         if self.map == "softplus" and not math.isfinite(self.low):
-            expected = "a finite bound to be above"
-            got = f"{self.low:g}"
-            raise InputError(
-                "E141", f"lower bound of {where}", got=got, expected=expected
-            )
+            raise error("no_bound_to_be_above", got=f"{self.low:g}", name=where)
         if self.map == "log_bounded" and self.low <= 0.0:
-            raise InputError(
-                "E141",
-                f"lower bound of {self.name}",
-                got=f"{self.low:g}",
-                expected="a positive bound for a logarithmic box",
-            )
+            raise error("no_positive_bound", got=f"{self.low:g}", name=self.name)
         checks.moments(f"the prior of {where}", self.mean, self.sd)
         checks.finite(where, nominal=self.nominal)
 
@@ -211,13 +198,8 @@ def _match_in_box(boxed: Parameter, mean: float, sd: float) -> Parameter:
 
 
 def _impossible(p: Parameter, mean: float, sd: float, expected: str) -> InputError:
-    return InputError(
-        "E142",
-        f"prior of {p.name or 'a parameter'}",
-        got=f"mean = {mean:g}, sd = {sd:g}",
-        expected=expected,
-        fix="widen the bounds or lower the sd",
-    )
+    got, name = f"mean = {mean:g}, sd = {sd:g}", p.name or "a parameter"
+    return error("impossible_prior", got=got, expected=expected, name=name)
 
 
 class Parameters(eqx.Module):
@@ -379,10 +361,6 @@ def parameters_of(record: type) -> Parameters:
 def unknown_parameter(name: str, known: Any) -> InputError:
     """E145, with the name that was probably meant."""
     close = nearest(name, known)
-    return InputError(
-        "E145",
-        "unknown parameter",
-        got=name,
-        expected=f"one of {', '.join(sorted(known))}",
-        fix=f"did you mean {close}?" if close else "",
-    )
+    expected = f"one of {', '.join(sorted(known))}"
+    fix = f"did you mean {close}?" if close else ""
+    return error("unknown_parameter", got=name, expected=expected, fix=fix)

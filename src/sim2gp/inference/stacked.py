@@ -17,7 +17,7 @@ import numpy as np
 from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Float
 
-from sim2gp.errors import InputError
+from sim2gp.errors import error
 from sim2gp.inference.arrowhead import Blocks, Noise
 from sim2gp.inference.likelihood import AbstractLikelihood
 from sim2gp.types import in_float64
@@ -36,13 +36,7 @@ class Stacked(AbstractLikelihood):
     @in_float64
     def __init__(self, likelihoods: Sequence[AbstractLikelihood]) -> None:
         if not likelihoods:
-            raise InputError(
-                "E148",
-                "likelihoods",
-                where="Stacked",
-                got="none",
-                expected="one or more",
-            )
+            raise error("no_likelihoods", where="Stacked", got="none")
         self.likelihoods = tuple(likelihoods)
         self.counts = block_diag(*(each.counts for each in likelihoods))
         self.floor = jnp.concatenate([each.floor for each in likelihoods])

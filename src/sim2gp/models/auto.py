@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp.belief import AbstractBelief, AbstractModel
 from sim2gp.data.transitions import Transitions
-from sim2gp.errors import InputError
+from sim2gp.errors import error
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.information import Sensitivity
 from sim2gp.types import Action, Dynamics, Key, Scalar, State, in_float64
@@ -114,8 +114,8 @@ class Auto(AbstractModel):
 
     def __init__(self, models: Sequence[AbstractModel]) -> None:
         if len(models) < 2:
-            got, expected = f"{len(models)} to choose from", "two or more"
-            raise InputError("E148", "models", where="Auto", got=got, expected=expected)
+            got = f"{len(models)} to choose from"
+            raise error("too_few_models", where="Auto", got=got)
         self.models = tuple(models)
 
     @property

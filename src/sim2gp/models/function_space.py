@@ -18,7 +18,7 @@ from jaxtyping import Array, Int
 
 from sim2gp import checks
 from sim2gp.data.transitions import Transitions
-from sim2gp.errors import NotFinite
+from sim2gp.errors import NotFinite, error
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.models import features, hybrid
 from sim2gp.models import function_space_loss as loss
@@ -90,14 +90,9 @@ class FunctionSpace(AbstractHybrid):
         towards = eqx.tree_at(lambda b: b.posterior, sim, target)
         fitted, lost = _fit(belief, sim, towards, data, key, schedule, self.objective)
         if int(lost):
-            raise NotFinite(
-                "E203",
-                "the simulator is not finite on its box",
-                where="the inputs that a network is matched on",
-                got=f"NaN or infinity at {int(lost)} of {POOL}",
-                expected="a finite step and Jacobian at each",
-                fix="narrow `reach`, or the channels' limits",
-            )
+            where = "the inputs that a network is matched on"
+            got = f"NaN or infinity at {int(lost)} of {POOL}"
+            raise error("simulator_not_finite_on_box", NotFinite, where=where, got=got)
         return fitted
 
 

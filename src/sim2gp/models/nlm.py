@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp.belief import AbstractBelief, AbstractModel
 from sim2gp.data.transitions import Transitions
-from sim2gp.errors import NotFinite
+from sim2gp.errors import NotFinite, error
 from sim2gp.inference import linear_regression as last_layer
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.information import Sensitivity
@@ -365,12 +365,8 @@ def checked(belief: Any, data: Transitions) -> Any:
     """The belief, or `NotFinite` where any of its numbers is not finite."""
     leaves = jax.tree.leaves(eqx.filter(belief, eqx.is_inexact_array))
     if not all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in leaves):
-        raise NotFinite(
-            "E203",
-            "no checkpoint of the training is finite",
-            where=f"{data.count} transitions",
-            fix="look for non-finite or huge values in the data",
-        )
+        where = f"{data.count} transitions"
+        raise error("no_finite_checkpoint", NotFinite, where=where)
     return belief
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp.data.transitions import with_history
-from sim2gp.errors import NotFinite, of_callbacks, warn
+from sim2gp.errors import NotFinite, error, of_callbacks, warn
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.planning.tasks import Task
 from sim2gp.planning.world import (
@@ -274,11 +274,11 @@ def check_finite(trajectory: Trajectory, where: str) -> None:
         rows = np.asarray(values).reshape(len(values), -1)
         bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
         if bad.size:
-            raise NotFinite(
-                "E203",
-                f"{what} {bad[0]} of an episode",
+            raise error(
+                "episode_not_finite",
+                NotFinite,
                 where=where,
                 got=str(rows[bad[0]].tolist()),
-                expected="finite numbers",
-                fix="check the truth's constants and the integration step",
+                what=what,
+                step=bad[0],
             )

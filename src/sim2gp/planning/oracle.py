@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from sim2gp import checks
 from sim2gp.data.transitions import Transitions
-from sim2gp.errors import NotFinite, Sim2GPError
+from sim2gp.errors import NotFinite, Sim2GPError, error
 from sim2gp.planning.episode import Purpose, Trajectory, episode, key_for, oracle_world
 from sim2gp.planning.tasks import Task, draw_truth
 from sim2gp.planning.world import AbstractPlanner, World
@@ -105,10 +105,7 @@ def accept_truth(
             continue
         if oracle.reached:
             return AcceptedTruth(task, oracle, attempt)
-    raise Sim2GPError(
-        "E204",
-        f"no truth that {type(planner).__name__} can swing up",
-        got=f"{attempts} draws ({truth}), {diverged} of them not finite",
-        expected="at least one",
-        fix="narrow the prior or give the planner more samples",
+    got = f"{attempts} draws ({truth}), {diverged} of them not finite"
+    raise error(
+        "no_truth_swung_up", Sim2GPError, got=got, planner=type(planner).__name__
     )

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from sim2gp import checks
-from sim2gp.errors import InputError
+from sim2gp.errors import error
 from sim2gp.systems import (
     AbstractEffect,
     AbstractPart,
@@ -283,7 +283,7 @@ def draw_truth(system: AbstractSystem, key: Key, truth: str = "prior") -> Any:
     if truth == "outside":
         for p, s in zip(table.free, side.tolist(), strict=True):
             if not (p.low > 0.0 and math.isfinite(p.high)):
-                raise InputError("E142", f"no bounds beyond which {p.name} could lie")
+                raise error("no_bounds_to_exceed", name=p.name)
             beyond = BEYOND * p.high if s > 0.0 else p.low / BEYOND
             values[p.name] = jnp.asarray(beyond)
     return system.record({k: v.astype(jnp.float32) for k, v in values.items()})
@@ -315,8 +315,8 @@ def score(returned: float, hanging: float, oracle: float) -> float:
     """
     checks.finite("a score", returned=returned, hanging=hanging, oracle=oracle)
     if not oracle > hanging:
-        got, expected = f"{oracle:g}", f"more than the {hanging:g} of doing nothing"
-        raise InputError("E148", "oracle", where="a score", got=got, expected=expected)
+        got, least = f"{oracle:g}", f"{hanging:g}"
+        raise error("oracle_no_better", where="a score", got=got, least=least)
     return (returned - hanging) / (oracle - hanging)
 
 
@@ -375,11 +375,10 @@ def _values(record: Any, system: AbstractSystem) -> dict[str, Scalar]:
         else {f.name: getattr(record, f.name) for f in dataclasses.fields(record)}
     )
     if set(given) != set(names):
-        raise InputError(
-            "E145",
-            f"truth of {type(system).__name__}",
-            got=", ".join(sorted(given)),
-            expected=", ".join(names),
+        got, expected = ", ".join(sorted(given)), ", ".join(names)
+        machine = type(system).__name__
+        raise error(
+            "truth_of_other_constants", got=got, expected=expected, machine=machine
         )
     return {name: jnp.asarray(given[name], jnp.float32) for name in names}
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 
-from sim2gp.errors import InputError
+from sim2gp.errors import error
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.linear_measurements import LinearMeasurement
 from sim2gp.inference.parameters import Parameter, Parameters, unknown_parameter
@@ -109,15 +109,11 @@ def with_measurements(
         for name in x.of:
             if name not in ranges:
                 raise unknown_parameter(name, ranges)
-        doubled = len(set(x.of)) < len(x.of)
-        if doubled or not set(x.of) & set(table.names):
-            raise InputError(
-                "E145",
-                "a constant twice in a sum" if doubled else "a sum without unknowns",
-                got=" + ".join(x.of),
-                expected="each constant once, one of them free",
-                fix="state its weight" if doubled else "give one of them a prior",
-            )
+        got = " + ".join(x.of)
+        if len(set(x.of)) < len(x.of):
+            raise error("constant_twice_in_sum", got=got)
+        if not set(x.of) & set(table.names):
+            raise error("sum_without_unknowns", got=got)
         x.check(ranges)
     more = replace(table, measurements=(*table.measurements, *sums))
     return replace(as_machine(system), parameters=more)
@@ -151,11 +147,10 @@ def _check_delays(machine: Machine, table: Parameters, variant: Variant) -> None
             prior = table[variant.column(name)]
             low, high = prior.low, prior.high
         if not 0.0 <= low <= high <= longest:
-            raise InputError(
-                "E141",
-                f"{name} of one configuration",
+            raise error(
+                "delay_of_configuration_too_long",
                 where=variant.name,
                 got=f"{low:g} s" if low == high else f"from {low:g} to {high:g} s",
-                expected=f"from 0 to {longest:g} s, as the machine has it",
-                fix=f"widen the machine's own {name}",
+                name=name,
+                longest=f"{longest:g}",
             )

@@ -23,7 +23,7 @@ from equinox import AbstractVar
 from jaxtyping import Array, Float, Int
 
 from sim2gp import checks
-from sim2gp.errors import InputError, nearest
+from sim2gp.errors import error, nearest
 from sim2gp.inference.linalg import library
 from sim2gp.inference.parameters import (
     Parameter,
@@ -192,13 +192,9 @@ class AbstractSystem(eqx.Module):
             return _integrate(substep, s, a, count)
         m = len(self.actions)
         if self.history * dt < self.longest_delay - 1e-9:
-            raise InputError(
-                "E113",
-                "delay longer than the carried history",
-                got=f"{self.history} past actions of {dt:g} s",
-                expected=f"at least {self.longest_delay:g} s",
-                fix="bound the delay and give Machine(..., period=)",
-            )
+            got = f"{self.history} past actions of {dt:g} s"
+            longest = f"{self.longest_delay:g}"
+            raise error("delay_longer_than_history", got=got, longest=longest)
         n = s.size - self.history * m
         held = jnp.concatenate([a[None], s[n:].reshape(self.history, m)])
         inputs = self.mean_inputs(params, held, dt, count)
@@ -327,9 +323,7 @@ def table_for(record: type, parameters: Parameters | None) -> Parameters:
         raise unknown_parameter(name, own.names)
     for name in own.names:
         if name not in given:
-            raise InputError(
-                "E145", "missing parameter", where=record.__name__, expected=name
-            )
+            raise error("missing_parameter", where=record.__name__, expected=name)
     return parameters
 
 
@@ -345,14 +339,9 @@ def index_of(name: str, channels: Sequence[Channel], *, where: str = "") -> int:
     names = [channel.name for channel in channels]
     if name not in names:
         close = nearest(name, names)
-        raise InputError(
-            "E103",
-            "unknown channel",
-            where=where,
-            got=name,
-            expected=f"one of {', '.join(names)}",
-            fix=f"did you mean {close}?" if close else "",
-        )
+        fix = f"did you mean {close}?" if close else ""
+        known = ", ".join(names)
+        raise error("no_such_channel", where=where, got=name, fix=fix, known=known)
     return names.index(name)
 
 

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from sim2gp import checks
-from sim2gp.errors import InputError
+from sim2gp.errors import error
 from sim2gp.inference.parameters import Parameters
 from sim2gp.types import Action, State
 
@@ -29,8 +29,7 @@ def named_once(table: Parameters, *channels: Sequence["Channel"]) -> None:
     names = [*names_of(table), *(c.name for group in channels for c in group)]
     for name in names:
         if names.count(name) > 1:
-            fix = "give each constant, state and input a name of its own"
-            raise InputError("E145", "a name given twice", got=name, fix=fix)
+            raise error("name_given_twice", got=name)
 
 
 def check_returns(

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from sim2gp import checks
-from sim2gp.errors import InputError
+from sim2gp.errors import error
 from sim2gp.inference.parameters import Parameter, Parameters, unknown_parameter
 from sim2gp.systems.actuators import (
     FADED,
@@ -121,16 +121,15 @@ class Machine(AbstractSystem):
         names = [*names_of(self.plant.parameters), *(p.place for p in self.parts)]
         for part in self.parts:
             if names.count(part.place) > 1:
-                raise InputError("E145", "two parts of one name", got=part.place)
+                raise error("two_parts_of_one_name", got=part.place)
         own = {p.name: p.magnitude for p in self.parts if p.name == p.place}
         for part in self.parts:
             if part.name not in own:
-                raise InputError(
-                    "E145",
-                    f"{part.place} shares a constant that is not there",
+                raise error(
+                    "constant_to_share_missing",
                     got=part.name,
                     expected=", ".join(own),
-                    fix="tie it to an input with a part of its own",
+                    part=part.place,
                 )
         return Parameters((), tuple(own.items()))
 
@@ -140,28 +139,16 @@ class Machine(AbstractSystem):
         for part in self.actuators:
             low, high = self._range(part.name)
             if isinstance(part, Delay) and (low < 0.0 or high == math.inf):
-                raise InputError(
-                    "E141",
-                    part.name,
-                    got=f"from {low:g} to {high:g} s",
-                    expected="a delay of zero or more, with an end",
-                    fix="give it a box [0, high]",
-                )
+                got = f"from {low:g} to {high:g} s"
+                raise error("delay_without_end", got=got, name=part.name)
             if not isinstance(part, Lag):
                 continue
             checks.positive("Machine with a lag", period=self.period or 0.0)
             if part.where in late and self._range(late[part.where])[1] > 0.0:
-                raise InputError(
-                    "E145", "lag of an input that is delayed", where=part.where
-                )
+                raise error("lag_of_delayed_input", where=part.where)
             if not (low > 0.0 and math.isfinite(high)):
-                raise InputError(
-                    "E141",
-                    part.name,
-                    got=f"from {low:g} to {high:g} s",
-                    expected="a positive, bounded time constant",
-                    fix="give it a box [low, high] with low > 0",
-                )
+                got = f"from {low:g} to {high:g} s"
+                raise error("lag_out_of_range", got=got, name=part.name)
 
     @property
     def parts(self) -> tuple[AbstractPart, ...]:
@@ -274,12 +261,7 @@ class Machine(AbstractSystem):
         """Names of the constants that delay inputs, by input (E145 for a lag)."""
         for part in self.actuators:
             if isinstance(part, Lag):
-                raise InputError(
-                    "E145",
-                    f"{part.name} over windows of logs",
-                    expected="one-step data; a delay over windows",
-                    fix=f"use a delay of {part.where}",
-                )
+                raise error("lag_over_windows", name=part.name, channel=part.where)
         return {part.where: part.name for part in self._of(Delay)}
 
     def mean_inputs(

@@ -10,7 +10,7 @@ from typing import ClassVar
 
 import equinox as eqx
 
-from sim2gp.errors import InputError
+from sim2gp.errors import error
 from sim2gp.inference.parameters import Parameter
 from sim2gp.systems.base import AbstractPlant, index_of
 from sim2gp.systems.parts import AbstractPart, around_nothing
@@ -32,10 +32,7 @@ class EncoderOffset(AbstractPart):
     def unit(self, plant: AbstractPlant) -> str:
         unit = plant.states[index_of(self.where, plant.states)].unit
         if unit not in ("rad", "m"):
-            expected = "a joint's position, in rad or m"
-            raise InputError(
-                "E145", f"encoder of {self.where}", got=unit, expected=expected
-            )
+            raise error("encoder_of_no_position", got=unit, state=self.where)
         return unit
 
     def parameter(self, plant: AbstractPlant) -> Parameter:

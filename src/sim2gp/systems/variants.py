@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 from jaxtyping import Int
 
-from sim2gp.errors import InputError, nearest
+from sim2gp.errors import InputError, error, nearest
 from sim2gp.inference.parameters import Parameter, Parameters, unknown_parameter
 from sim2gp.systems.function_checks import names_of
 from sim2gp.types import AnyArray, AnyScalar
@@ -91,7 +91,7 @@ def joint_table(
         _check(table, c)
     names = [c.name for c in variants]
     if len(set(names)) < len(names):
-        raise InputError("E145", "two configurations of one name", got=", ".join(names))
+        raise error("two_configurations_of_one_name", got=", ".join(names))
     free = []
     for p in table.free:
         columns = dict.fromkeys(c.column(p.name) for c in variants)
@@ -142,14 +142,11 @@ def index_of(name: str | None, variants: Sequence[Variant]) -> int:
 def which(name: str | None, known: Sequence[str]) -> InputError:
     """E152: a variant must be named, by one of the known names."""
     close = nearest(name, known) if name else None
-    said = f"one of {', '.join(known)}" if known else "no name: there is one alone"
-    return InputError(
-        "E152",
-        "unknown configuration" if name else "which configuration of the machine",
-        got=name or "none named",
-        expected=said,
-        fix=f"did you mean {close}" if close else "name one with --configuration",
-    )
+    expected = f"one of {', '.join(known)}" if known else "no name: there is one alone"
+    if not name:
+        return error("which_configuration", got="none named", expected=expected)
+    fix = f"did you mean {close}" if close else None
+    return error("unknown_configuration", got=name, expected=expected, fix=fix)
 
 
 def _check(table: Parameters, variant: Variant) -> None:
@@ -160,20 +157,9 @@ def _check(table: Parameters, variant: Variant) -> None:
             raise unknown_parameter(name, names_of(table))
     for name in own:
         if name in fixed or own.count(name) > 1:
-            raise InputError(
-                "E145",
-                "a constant stated twice in one configuration",
-                where=variant.name,
-                got=name,
-                expected="a known value, or a column of its own",
-                fix=f"leave one of the two out for {name}",
+            raise error(
+                "constant_stated_twice", where=variant.name, got=name, name=name
             )
         if name not in table.names:
-            raise InputError(
-                "E145",
-                "a fixed constant cannot be free in one configuration",
-                where=variant.name,
-                got=f"{name} = {dict(table.fixed)[name]:g}",
-                expected="a constant with a prior",
-                fix=f"give {name} a prior, and fix it in the other configurations",
-            )
+            got = f"{name} = {dict(table.fixed)[name]:g}"
+            raise error("fixed_constant_freed", where=variant.name, got=got, name=name)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from equinox import AbstractClassVar
 from jaxtyping import Array, Float
 
-from sim2gp.errors import InputError
+from sim2gp.errors import error
 from sim2gp.inference.parameters import Parameter
 from sim2gp.systems.base import AbstractPlant, index_of
 from sim2gp.systems.effects.units import law_unit
@@ -120,13 +120,8 @@ def check_effect(plant: AbstractPlant, effect: AbstractEffect) -> None:
     elif isinstance(effect, AbstractJointForce):
         found = [("along", _along, 2)]
     else:
-        raise InputError(
-            "E145",
-            f"{effect.name} of this machine",
-            got=type(plant).__name__,
-            expected="a machine with a mass matrix (an AbstractMechanism)",
-            fix="write the effect into the machine's own function",
-        )
+        got = type(plant).__name__
+        raise error("effect_without_mass_matrix", got=got, name=effect.name)
     for what, f, size in found:
         name = f"{type(effect).__name__}.{what}"
         function = jax.tree_util.Partial(f, plant, effect)

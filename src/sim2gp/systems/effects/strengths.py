@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from sim2gp.errors import InputError, nearest
+from sim2gp.errors import error, nearest
 from sim2gp.systems.actuators import Delay
 from sim2gp.systems.effects.forces import RailTilt
 from sim2gp.systems.effects.friction import Coulomb, Drag, RailFriction
@@ -65,11 +65,6 @@ def effect(machine: str, name: str, strength: str) -> AbstractPart:
 def _known(table: Mapping[str, Any], name: str) -> Any:
     if name not in table:
         close = nearest(name, table)
-        raise InputError(
-            "E145",
-            "unknown name in the catalogue of effects",
-            got=name,
-            expected=f"one of {', '.join(table)}",
-            fix=f"did you mean {close}?" if close else "",
-        )
+        fix = f"did you mean {close}?" if close else ""
+        raise error("unknown_in_effects", got=name, fix=fix, known=", ".join(table))
     return table[name]

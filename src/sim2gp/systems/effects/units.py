@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
-from sim2gp.errors import InputError
+from sim2gp.errors import error
 from sim2gp.systems.base import AbstractPlant, AbstractSystem, Channel, index_of
 from sim2gp.systems.mechanism import AbstractMechanism
 
@@ -13,12 +13,9 @@ def only_on(name: str, plant: AbstractPlant, homes: Mapping[type, str]) -> None:
     for kind, channel in homes.items():
         if isinstance(plant, kind) and where == channel:
             return
-    raise InputError(
-        "E145",
-        f"{what} of this machine",
-        got=f"{where} of {type(plant).__name__}",
-        expected=" or ".join(f"{c} of {k.__name__}" for k, c in homes.items()),
-    )
+    got = f"{where} of {type(plant).__name__}"
+    expected = " or ".join(f"{c} of {k.__name__}" for k, c in homes.items())
+    raise error("effect_of_other_machine", got=got, expected=expected, effect=what)
 
 
 def gravity_of(system: AbstractMechanism) -> float:

@@ -31,7 +31,7 @@ from typing import Any
 
 import numpy as np
 
-from sim2gp.errors import InputError, nearest
+from sim2gp.errors import error, nearest
 from sim2gp.systems.mujoco.inertia import NAMES as INERTIA
 from sim2gp.systems.mujoco.inertia import BodyInertia, mirror_sign, unframe
 
@@ -124,13 +124,9 @@ def matching(known: dict[str, Constant], pattern: str) -> list[Constant]:
     ]
     if not found:
         close = nearest(pattern, known)
-        raise InputError(
-            "E170",
-            "unknown constant of the model",
-            got=pattern,
-            expected=_kinds(known),
-            fix=f"did you mean {close}?" if close else "",
-        )
+        fix = f"did you mean {close}?" if close else ""
+        expected = _kinds(known)
+        raise error("unknown_model_constant", got=pattern, expected=expected, fix=fix)
     return found
 
 

@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterator
 from typing import Any
 
-from sim2gp.errors import InputError, missing_extra
+from sim2gp.errors import InputError, error, missing_extra
 
 UNREAD = "a MuJoCo model cannot be read"
 #: `--` in a comment, a prefix without its namespace, blank lines before `<?xml`: both
@@ -107,13 +107,12 @@ def _check(root: Any, data: bytes, where: str, etree: Any) -> None:
         for name, value in each.attrib.items():
             text = bare(name) in words or (name, bare(each.tag)) == ("data", "text")
             if not text and any(_endless(word) for word in value.split()):
-                raise InputError(
-                    "E170",
-                    f"{name} of {bare(each.tag)} is not finite",
+                raise error(
+                    "attribute_not_finite",
                     where=place(each, data, where),
                     got=value,
-                    expected="finite numbers",
-                    fix="correct the attribute",
+                    attribute=name,
+                    element=bare(each.tag),
                 )
 
 
@@ -133,11 +132,4 @@ def _endless(word: str) -> bool:
 
 
 def _refused(where: str, got: str) -> InputError:
-    return InputError(
-        "E170",
-        "no model",
-        where=where,
-        got=" ".join(got.split()),
-        expected="plain XML in UTF-8",
-        fix="correct the file there",
-    )
+    return error("not_plain_xml", where=where, got=" ".join(got.split()))

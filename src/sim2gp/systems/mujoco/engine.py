@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sim2gp.errors import InputError
+from sim2gp.errors import error
 from sim2gp.inference.parameters import Parameters
 from sim2gp.systems.base import steps_in
 from sim2gp.systems.mujoco.constants import CENTRED, DERIVED, Constant, set_constants
@@ -297,14 +297,7 @@ def _check_centres(model: Any, constants: Sequence[Sequence[Constant]]) -> None:
     """Bodies that MuJoCo has simplified keep their centre of mass (E172)."""
     for c in (c for group in constants for c in group):
         if c.quantity in CENTRED and c.kind == "body" and model.body_simple[c.index]:
-            raise InputError(
-                "E172",
-                f"{c.path} of a body that MuJoCo has simplified",
-                got="body_simple",
-                expected="a body with a general inertia",
-                fix="leave it out if the body only slides, where it does not matter; "
-                'else simple="false" on the body (MuJoCo 4 or newer)',
-            )
+            raise error("centre_of_simple_body", got="body_simple", path=c.path)
 
 
 def _cores() -> int:

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from sim2gp import cleanup
-from sim2gp.errors import InputError, missing_extra, warn
+from sim2gp.errors import InputError, error, missing_extra, warn
 from sim2gp.systems.mujoco.elements import UNREAD
 from sim2gp.systems.mujoco.sources import Sources, read_sources
 
@@ -154,30 +154,9 @@ def in_child(
 def _refused(where: str, said: str) -> InputError:
     """E147 for a body that no matter could make, E170 for what is no model."""
     if _IMPOSSIBLE.search(said):
-        return InputError(
-            "E147",
-            "impossible body",
-            where=where,
-            got=said,
-            expected="positive masses, and moments of inertia with A + B >= C",
-            fix="correct the mass or the inertia of the body",
-        )
-    return InputError(
-        "E170",
-        "no model",
-        where=where,
-        got=said,
-        expected="a model that MuJoCo compiles",
-        fix="correct the file where MuJoCo says",
-    )
+        return error("impossible_body", where=where, got=said)
+    return error("model_not_compiled", where=where, got=said)
 
 
 def _died(where: str, got: str) -> InputError:
-    return InputError(
-        "E171",
-        "MuJoCo's parser did not come back",
-        where=where,
-        got=got,
-        expected="a model",
-        fix="see whether MuJoCo's own viewer opens it",
-    )
+    return error("parser_died", where=where, got=got)

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sim2gp.errors import InputError
+from sim2gp.errors import InputError, error
 from sim2gp.systems.base import steps_in
 from sim2gp.systems.mujoco.constants import CENTRED, DERIVED, Constant, set_constants
 from sim2gp.systems.mujoco.inertia import unframe
@@ -209,13 +209,7 @@ def _check(model: Any, derive: bool) -> None:
 
 
 def _unsupported(got: str, expected: str) -> InputError:
-    return InputError(
-        "E172",
-        "a model that MJX does not support",
-        got=got,
-        expected=expected,
-        fix="leave engine out: C MuJoCo has every feature",
-    )
+    return error("unsupported_by_mjx", got=got, expected=expected)
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from sim2gp.errors import InputError
+from sim2gp.errors import InputError, error
 from sim2gp.systems.mujoco.constants import Constant, constants_of, set_constants
 from sim2gp.systems.mujoco.inertia import inertia_matrix
 from sim2gp.systems.mujoco.load import as_mjcf
@@ -188,14 +188,9 @@ class ModelFile:
                 raise self._unwritten(name, "another", "the model's")
 
     def _unwritten(self, path: str, got: str, expected: str) -> InputError:
-        return InputError(
-            "E170",
-            f"{path} cannot be written",
-            where=str(self.source),
-            got=got,
-            expected=expected,
-            fix="see what in the file overrules or derives it "
-            "(inertiafromgeom, settotalmass, dampratio)",
+        where = str(self.source)
+        return error(
+            "constant_not_written", where=where, got=got, expected=expected, path=path
         )
 
 

@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sim2gp.errors import InputError
+from sim2gp.errors import InputError, error
 from sim2gp.systems.mujoco.elements import bare, elements, parsed, place
 
 _BYTES = 1 << 30  # of all files of a model
@@ -213,16 +213,13 @@ class _Reader:
         file = next(
             (x for x in map(os.path.realpath, ways) if not is_inside(x, root)), ""
         )
-        raise InputError(
-            "E171",
-            f"{kind} outside the model's folder",
+        got = _shown(name) if file in ("", name) else f"{_shown(name)}, {_shown(file)}"
+        raise error(
+            "file_outside_model_folder",
             where=document.where(element),
-            got=_shown(name)
-            if file in ("", name)
-            else f"{_shown(name)}, {_shown(file)}",
-            expected=f"a file below {os.path.realpath(root)}",
-            fix="move it there, or name a folder that holds both: --root DIR of sim2gp "
-            'init, root = "DIR" under [options], MuJoCo(..., root=)',
+            got=got,
+            part=kind,
+            folder=os.path.realpath(root),
         )
 
     def _keep_text(
@@ -244,9 +241,9 @@ class _Reader:
         for name in ways:
             path = _joined(base, name)
             if "//" in path:  # which versions of MuJoCo read differently
-                got, fix = f"an empty part in {_shown(path)}", "write one / there"
+                got = f"an empty part in {_shown(path)}"
                 where = document.where(element)
-                raise InputError("E170", "no model", where=where, got=got, fix=fix)
+                raise error("empty_part_in_path", where=where, got=got)
             key = os.path.normpath(path)
             self._keep(document, element, f"asset/{key}", data)
             self.sources.assets[key] = data
@@ -254,14 +251,8 @@ class _Reader:
     def _keep(self, document: _Document, element: Any, name: str, data: bytes) -> None:
         """One name is one file: MuJoCo would take either (E172)."""
         if self._names.setdefault(name.lower(), data) != data:
-            raise InputError(
-                "E172",
-                "two files of one name in folders of parts",
-                where=document.where(element),
-                got=name.split("/", 1)[1],
-                expected="names that differ, or paths from the main file's folder",
-                fix="rename one of the two",
-            )
+            where, got = document.where(element), name.split("/", 1)[1]
+            raise error("two_files_of_one_name", where=where, got=got)
 
     def read(self, file: str, shown: Path, where: str) -> bytes:
         """A regular file's bytes, once (E130)."""
@@ -272,10 +263,9 @@ class _Reader:
                 if not stat.S_ISREG(os.fstat(opened.fileno()).st_mode):
                     raise OSError(None, "no regular file")
                 data = opened.read(_BYTES - self._size + 1)
-        except (OSError, ValueError) as error:
-            reason = getattr(error, "strerror", None) or str(error)
-            what = f"cannot read {shown}"
-            raise InputError("E130", what, where=where, got=reason) from None
+        except (OSError, ValueError) as caught:
+            got = getattr(caught, "strerror", None) or str(caught)
+            raise error("unreadable_file", where=where, got=got, file=shown) from None
         self._size += len(data)
         if self._size > _BYTES:
             raise self._too_much(f"more than {_BYTES >> 20} MiB")
@@ -283,17 +273,11 @@ class _Reader:
         return data
 
     def _missing(self, document: _Document, element: Any, name: str) -> InputError:
-        return InputError(
-            "E170",
-            "no model",
-            where=document.where(element),
-            got=f"{_shown(name)}, which is no file",
-            expected="files that are there",
-            fix="correct the name, or put the file there",
-        )
+        got = f"{_shown(name)}, which is no file"
+        return error("missing_model_part", where=document.where(element), got=got)
 
     def _too_much(self, got: str) -> InputError:
-        return InputError("E170", "a large model", where=str(self.main), got=got)
+        return error("large_model", where=str(self.main), got=got)
 
 
 def _ways(folder: str, prefix: str | None, name: str) -> list[str]:

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import NormalDist
 
-from sim2gp.errors import InputError, nearest
+from sim2gp.errors import InputError, error, nearest
 from sim2gp.inference.parameters import Parameter, Parameters
 
 ARRAYS = ("value", "nominal", "min_value", "max_value")
@@ -65,11 +65,9 @@ def read_sysid(
         if theirs not in found:
             close = nearest(theirs, found)
             fix = f"did you mean {close}?" if close else ""
-            raise InputError(
-                "E145", "unknown parameter", where=str(path), got=theirs, fix=fix
-            )
+            raise error("unknown_parameter", where=str(path), got=theirs, fix=fix)
         if ours in made:
-            raise InputError("E145", "a constant named twice", got=ours)
+            raise error("constant_read_twice", got=ours)
         made[ours] = _prior(ours, *found[theirs])
     return made
 
@@ -97,13 +95,13 @@ def write_sysid(
         if name not in nominal:
             close = nearest(name, nominal)
             fix = f"did you mean {close}?" if close else ""
-            raise InputError("E145", "unknown parameter", got=name, fix=fix)
+            raise error("unknown_parameter", got=name, fix=fix)
     free = {p.name: p for p in table.free}
     lines = []
     for name, usual in nominal.items():
         value = float(given.get(name, usual))
         if not math.isfinite(value):
-            raise InputError("E101", f"value of {name}", got=value)
+            raise error("parameter_value_not_finite", got=value, name=name)
         low, high = _bounds(free[name], value) if name in free else (value, value)
         called = json.dumps(theirs.get(name, name), ensure_ascii=False)
         lines += [f"{called}:", f"  frozen: {str(name not in free).lower()}"]
@@ -113,21 +111,25 @@ def write_sysid(
         lines += [f"  value:\n  - {_number(value)}"]
     try:
         Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
-    except OSError as error:
-        raise _refused(Path(path), error) from error
+    except OSError as caught:
+        raise _refused(Path(path), caught) from caught
 
 
 def _prior(name: str, entry: Entry, i: int) -> Parameter | float:
     value, nominal, low, high = (entry.numbers[each][i] for each in ARRAYS)
     if entry.frozen:
         if not math.isfinite(value):
-            raise InputError("E101", f"value of {name}", got=value)
+            raise error("parameter_value_not_finite", got=value, name=name)
         return value
     parameter = Parameter(name, "", "", "bounded", low, high, nominal=nominal)
     if not low <= nominal <= high:
-        expected = f"within [{low:g}, {high:g}]"
-        what = f"nominal value of {name}"
-        raise InputError("E142", what, got=f"{nominal:g}", expected=expected)
+        raise error(
+            "nominal_outside_box",
+            got=f"{nominal:g}",
+            name=name,
+            low=f"{low:g}",
+            high=f"{high:g}",
+        )
     return parameter
 
 
@@ -160,16 +162,15 @@ def _elements(base: str, entry: Entry) -> list[str]:
 def _read(path: Path) -> str:
     try:
         if os.path.getsize(path) > LARGEST:
-            expected = f"at most {LARGEST} bytes"
-            raise InputError("E161", "a large file", where=str(path), expected=expected)
+            raise error("large_parameter_file", where=str(path), limit=LARGEST)
         return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise _refused(path, error) from error
+    except (OSError, UnicodeDecodeError) as caught:
+        raise _refused(path, caught) from caught
 
 
-def _refused(path: Path, error: OSError | UnicodeDecodeError) -> InputError:
-    reason = getattr(error, "strerror", None) or str(error)
-    return InputError("E130", "a parameter file", where=str(path), got=reason)
+def _refused(path: Path, caught: OSError | UnicodeDecodeError) -> InputError:
+    reason = getattr(caught, "strerror", None) or str(caught)
+    return error("unreadable_parameter_file", where=str(path), got=reason)
 
 
 def _parsed(text: str, path: Path) -> dict[str, Entry]:
@@ -183,7 +184,7 @@ def _parsed(text: str, path: Path) -> dict[str, Entry]:
         if key := _KEY.match(line):
             name, entry, array = _name(key[1], where), Entry(), ""
             if name in found:
-                raise InputError("E145", "a parameter twice", where=where, got=name)
+                raise error("parameter_twice_in_file", where=where, got=name)
             found[name] = entry
         elif found and (each := _FIELD.match(line)):
             array = each[1] if each[1] in ARRAYS and each[2] is None else ""
@@ -202,9 +203,8 @@ def _parsed(text: str, path: Path) -> dict[str, Entry]:
     for name, read in found.items():
         sizes = {len(read.numbers.get(array, ())) for array in ARRAYS}
         if read.frozen is None or len(sizes) != 1 or 0 in sizes:
-            expected = f"frozen, and as many numbers each of {', '.join(ARRAYS)}"
-            what = f"entry {name}"
-            raise InputError("E160", what, where=str(path), expected=expected)
+            arrays = ", ".join(ARRAYS)
+            raise error("incomplete_entry", where=str(path), name=name, arrays=arrays)
     return found
 
 
@@ -221,6 +221,4 @@ def _name(word: str, where: str) -> str:
 
 
 def _odd(line: str, where: str) -> InputError:
-    expected = "a file that mujoco.sysid wrote"
-    got = repr(line.strip()[:60])
-    return InputError("E160", "a line", where=where, got=got, expected=expected)
+    return error("odd_parameter_line", where=where, got=repr(line.strip()[:60]))

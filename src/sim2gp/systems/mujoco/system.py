@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from sim2gp.errors import InputError
+from sim2gp.errors import error
 from sim2gp.inference.parameters import Parameter, Parameters
 from sim2gp.systems.base import AbstractPlant, Channel
 from sim2gp.systems.mujoco.constants import (
@@ -138,8 +138,7 @@ class MuJoCo(AbstractPlant):
         Raises `InputError` E170 where there is no file.
         """
         if self.source is None:
-            fix = "give the path of its file instead of a compiled model"
-            raise InputError("E170", "a model without a file", fix=fix)
+            raise error("model_without_file")
         return ModelFile(self.source, self.engine.model, mjcf=mjcf)
 
     @property
@@ -189,13 +188,7 @@ def _check_finite(model: Any) -> None:
         if isinstance(value, np.ndarray) and value.dtype.kind == "f":
             wrong = value[~np.isfinite(value)]
             if wrong.size:
-                raise InputError(
-                    "E170",
-                    "a number of the compiled model is not finite",
-                    got=f"{wrong[0]} in {name}",
-                    expected="finite numbers",
-                    fix="see what in the model is too large",
-                )
+                raise error("compiled_number_not_finite", got=f"{wrong[0]} in {name}")
 
 
 def _groups(
@@ -223,14 +216,12 @@ def _groups(
     paths = [c.path for group in groups for c in group]
     for path in paths:
         if paths.count(path) > 1:
-            fix = "let one path or pattern name it"
-            raise InputError("E145", "a constant named twice", got=path, fix=fix)
+            raise error("constant_of_two_patterns", got=path)
     own = {c.index for group in groups for c in group if c.block is not None}
     for c in (c for group in groups for c in group):
         if c.index in own and c.quantity in OF_INERTIA:
-            fix = "open one of the two"
             got = f"{c.path}, and the body's inertia"
-            raise InputError("E145", "a constant named twice", got=got, fix=fix)
+            raise error("constant_and_its_inertia", got=got)
     return groups
 
 
@@ -262,13 +253,8 @@ def _prior(
         return default
     if constant.path in given:
         return Parameter(constant.path, constant.unit, constant.meaning, "identity")
-    raise InputError(
-        "E142",
-        f"no prior for {constant.path}",
-        got=f"{constant.get(model):g} in the model",
-        expected="a positive number to start from",
-        fix="give its prior: mean and sd, or low and high",
-    )
+    got = f"{constant.get(model):g} in the model"
+    raise error("no_default_prior", got=got, name=constant.path)
 
 
 def _described(

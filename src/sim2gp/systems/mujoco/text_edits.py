@@ -12,7 +12,7 @@ from pathlib import Path
 from xml.parsers import expat
 from xml.sax.saxutils import escape
 
-from sim2gp.errors import InputError
+from sim2gp.errors import InputError, error
 
 _ATTRIBUTE = re.compile(rb"""\s+([^\s=/>]+)\s*=\s*("[^"]*"|'[^']*')""")
 _TAG = re.compile(rb"""<([^\s/>]+)(?:"[^"]*"|'[^']*'|[^"'>])*?(/?)>""")
@@ -80,8 +80,8 @@ def read_files(path: Path, data: bytes | None = None) -> Files:
 def _document(path: Path, data: bytes | None = None) -> Document:
     try:
         return Document(path, path.read_bytes() if data is None else data)
-    except OSError as error:
-        raise InputError("E130", f"cannot read {path}", got=error.strerror) from None
+    except OSError as caught:
+        raise error("unreadable_file", got=caught.strerror, file=path) from None
 
 
 def _include(element: Element, files: Files, folder: Path) -> None:
@@ -135,13 +135,7 @@ def _parsed(document: Document) -> Element:
 
 
 def _unreadable(path: Path, got: str) -> InputError:
-    return InputError(
-        "E170",
-        "the file's text cannot be changed",
-        where=str(path),
-        got=got,
-        expected="plain XML in UTF-8",
-    )
+    return error("text_cannot_be_changed", where=str(path), got=got)
 
 
 class Edits:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sim2gp.errors import InputError
+from sim2gp.errors import error
 from sim2gp.systems.mujoco.constants import name_of
 
 #: Words of `mujoco.mjtDyn`, `mjtGain`, `mjtBias` that a step of ours knows.
@@ -27,37 +27,19 @@ def check_supported(model: Any) -> None:
 
 def _joints(model: Any) -> None:
     if model.njnt == 0:
-        raise _refused(
-            "a model without joints",
-            _model_name(model),
-            "a hinge or a slide",
-            "name the file that includes this part",
-        )
+        raise error("model_without_joints", got=_model_name(model))
     for j in range(model.njnt):
         if model.jnt_type[j] not in (2, 3):
-            raise _refused(
-                "joint with a quaternion",
-                f"{name_of(model, 'joint', j)} ({('free', 'ball')[model.jnt_type[j]]})",
-                "hinges and slides",
-                "fix the base, or replace a free joint by slides and hinges",
-            )
+            of_type = ("free", "ball")[model.jnt_type[j]]
+            got = f"{name_of(model, 'joint', j)} ({of_type})"
+            raise error("joint_with_quaternion", got=got)
 
 
 def _bodies(model: Any) -> None:
     for b in np.flatnonzero(model.body_mocapid >= 0).tolist():
-        raise _refused(
-            "mocap body",
-            name_of(model, "body", b),
-            "bodies that joints and actuators move",
-            'delete mocap="true": the body stays where the file has it',
-        )
+        raise error("mocap_body", got=name_of(model, "body", b))
     for i in range(model.nflex):
-        raise _refused(
-            "deformable body",
-            _name(model, "flex", i),
-            "rigid bodies",
-            "delete it, or replace it by bodies with hinges and slides",
-        )
+        raise error("deformable_body", got=_name(model, "flex", i))
 
 
 def _actuators(model: Any) -> None:
@@ -74,20 +56,19 @@ def _actuators(model: Any) -> None:
         for kind, words, known in kinds:
             word = words(getattr(model, f"actuator_{kind}type")[i]).name.split("_")[1]
             if word not in known:
-                raise _refused(
-                    f"actuator with {kind}type {word.lower()}",
-                    name,
-                    ", ".join(known).lower(),
-                    "write it as a motor, a servo or a general with affine terms",
+                raise error(
+                    "actuator_of_unknown_type",
+                    got=name,
+                    expected=", ".join(known).lower(),
+                    setting=f"{kind}type",
+                    word=word.lower(),
                 )
         for what in ("act", "ctrl", "out"):
             count = getattr(model, f"actuator_{what}num", None)
             if count is not None and count[i] > 1:  # before MuJoCo 4 only act
-                raise _refused(
-                    "actuator with several inputs, forces or activations",
-                    f"{what}num {count[i]} of {name}",
-                    "one of each",
-                    "write one actuator for each",
+                raise error(
+                    "actuator_with_several_inputs",
+                    got=f"{what}num {count[i]} of {name}",
                 )
 
 
@@ -100,11 +81,11 @@ def _delays(model: Any) -> None:
         samples = getattr(model, f"{kind}_history", None)
         for i in np.flatnonzero(() if samples is None else np.any(samples, axis=-1)):
             name = name_of(model, kind, int(i))
-            raise _refused(
-                f"{kind} with a delay of its own",
-                f"delay or nsample of {name}",
-                "a state of joints and activations",
-                fix.replace("NAME", f'"{name}"'),
+            raise error(
+                "delay_of_its_own",
+                got=f"delay or nsample of {name}",
+                fix=fix.replace("NAME", f'"{name}"'),
+                element=kind,
             )
 
 
@@ -113,38 +94,20 @@ def _state(model: Any) -> None:
     import mujoco
 
     for i in range(model.nplugin):
-        raise _refused(
-            "plugin",
-            _name(model, "plugin", i),
-            "what MuJoCo itself computes",
-            "delete the plugin",
-        )
+        raise error("model_with_plugin", got=_name(model, "plugin", i))
     for kind, short in (("joint", "jnt"), ("tendon", "tendon")):
         places = getattr(model, f"{short}_plasticadr", np.empty(0))  # MuJoCo 4
         for i in np.flatnonzero(places >= 0).tolist():
-            raise _refused(
-                f"{kind} with a spring that yields",
-                f"springyield of {name_of(model, kind, i)}",
-                "a spring that is elastic",
-                "delete springyield",
-            )
+            got = f"springyield of {name_of(model, kind, i)}"
+            raise error("spring_that_yields", got=got, element=kind)
     sleep = getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0)
     if model.opt.enableflags & int(sleep):
-        raise _refused(
-            "bodies that sleep",
-            'option flag sleep="enable"',
-            "steps that depend on the state alone",
-            'write sleep="disable"',
-        )
+        raise error("bodies_that_sleep", got='option flag sleep="enable"')
     whole = mujoco.mj_stateSize(model, int(mujoco.mjtState.mjSTATE_FULLPHYSICS))
     more = whole - 1 - model.nq - model.nv - model.na  # one is the time
     if more:
-        raise _refused(
-            "a state beyond positions, velocities and activations",
-            f"{more} more numbers in {_model_name(model)}",
-            "a state of joints and activations",
-            "delete the element that has them",
-        )
+        got = f"{more} more numbers in {_model_name(model)}"
+        raise error("state_beyond_activations", got=got)
 
 
 def _name(model: Any, kind: str, index: int) -> str:
@@ -157,7 +120,3 @@ def _name(model: Any, kind: str, index: int) -> str:
 
 def _model_name(model: Any) -> str:
     return f"model {model.names.split(bytes(1), 1)[0].decode()}".strip()
-
-
-def _refused(what: str, got: str, expected: str, fix: str) -> InputError:
-    return InputError("E172", what, got=got, expected=expected, fix=fix)

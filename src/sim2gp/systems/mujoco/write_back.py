@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from sim2gp.errors import InputError
+from sim2gp.errors import error
 from sim2gp.systems.mujoco.constants import Constant
 from sim2gp.systems.mujoco.inertia import NAMES as INERTIA
 from sim2gp.systems.mujoco.inertia import inertia_matrix
@@ -131,7 +131,8 @@ class MJCF:
                     rest = dict(enumerate(now.tolist()))
                     edits.set_numbers(element, name, changed, rest)
         else:
-            raise unsayable(constant.path, element, f"a {element.tag}", "a general")
+            where, got = element.line, f"a {element.tag}"
+            raise error("unsayable_constant", where=where, got=got, path=constant.path)
 
     def _pair(self, edits: Edits, wanted: Any, constant: Constant) -> None:
         """Sliding friction along both tangents, or both numbers of `solref`."""
@@ -184,25 +185,8 @@ def _located(
     unnamed = not name and len(elements) == count
     if unnamed and "name" not in elements[index].attributes:
         return elements[index]
-    raise InputError(
-        "E170",
-        f"{kind} {name or index} cannot be found in the file's text",
-        got=f"{len(elements)} of {count} elements of its kind",
-        expected="an element of its own",
-        fix=f"give the {kind} a name, or write out what makes it (replicate, attach)",
-    )
-
-
-def unsayable(path: str, element: Element, got: str, expected: str) -> InputError:
-    """E170: this element has no word for a constant."""
-    return InputError(
-        "E170",
-        f"{path} cannot be written",
-        where=element.line,
-        got=got,
-        expected=expected,
-        fix="write the element in a form that states the constant",
-    )
+    got = f"{len(elements)} of {count} elements of its kind"
+    raise error("element_not_found", got=got, element=kind, name=name or index)
 
 
 def say_gravity(edits: Edits, root: Element, wanted: Any) -> None:

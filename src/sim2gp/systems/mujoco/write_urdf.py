@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sim2gp.errors import InputError
+from sim2gp.errors import error
 from sim2gp.systems.mujoco.constants import Constant
 from sim2gp.systems.mujoco.inertia import NAMES as INERTIA
 from sim2gp.systems.mujoco.inertia import inertia_matrix
@@ -64,8 +64,8 @@ class URDF:
     def _named(self, tag: str, name: str) -> Element:
         found = [e for e in self.root.all(tag) if e.attributes.get("name") == name]
         if len(found) != 1:
-            what = f"{tag} {name} cannot be found in the file's text"
-            raise InputError("E170", what, got=f"{len(found)} of that name")
+            got = f"{len(found)} of that name"
+            raise error("urdf_element_not_found", got=got, tag=tag, name=name)
         return found[0]
 
     def _dynamics(self, edits: Edits, j: int, word: str, value: float) -> None:
@@ -90,8 +90,8 @@ class URDF:
         link = self._named("link", self._name("body", b))
         found = next(link.all("inertial"), None)
         if found is None:
-            what = f"{link.attributes['name']} has no inertial"
-            raise InputError("E170", what, where=link.line, fix="give the link one")
+            name = link.attributes["name"]
+            raise error("link_without_inertial", where=link.line, name=name)
         return found
 
     def _length(self, edits: Edits, wanted: Any, b: int) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sim2gp import checks
-from sim2gp.errors import InputError
+from sim2gp.errors import error
 from sim2gp.inference.parameters import Parameter, Parameters
 from sim2gp.systems.base import LONGEST_MEAN, AbstractPlant, Channel, table_of
 from sim2gp.systems.function_checks import named_once, names_of
@@ -142,14 +142,9 @@ class BlackBox(AbstractPlant):
             x = theta[None], s[None], a[None], x[3][None]
         one, two = (self.engine.asked(*(y.copy() for y in x)) for _ in range(2))
         if not np.array_equal(one, two, equal_nan=True):
-            raise InputError(
-                "E173",
-                "a simulator that answers differently each time",
-                where=checks.name_of(self.engine.step),
-                got=f"{one.tolist()}, then {two.tolist()}",
-                expected="a function of its arguments",
-                fix="fix its random seed, and reset what it remembers at each call",
-            )
+            where = checks.name_of(self.engine.step)
+            got = f"{one.tolist()}, then {two.tolist()}"
+            raise error("simulator_answers_differently", where=where, got=got)
         return one
 
     def check_functions(self) -> None:
