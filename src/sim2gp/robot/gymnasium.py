@@ -247,7 +247,9 @@ def check_met(state: AnyArray, reward: AnyArray) -> None:
     """Raise `NotFinite` E203 where a state or a reward is no number."""
     if not (np.isfinite(state).all() and np.isfinite(reward).all()):
         got = f"{state.tolist()}, {reward.tolist()}"
-        raise error("episode_not_finite", NotFinite, where="an environment", got=got)
+        raise error(
+            "environment_not_finite", NotFinite, where="an environment", got=got
+        )
 
 
 def checked(action: Any, shape: tuple[int, ...]) -> np.ndarray:

@@ -75,7 +75,7 @@ class Writer:
         for key, value in plain.items():
             if value.dtype.kind not in "biufcSU":
                 got = f"dtype {value.dtype}"
-                raise error("array_of_objects", Sim2GPError, got=got, name=key)
+                raise error("run_array_of_objects", Sim2GPError, got=got, name=key)
         buffer = io.BytesIO()
         np.savez_compressed(buffer, allow_pickle=False, **plain)
         self.write_bytes(name, buffer.getvalue())
