@@ -18,7 +18,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from sim2gp.errors import InputError, Sim2GPError, nearest
+from sim2gp.errors import InputError, Sim2GPError, error, nearest
 
 #: What calls return that were traced already; more than so many are forgotten.
 _KNOWN: dict[Any, Any] = {}
@@ -102,11 +102,7 @@ def moments(where: str, mean: Any, sd: Any) -> None:
     if a is None or b is None:
         return
     if not (np.isfinite(a) & (b > 0.0) & np.isfinite(b)).all():
-        got, expected = (
-            f"mean {a:g}, sd {b:g}",
-            "a finite mean and a positive, finite sd",
-        )
-        raise InputError("E144", "moments", where=where, got=got, expected=expected)
+        raise error("wrong_moments", where=where, got=f"mean {a:g}, sd {b:g}")
 
 
 def bounds(
@@ -124,14 +120,8 @@ def bounds(
     if not unbounded:
         good, words = good & np.isfinite(a) & np.isfinite(b), f"finite, {words}"
     if not np.all(good):
-        raise InputError(
-            "E141",
-            "bounds",
-            where=where,
-            got=f"low = {_shown(low)}, high = {_shown(high)}",
-            expected=words,
-            fix="correct the bounds",
-        )
+        got = f"low = {_shown(low)}, high = {_shown(high)}"
+        raise error("wrong_bounds", where=where, got=got, expected=words)
 
 
 def one_of(where: str, known: Iterable[str], /, **settings: str) -> None:
@@ -140,13 +130,9 @@ def one_of(where: str, known: Iterable[str], /, **settings: str) -> None:
     for name, word in settings.items():
         if word not in known:
             close = nearest(word, known) if isinstance(word, str) else None
-            raise InputError(
-                "E145",
-                f"unknown {name}",
-                where=where,
-                got=word,
-                expected=f"one of {', '.join(known)}",
-                fix=f"did you mean {close}?" if close else "",
+            fix, names = f"did you mean {close}?" if close else "", ", ".join(known)
+            raise error(
+                "unknown_word", where=where, got=word, fix=fix, name=name, known=names
             )
 
 
@@ -256,24 +242,24 @@ def another_shape(
     """E140: what a function returned, or an array that was given, has another shape."""
     words = f"shape {expected}" + (f", {meaning}" if meaning else "")
     shown = got if isinstance(got, str) else f"shape {got}"
-    return InputError("E140", what, where=name, got=shown, expected=words, fix=fix)
+    return error(
+        "another_shape", where=name, got=shown, expected=words, fix=fix, what=what
+    )
 
 
 def no_real_numbers(what: str, name: str, got: str) -> InputError:
     """E123: a function returned something else than real numbers."""
-    return InputError(
-        "E123", what, where=name, got=got, expected="real (floating-point) numbers"
-    )
+    return error("no_real_numbers", where=name, got=got, what=what)
 
 
-def raised(what: str, name: str, error: Exception, fix: str = "") -> InputError:
+def raised(what: str, name: str, caught: Exception, fix: str = "") -> InputError:
     """E173: a user's function raised; its own message, as far as its first blank line.
 
     (JAX goes on with advice.) Chain the error itself.
     """
-    said = str(error).split("\n\n")[0]
-    got = f"{type(error).__name__}: {said}"
-    return InputError("E173", f"{what} raised", where=name, got=got, fix=fix)
+    said = str(caught).split("\n\n")[0]
+    got = f"{type(caught).__name__}: {said}"
+    return error("function_raised", where=name, got=got, fix=fix, what=what)
 
 
 def name_of(function: Any) -> str:

@@ -19,7 +19,7 @@ from sim2gp.cli.arguments import parsed
 from sim2gp.cli.commands import COMMANDS
 from sim2gp.cli.interrupts import DONE, interruptible, leave
 from sim2gp.cli.late import Call
-from sim2gp.errors import InputError, Sim2GPError, Sim2GPWarning
+from sim2gp.errors import InputError, Sim2GPError, Sim2GPWarning, error
 from sim2gp.runs import DiskError, Progress, RunOwned
 from sim2gp.runs.plain import to_json
 from sim2gp.runs.show import print_summary
@@ -58,24 +58,22 @@ def main(argv: Sequence[str] | None = None) -> int:
             return signals.exit_code
 
 
-def _failed(error: BaseException, debug: bool) -> int:
+def _failed(caught: BaseException, debug: bool) -> int:
     """Say in one line what went wrong; returns the exit code."""
-    if isinstance(error, BrokenPipeError):
+    if isinstance(caught, BrokenPipeError):
         # Whoever read our output has gone; the interpreter must not flush into it.
         with open(os.devnull, "w") as nowhere:
             os.dup2(nowhere.fileno(), sys.stdout.fileno())
         return OK
-    if isinstance(error, Sim2GPError):
-        return _told(error, _code(error), debug)
-    if isinstance(error, OSError):
-        typed = disk_error(Path(error.filename or "."), error)
+    if isinstance(caught, Sim2GPError):
+        return _told(caught, _code(caught), debug)
+    if isinstance(caught, OSError):
+        typed = disk_error(Path(caught.filename or "."), caught)
         return _told(typed, _code(typed), debug)
-    if isinstance(error, Exception):
-        what = f"{type(error).__name__}: {error}".split("\n")[0][:200]
-        fix = "run the command again with --debug and report what it prints"
-        bug = Sim2GPError("E001", "fault of sim2gp", got=what, fix=fix)
-        return _told(bug, BUG, debug)
-    raise error
+    if isinstance(caught, Exception):
+        what = f"{type(caught).__name__}: {caught}".split("\n")[0][:200]
+        return _told(error("fault_of_sim2gp", Sim2GPError, got=what), BUG, debug)
+    raise caught
 
 
 def _run(args: list[str]) -> int:

@@ -21,7 +21,7 @@ from sim2gp.commands.identification import (
     used,
 )
 from sim2gp.commands.result import AbstractResult
-from sim2gp.errors import InputError, error
+from sim2gp.errors import error
 from sim2gp.project import Project
 from sim2gp.project.project import is_model
 from sim2gp.runs import Progress, load_run
@@ -142,7 +142,7 @@ def _values(
     for name in values:
         if "/" in name and name not in system.names:
             matching(system.file().constants, name)  # raises with the nearest name
-            raise InputError("E170", "a constant that is not open", got=name)
+            raise error("constant_not_open", got=name)
     apart = {
         name: "no constant of the model's file"
         for name, value in values.items()

@@ -18,7 +18,7 @@ import numpy as np
 
 from sim2gp.commands.identification import Identification, used
 from sim2gp.commands.result import AbstractResult
-from sim2gp.errors import InputError
+from sim2gp.errors import error
 from sim2gp.experiment_design import (
     AbstractGoal,
     AbstractSignal,
@@ -192,14 +192,8 @@ def setting(
     period = asked.period or period
     steps = round(asked.seconds / period)
     if steps < 2:
-        raise InputError(
-            "E151",
-            "experiment shorter than its steps",
-            where="--seconds",
-            got=f"{asked.seconds:g} s",
-            expected=f"at least two periods of {period:g} s",
-            fix="design some seconds",
-        )
+        got, least = f"{asked.seconds:g} s", f"{period:g}"
+        raise error("experiment_too_short", where="--seconds", got=got, period=least)
     stated = project.spec.likelihood
     window = max(2, round((stated.window or WINDOW) / period))
     sd = stated.start_sd

@@ -12,7 +12,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import replace
 from fnmatch import fnmatchcase
 
-from sim2gp.errors import InputError
+from sim2gp.errors import error
 from sim2gp.inference.parameters import Parameter
 from sim2gp.project.priors import prior
 from sim2gp.project.schema import ProjectSpec
@@ -69,23 +69,10 @@ def _tables(
         found = _matching(pattern, inputs, spec.actuators, where)
         twice = [name for other in tables.values() for name in other if name in found]
         if twice:
-            raise InputError(
-                "E145",
-                "an input named twice",
-                where=where,
-                got=twice[0],
-                expected="one table for each input",
-                fix="let one pattern name it, or give it a table of its own",
-            )
+            raise error("input_named_twice", where=where, got=twice[0])
         if table.tie and len(found) == 1:
-            raise InputError(
-                "E160",
-                "a tie of one input",
-                where=source.where("actuators", pattern, "tie"),
-                got=found[0],
-                expected="a pattern that names several inputs",
-                fix="remove tie, or write a pattern",
-            )
+            where = source.where("actuators", pattern, "tie")
+            raise error("tie_of_one_input", where=where, got=found[0])
         tables[pattern] = found
     return tables
 
@@ -101,25 +88,11 @@ def _matching(
         raise unknown("input", pattern, inputs, where)
     own = [name for name in found if name not in stated]
     if not own:
-        raise InputError(
-            "E145",
-            "pattern without inputs of its own",
-            where=where,
-            got=pattern,
-            expected="an input that no other table names",
-            fix="remove the pattern, or one of the other tables",
-        )
+        raise error("pattern_without_own_inputs", where=where, got=pattern)
     return own
 
 
 def _check_delay(part: str, stated: Parameter | float, where: str) -> None:
     low = stated.low if isinstance(stated, Parameter) else stated
     if part == "delay" and low < 0:
-        raise InputError(
-            "E141",
-            "negative delay",
-            where=where,
-            got=f"{low:g} s",
-            expected="a delay of at least 0 s",
-            fix="state low and high, with low >= 0",
-        )
+        raise error("negative_delay", where=where, got=f"{low:g} s")

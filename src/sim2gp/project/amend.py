@@ -11,7 +11,7 @@ from typing import Any
 import tomlkit
 from tomlkit.items import AbstractTable, InlineTable
 
-from sim2gp.errors import InputError, Sim2GPError
+from sim2gp.errors import InputError, Sim2GPError, error
 from sim2gp.project.project import Project
 from sim2gp.project.replace import replace_project
 from sim2gp.project.schema import EFFECT_OPTIONS
@@ -34,13 +34,7 @@ def addition(candidate: Candidate) -> tuple[tuple[str, ...], dict[str, Any]]:
         bounds = tomlkit.inline_table()
         bounds.update({"low": 0.0, "high": effect.magnitude})
         return ("actuators", effect.where), {"delay": bounds}
-    raise InputError(
-        "E160",
-        "a lag in a project file",
-        got=candidate.name,
-        expected="an effect or a delay",
-        fix=f'use delay = "free" under [actuators.{effect.where}]',
-    )
+    raise error("lag_in_project_file", got=candidate.name, channel=effect.where)
 
 
 def amended(text: str, candidate: Candidate, note: str = _NOTE) -> str:
@@ -72,14 +66,8 @@ def _table_in(parent: Any, note: str) -> Any:
 
 
 def _stated(candidate: Candidate, key: str, value: Any) -> InputError:
-    return InputError(
-        "E160",
-        f"{candidate.name} is stated already",
-        where=f"key {key}",
-        got=tomlkit.item(value).as_string(),
-        expected="a key that is not there",
-        fix="replace the line by hand",
-    )
+    got = tomlkit.item(value).as_string()
+    return error("stated_already", where=f"key {key}", got=got, name=candidate.name)
 
 
 def amend(path: Path, candidate: Candidate, note: str = _NOTE) -> None:
@@ -88,18 +76,17 @@ def amend(path: Path, candidate: Candidate, note: str = _NOTE) -> None:
 
     def freed(found: Project) -> None:
         if candidate.name not in found.system.parameters.names:
-            raise InputError("E160", f"{candidate.name} did not become free")
+            raise error("did_not_become_free", name=candidate.name)
 
     try:
         replace_project(path, text, freed)
-    except Sim2GPError as error:
+    except Sim2GPError as caught:
         place, entries = addition(candidate)
         lines = [f"{key} = {tomlkit.item(v).as_string()}" for key, v in entries.items()]
-        raise InputError(
-            "E160",
-            f"{candidate.name} cannot be added",
+        raise error(
+            "cannot_be_added",
             where=str(path),
-            got=f"{error.code} {error.what}",
-            expected="a file that can take one more table",
-            fix="add by hand: " + ", ".join([f"[{'.'.join(place)}]", *lines]),
-        ) from error
+            got=f"{caught.code} {caught.what}",
+            name=candidate.name,
+            lines=", ".join([f"[{'.'.join(place)}]", *lines]),
+        ) from caught

@@ -10,7 +10,7 @@ from typing import Any, get_type_hints
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from sim2gp.errors import InputError
+from sim2gp.errors import InputError, error
 from sim2gp.inference.parameters import Parameter, Parameters, unknown_parameter
 from sim2gp.project import slips
 from sim2gp.project.actuators import with_actuators
@@ -36,17 +36,14 @@ def build_system(
     options = _options(spec.options, source, kind)
     try:
         plain = kind(**options)
-    except InputError as error:
-        raise located(error, source.where("options")) from error
-    except (TypeError, ValueError) as error:
-        raise InputError(
-            "E160",
-            "options refused",
-            where=source.where("options"),
-            got=", ".join(f"{k} = {v}" for k, v in options.items()),
-            expected=str(error),
-            fix="correct the options",
-        ) from error
+    except InputError as caught:
+        raise located(caught, source.where("options")) from caught
+    except (TypeError, ValueError) as caught:
+        where, expected = source.where("options"), str(caught)
+        got = ", ".join(f"{k} = {v}" for k, v in options.items())
+        raise error(
+            "options_refused", where=where, got=got, expected=expected
+        ) from caught
     shared = {k: v for k, v in spec.parameters.items() if AT not in k}
     table = _table(plain.parameters, shared, source, ("parameters",))
     plant: Any = kind(parameters=table, **options)
@@ -133,14 +130,7 @@ def check_names(spec: ProjectSpec, source: Source, system: AbstractSystem) -> No
                 low, high = value.saturation
                 _check_pair(f"saturation of {name}", low, high, where)
             if isinstance(value, float) and name not in inputs:
-                raise InputError(
-                    "E160",
-                    "a measured channel cannot be a constant",
-                    where=where,
-                    got=f"{value:g}",
-                    expected="a column in quotes",
-                    fix="name the column, or leave the channel out",
-                )
+                raise error("constant_measured_channel", where=where, got=f"{value:g}")
         _check_complete(list(group.columns), states, inputs, source, i)
         _check_clock(group, source, i)
         for name in group.fixed:
@@ -165,14 +155,9 @@ def _check_likelihood(spec: ProjectSpec, source: Source, states: list[str]) -> N
     """What the file says of windows, of states, and of noise is what is fitted."""
     stated = spec.likelihood
     if stated.window == 0.0 and "start" in stated.model_fields_set:
-        raise InputError(
-            "E160",
-            "start of windows of one step",
-            where=source.where("likelihood", "start"),
-            got=f'window = 0, start = "{stated.start}"',
-            expected="no start: a step begins at its first row",
-            fix="remove start, or set window to some tenths of a second",
-        )
+        where = source.where("likelihood", "start")
+        got = f'window = 0, start = "{stated.start}"'
+        raise error("start_of_one_step", where=where, got=got)
     named = {name for group in spec.logs for name in group.columns}
     measured = [name for name in states if name in named] or states
     for key, given, kind, known in (
@@ -195,27 +180,16 @@ def _check_complete(
         lacking = lacking or states
     elif not lacking:
         return
-    raise InputError(
-        "E160",
-        f"no column for {lacking[0]}",
-        where=where,
-        got=", ".join(named) or "no columns",
-        expected="every input, and at least one measured channel",
-        fix=f'add {lacking[0]} = "its column" (an input may be a constant number)',
-    )
+    got = ", ".join(named) or "no columns"
+    raise error("no_column_for_channel", where=where, got=got, channel=lacking[0])
 
 
 def _check_clock(group: LogSpec, source: Source, i: int) -> None:
     """Time comes from a column or a period; rows from a period or from stamps."""
     if isinstance(group.time, ColumnSpec) and group.time.saturation is not None:
-        raise InputError(
-            "E160",
-            "saturation of a clock",
-            where=source.where("logs", i, "time", "saturation"),
-            got=f"saturation = {group.time.saturation}",
-            expected="column, unit, sign, scale, offset",
-            fix="remove it, or leave rows out by exclude",
-        )
+        where = source.where("logs", i, "time", "saturation")
+        got = f"saturation = {group.time.saturation}"
+        raise error("saturation_of_clock", where=where, got=got)
     pairs: list[tuple[str, str, object, object]]
     pairs = [("time", "period", group.time, group.period)]
     if group.resample is not None:
@@ -223,23 +197,14 @@ def _check_clock(group: LogSpec, source: Source, i: int) -> None:
         pairs += [("resample.period", "resample.stamps", rule.period, rule.stamps)]
     for one, other, first, second in pairs:
         if first is not None and second is not None:
-            raise InputError(
-                "E160",
-                f"{one} and {other}",
-                where=source.where("logs", i, *other.split(".")),
-                got=f"{other} = {second!r}",
-                expected="one of the two",
-                fix=f"remove {one} or {other}",
-            )
+            where = source.where("logs", i, *other.split("."))
+            got = f"{other} = {second!r}"
+            raise error("two_keys_for_one", where=where, got=got, one=one, other=other)
 
 
 def _check_pair(what: str, low: float, high: float, where: str) -> None:
     if not low < high:
-        raise InputError(
-            "E141",
-            f"{what} reversed" if low > high else f"{what} empty",
-            where=where,
-            got=f"[{low:g}, {high:g}]",
-            expected="[low, high] with low < high",
-            fix="swap the two" if low > high else "leave room between them",
-        )
+        got = f"[{low:g}, {high:g}]"
+        if low > high:
+            raise error("interval_reversed", where=where, got=got, what=what)
+        raise error("interval_empty", where=where, got=got, what=what)

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from sim2gp.data.logs import Column
 from sim2gp.data.logs.checks import follows
 from sim2gp.data.logs.units import UNITS
-from sim2gp.errors import InputError
+from sim2gp.errors import InputError, error
 from sim2gp.systems.base import Channel
 
 Values = Float[np.ndarray, " N"]
@@ -99,23 +99,9 @@ def time_column(columns: Mapping[str, Values], where: str) -> Match:
     named = [name for name in grow if TIME & set(words_of(name))]
     rows = min((len(x) for x in columns.values()), default=3)
     if rows < 3:
-        raise InputError(
-            "E116",
-            "a log that is too short",
-            where=where,
-            got=f"{rows} rows",
-            expected="a recording of a few seconds",
-            fix="record longer, or leave it out",
-        )
+        raise error("too_short_to_draft", where=where, got=f"{rows} rows")
     if not grow:
-        raise InputError(
-            "E103",
-            "no column of time",
-            where=where,
-            got=", ".join(columns)[:120],
-            expected="a column that grows, such as time",
-            fix="say --period, add one, or write the project file by hand",
-        )
+        raise error("no_column_of_time", where=where, got=", ".join(columns)[:120])
     name = (named or grow)[0]
     why = "by name" if named else "it grows"
     steps = np.diff(columns[name])
@@ -328,11 +314,7 @@ def _unmatched(
     names = ", ".join(c.name for c in channels)
     held = " ".join(f"{c.name}=0.0" for c in channels)
     either = f", say --constant {held} if held there," if what == "input" else ""
-    return InputError(
-        "E103",
-        f"no column for {what} {names}",
-        where=where,
-        got=", ".join(columns)[:160] or "no other column",
-        expected=f"columns that name {names}",
-        fix=f"rename the columns{either} or write the project file by hand",
+    got = ", ".join(columns)[:160] or "no other column"
+    return error(
+        "no_columns_found", where=where, got=got, what=what, names=names, either=either
     )

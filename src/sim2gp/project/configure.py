@@ -10,7 +10,7 @@ the prior of its constant, or of ``[parameters."body/hand/mass @ payload"]``.
 
 from collections.abc import Mapping
 
-from sim2gp.errors import InputError
+from sim2gp.errors import InputError, error
 from sim2gp.inference.linear_measurements import LinearMeasurement
 from sim2gp.inference.parameters import Parameter, unknown_parameter
 from sim2gp.project.priors import located, prior
@@ -33,14 +33,8 @@ def in_configurations(
     for i, group in enumerate(spec.logs):
         first = spec.logs[places.setdefault(spec.configuration(i), i)]
         if (group.fixed, sorted(group.free)) != (first.fixed, sorted(first.free)):
-            raise InputError(
-                "E160",
-                "one configuration stated in two ways",
-                where=source.where("logs", i, "name"),
-                got=spec.configuration(i),
-                expected="the same fixed and free in all groups of one name",
-                fix="give this group another name",
-            )
+            where, got = source.where("logs", i, "name"), spec.configuration(i)
+            raise error("configuration_in_two_ways", where=where, got=got)
     if not any(group.fixed or group.free for group in spec.logs):
         for column in own_columns(spec.parameters):
             known = names_of(system.parameters)
@@ -54,13 +48,13 @@ def in_configurations(
         found.append(Variant(name, fixed, tuple(group.free)))
         try:  # alone, so that a fault has its group's place
             with_variants(system, found[-1:])
-        except InputError as error:
-            wrong = str(error.got).split(" ")[0]
+        except InputError as caught:
+            wrong = str(caught.got).split(" ")[0]
             if wrong in group.free or not group.fixed:
                 where = source.where("logs", i, "free")
             else:
                 where = source.where("logs", i, "fixed", wrong)
-            raise located(error, where) from error
+            raise located(caught, where) from caught
     priors = _priors(spec, source, system, found)
     return with_variants(system, found, priors)
 
@@ -74,19 +68,14 @@ def weighed(
         given = stated.weights
         weights = tuple([1.0] * len(stated.of) if given is None else given)
         if len(weights) != len(stated.of):
-            raise InputError(
-                "E160",
-                "weights of a sum",
-                where=source.where("weighed", i, "weights"),
-                got=f"{len(weights)} weights",
-                expected=f"{len(stated.of)}, one for each constant",
-                fix="state one for each, or leave weights out",
-            )
+            where = source.where("weighed", i, "weights")
+            got = f"{len(weights)} weights"
+            raise error("weights_of_sum", where=where, got=got, count=len(stated.of))
         found = LinearMeasurement(tuple(stated.of), weights, stated.value, stated.sd)
         try:
             system = with_measurements(system, [found])
-        except InputError as error:
-            raise located(error, where) from error
+        except InputError as caught:
+            raise located(caught, where) from caught
     return system
 
 
@@ -114,13 +103,7 @@ def _priors(
         found = prior(stated, base, where)
         tied = isinstance(stated, ParameterSpec) and stated.tie
         if tied or not isinstance(found, Parameter):
-            raise InputError(
-                "E160",
-                f"no prior for {column}",
-                where=where,
-                got="tie" if tied else f"{found:g}",
-                expected="mean and sd, or low and high",
-                fix="or fix it in its group: fixed = {...} instead of free",
-            )
+            got = "tie" if tied else f"{found:g}"
+            raise error("no_prior_of_column", where=where, got=got, column=column)
         priors[column] = found
     return priors

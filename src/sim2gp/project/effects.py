@@ -9,7 +9,7 @@ An effect that changes nothing of the machine's equations on its channel is an e
 
 from collections.abc import Collection, Mapping
 
-from sim2gp.errors import InputError, nearest
+from sim2gp.errors import InputError, error, nearest
 from sim2gp.inference.parameters import Parameter
 from sim2gp.project.priors import prior
 from sim2gp.project.schema import EFFECT_OPTIONS, EffectSpec
@@ -57,25 +57,24 @@ def _impossible(plant: AbstractPlant, what: str, where: str, line: str) -> Input
     homes = [channel for channel in channels if possible(plant, what, channel)]
     every = sorted({kind for kinds in known.values() for kind in kinds})
     if where in (*NAMES, *ALIASES):  # [effects.coulomb] and below it a prior's keys
-        code, wrong, got, names = "E103", "unknown channel", where, channels
-        fix = f"write [effects.CHANNEL.{where}]"
-    elif what not in (*NAMES, *ALIASES):
+        names = ", ".join(channels)
+        return error("effect_for_channel", where=line, got=where, names=names, of=where)
+    if what not in (*NAMES, *ALIASES):
         return unknown("effect", what, known.get(where, every), line)
-    elif homes and where not in channels:
-        code, wrong, got, names = "E103", "unknown channel", where, homes
-        close = nearest(where, homes)
+    if homes and where not in channels:
+        close, names = nearest(where, homes), ", ".join(homes)
         fix = f"did you mean {close}" if close else "use one of these"
-    else:
-        code, got, names = "E145", f"{where}.{what}", known.get(where, every)
-        wrong = f"no {what} on {where if homes else 'this machine'}"
-        fix = f"write [effects.{homes[0]}.{what}]" if homes else "use one of these"
-    return InputError(
-        code,
-        wrong,
+        return error(
+            "unknown_channel_of_effect", where=line, got=where, names=names, fix=fix
+        )
+    return error(
+        "impossible_effect",
         where=line,
-        got=got,
-        expected="one of " + ", ".join(names),
-        fix=fix,
+        got=f"{where}.{what}",
+        fix=f"write [effects.{homes[0]}.{what}]" if homes else "use one of these",
+        what=what,
+        place=where if homes else "this machine",
+        names=", ".join(known.get(where, every)),
     )
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from sim2gp.data.logs import Log, RawLog, none_unused
-from sim2gp.errors import InputError
+from sim2gp.errors import error
 from sim2gp.project.project import IN_MEMORY, Project
 from sim2gp.project.source import parsed
 from sim2gp.project.validate import validated
@@ -60,14 +60,7 @@ def as_logs(project: Project, logs: Logs) -> tuple[Log, ...]:
     for log in given:
         found += [log] if isinstance(log, Log) else project.read_logs([log])
     if not found:
-        raise InputError(
-            "E160",
-            "no logs",
-            where="logs",
-            got="an empty list",
-            expected="at least one",
-            fix="give Log.of(time=..., ...), or what read_logs returns",
-        )
+        raise error("empty_list_of_logs", where="logs", got="an empty list")
     return tuple(found)
 
 

@@ -11,7 +11,7 @@ usual constants that are not zero in the model are open.
 
 from pathlib import Path
 
-from sim2gp.errors import InputError
+from sim2gp.errors import InputError, error
 from sim2gp.inference.parameters import Parameter
 from sim2gp.project.actuators import with_actuators
 from sim2gp.project.effects import with_effects
@@ -42,8 +42,8 @@ def build_model(
     root = _root(spec, source, folder)
     try:
         model = loaded(path, root)
-    except InputError as error:
-        raise located(error, error.where or source.where("system")) from error
+    except InputError as caught:
+        raise located(caught, caught.where or source.where("system")) from caught
     known = constants_of(model)
     groups: list[list[str]] = []
     priors: dict[str, Parameter | float] = {}
@@ -53,27 +53,20 @@ def build_model(
         where = source.where("parameters", pattern)
         try:
             found = matching(known, pattern)
-        except InputError as error:
-            raise located(error, where) from error
+        except InputError as caught:
+            raise located(caught, where) from caught
         # A path of its own is the exception to a pattern.
         found = [c for c in found if c.path == pattern or c.path not in spec.parameters]
         if not found:
-            raise InputError(
-                "E145",
-                "pattern without constants of its own",
-                where=where,
-                got=pattern,
-                expected="a constant that no other table names",
-                fix="remove the pattern, or one of the other tables",
-            )
+            raise error("pattern_without_own_constants", where=where, got=pattern)
         shared = isinstance(stated, ParameterSpec) and stated.tie
         for group in tied(found, model) if shared else [[c] for c in found]:
             groups.append([c.path for c in group])
             priors[group[0].path] = _prior(stated, group[0], model, where)
     try:
         plant = MuJoCo(model, groups or None, priors, source=path)
-    except InputError as error:
-        raise located(error, source.where("parameters")) from error
+    except InputError as caught:
+        raise located(caught, source.where("parameters")) from caught
     return with_actuators(with_effects(plant, spec.effects, source), spec, source)
 
 

@@ -16,7 +16,7 @@ from sim2gp.data.logs import Log
 from sim2gp.data.split_log import cut
 from sim2gp.data.windows import Windows, motion
 from sim2gp.data.windows_likelihood import WindowsLikelihood
-from sim2gp.errors import NotFinite
+from sim2gp.errors import NotFinite, error
 from sim2gp.identification.identifiability.selection import (
     Selection,
     select_parameters,
@@ -106,7 +106,7 @@ def _linearised(
 
 
 def _not_finite() -> NotFinite:
-    return NotFinite("E203", "the model does not follow the logs at its own numbers")
+    return error("model_leaves_logs", NotFinite)
 
 
 def _liveliest(windows: Windows) -> Int[np.ndarray, " W"]:

@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 
-from sim2gp.errors import InputError
+from sim2gp.errors import InputError, error
 from sim2gp.inference.parameters import BOX_SD, Parameter, prior_from_moments
 from sim2gp.project.schema import PriorSpec
 
@@ -68,14 +68,8 @@ def _check_matter(least: float | None, base: Parameter, where: str) -> None:
     """A mass or an inertia is not negative (E147), unless it is a correction of one."""
     if least is None or least >= 0.0 or base.unit not in _MATTER or base.low < 0.0:
         return
-    raise InputError(
-        "E147",
-        f"negative {_MATTER[base.unit]}",
-        where=where,
-        got=f"{least:g} {base.unit}",
-        expected=f"{base.name} of at least 0",
-        fix="correct the sign",
-    )
+    got, what = f"{least:g} {base.unit}", _MATTER[base.unit]
+    raise error("negative_matter", where=where, got=got, what=what, name=base.name)
 
 
 def _absolute(
@@ -93,14 +87,8 @@ def _absolute(
 def _conflict(
     where: str, what: str, given: Mapping[str, object], expected: str
 ) -> InputError:
-    return InputError(
-        "E160",
-        f"incomplete prior: {what}",
-        where=where,
-        got=", ".join(given) or "an empty table",
-        expected=expected,
-        fix="state mean and sd, or low and high, or value",
-    )
+    got = ", ".join(given) or "an empty table"
+    return error("incomplete_prior", where=where, got=got, expected=expected, what=what)
 
 
 def _check_bounds(spec: PriorSpec, base: Parameter, where: str) -> None:
@@ -108,15 +96,11 @@ def _check_bounds(spec: PriorSpec, base: Parameter, where: str) -> None:
     high = base.high if spec.high is None else spec.high
     if low < high:
         return
-    same = low == high
-    raise InputError(
-        "E141",
-        f"bounds of {base.name} " + ("leave no room" if same else "reversed"),
-        where=where,
-        got=f"low = {low:g}, high = {high:g}",
-        expected="low < high",
-        fix=f"fix it instead: value = {low:g}" if same else "swap low and high",
-    )
+    name, got = base.name, f"low = {low:g}, high = {high:g}"
+    if low == high:
+        value = f"{low:g}"
+        raise error("bounds_without_room", where=where, got=got, name=name, value=value)
+    raise error("bounds_reversed", where=where, got=got, name=name)
 
 
 def _box(spec: PriorSpec, base: Parameter, where: str) -> Parameter:
@@ -130,13 +114,8 @@ def _box(spec: PriorSpec, base: Parameter, where: str) -> Parameter:
     low = base.low if spec.low is None else spec.low
     high = base.high if spec.high is None else spec.high
     if not (math.isfinite(low) and math.isfinite(high)):
-        raise InputError(
-            "E141",
-            f"half a box for {base.name}",
-            got=f"low = {low:g}, high = {high:g}",
-            expected="two finite bounds",
-            fix="state both low and high",
-        )
+        got = f"low = {low:g}, high = {high:g}"
+        raise error("half_a_box", got=got, name=base.name)
     logarithmic = base.map in ("log", "log_bounded") and low > 0
     kind = spec.map or ("log_bounded" if logarithmic else "bounded")
     if kind not in ("bounded", "log_bounded"):

@@ -24,7 +24,7 @@ from sim2gp.data.logs import (
     read_log,
 )
 from sim2gp.data.logs.file import shown
-from sim2gp.errors import InputError, nearest
+from sim2gp.errors import InputError, error, nearest
 from sim2gp.project.schema import (
     ColumnSpec,
     LogSpec,
@@ -98,25 +98,16 @@ class Project:
             for file in self.files(group):
                 place = os.path.realpath(file)  # of links in a circle, too
                 if place in seen:
-                    raise InputError(
-                        "E160",
-                        "file listed twice",
-                        where=self.source.where("logs", group, "files"),
-                        got=shown(file),
-                        expected="each file in one group",
-                        fix=f"remove it here or from group {seen[place] + 1}",
+                    where = self.source.where("logs", group, "files")
+                    other = seen[place] + 1
+                    raise error(
+                        "file_listed_twice", where=where, got=shown(file), other=other
                     )
                 seen[place] = group
                 logs += self._read(file, group, spec)
         if not logs:
-            raise InputError(
-                "E160",
-                "no logs",
-                where=self.source.where("logs"),
-                got="no [[logs]] table",
-                expected="at least one",
-                fix="add a [[logs]] table with files and columns",
-            )
+            where, got = self.source.where("logs"), "no [[logs]] table"
+            raise error("no_logs_in_project", where=where, got=got)
         if strict:
             none_unused(logs)
         return tuple(_uniquely_named(logs))
@@ -169,14 +160,9 @@ class Project:
         """The machine of all groups is in one configuration, or E160."""
         for group, spec in enumerate(self.spec.logs):
             if spec.fixed or spec.free:
-                raise InputError(
-                    "E160",
-                    "several configurations, which explain and compare do not take",
-                    where=self.source.where("logs", group),
-                    got=", ".join(self.spec.configurations),
-                    expected="the same constants in all groups",
-                    fix="write a project file of one configuration's logs",
-                )
+                where = self.source.where("logs", group)
+                got = ", ".join(self.spec.configurations)
+                raise error("several_configurations", where=where, got=got)
 
     def files(self, group: int) -> list[Path]:
         """The files of a group, in the order of their names (E130 if there is none)."""
@@ -184,28 +170,15 @@ class Project:
         for i, pattern in enumerate(self.spec.logs[group].files):
             where = self.source.where("logs", group, "files", i)
             if "\x00" in pattern:
-                raise InputError(
-                    "E131",
-                    "NUL in a path",
-                    where=where,
-                    got=repr(pattern),
-                    expected="a plain path",
-                    fix="remove the character",
-                )
+                raise error("nul_in_pattern", where=where, got=repr(pattern))
             anchored = os.path.join(self.path.parent, pattern)
             if not glob.has_magic(pattern):
                 found[Path(anchored)] = None
                 continue
             matches = sorted(glob.glob(anchored, recursive=True))
             if not matches:
-                raise InputError(
-                    "E130",
-                    "no file matches",
-                    where=where,
-                    got=repr(pattern),
-                    expected="at least one file below " + shown(self.path.parent),
-                    fix="correct the pattern; it is relative to the project file",
-                )
+                got, folder = repr(pattern), shown(self.path.parent)
+                raise error("no_file_matches", where=where, got=got, folder=folder)
             found.update(dict.fromkeys(Path(match) for match in matches))
         return list(found)
 
@@ -296,14 +269,8 @@ def unknown_system(name: str, where: str) -> InputError:
         fix = 'write the file\'s name, as in "robot.xml"'
     else:
         fix = f"did you mean {close}" if close else "name one of these"
-    return InputError(
-        "E160",
-        "unknown system",
-        where=where,
-        got=repr(name),
-        expected="one of " + ", ".join(SYSTEMS) + ", or a model's file (.xml, .urdf)",
-        fix=fix,
-    )
+    known = ", ".join(SYSTEMS)
+    return error("unknown_system", where=where, got=repr(name), known=known, fix=fix)
 
 
 def system_class(name: str) -> "type[AbstractPlant]":
@@ -343,14 +310,8 @@ def _resample(spec: ResampleSpec | None) -> Resample | None:
 
 
 def _no_group(source: Source) -> InputError:
-    return InputError(
-        "E160",
-        "no logs",
-        where=source.where("logs"),
-        got="no [[logs]] table",
-        expected="one that says how columns are named",
-        fix="add a [[logs]] table with columns",
-    )
+    where = source.where("logs")
+    return error("no_group_of_logs", where=where, got="no [[logs]] table")
 
 
 def _uniquely_named(logs: Sequence[Log]) -> list[Log]:

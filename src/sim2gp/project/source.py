@@ -14,7 +14,7 @@ from typing import Any
 
 from sim2gp.data.logs.file import read_bytes, shown
 from sim2gp.data.logs.table import decode
-from sim2gp.errors import InputError
+from sim2gp.errors import InputError, error
 from sim2gp.project.syntax import of_repeated, of_syntax
 
 MAX_BYTES = 1_000_000
@@ -75,30 +75,21 @@ def parsed(text: str, name: str) -> Source:
         raise _refused(name, f"a nesting of {depth}", f"at most {MAX_DEPTH}")
     try:
         values = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
-        raise _yaml(name, bare) or _syntax(name, text, str(error)) from error
+    except (tomllib.TOMLDecodeError, RecursionError, ValueError) as caught:
+        raise _yaml(name, bare) or _syntax(name, text, str(caught)) from caught
     lines: dict[Path_, int] = {}
     for key, line in _lines(text, bare):
         lines.setdefault(key, line)  # of a table in pieces, the first
     source = Source(name, text, values, lines)
     for key, value in _leaves(values, ()):
         if _is_hostile(key, value):
-            raise InputError(
-                "E162",
-                "code or substitution in a project file",
-                where=source.where(*key),
-                got=repr(value)[:40],
-                expected="plain values",
-                fix="write the value itself",
-            )
+            where, got = source.where(*key), repr(value)[:40]
+            raise error("code_in_project_file", where=where, got=got)
     return source
 
 
 def _refused(name: str, got: str, expected: str) -> InputError:
-    fix = "write a smaller, flatter file"
-    return InputError(
-        "E161", "project file refused", where=name, got=got, expected=expected, fix=fix
-    )
+    return error("project_file_too_large", where=name, got=got, expected=expected)
 
 
 def _yaml(name: str, bare: str) -> InputError | None:
@@ -106,14 +97,8 @@ def _yaml(name: str, bare: str) -> InputError | None:
     line = next((x for x in bare.splitlines() if x.strip()), "")
     if not _YAML.match(line):
         return None
-    return InputError(
-        "E161",
-        "project file refused",
-        where=name,
-        got="YAML, whose aliases and tags are not read",
-        expected="TOML",
-        fix="write it as TOML: key = value, and [section] for a mapping",
-    )
+    got = "YAML, whose aliases and tags are not read"
+    return error("project_file_in_yaml", where=name, got=got)
 
 
 def _blank(match: re.Match[str]) -> str:
@@ -152,18 +137,13 @@ def _syntax(name: str, text: str, message: str) -> InputError:
     row = rows[line - 1] if 0 < line <= len(rows) else ""
     reason = re.sub(r"\s*\(at .*\)", "", message)
     twice = re.search(r"overwrite|twice|redefine|already", reason, re.IGNORECASE)
-    what = "key stands twice" if twice else "not valid TOML"
-    code = "E160"
-    if twice and _table_at(text, line).startswith("parameters"):
-        code, what = "E145", "duplicate parameter"
-    return InputError(
-        code,
-        what,
-        where=f"{name}:line {line}",
-        got=repr(row.strip()[:60]),
-        expected="each key once" if twice else "TOML (" + reason[:80].lower() + ")",
-        fix=of_repeated(row) if twice else of_syntax(reason, row, column),
-    )
+    where, got = f"{name}:line {line}", repr(row.strip()[:60])
+    if not twice:
+        fix, said = of_syntax(reason, row, column), reason[:80].lower()
+        return error("not_valid_toml", where=where, got=got, reason=said, fix=fix)
+    if _table_at(text, line).startswith("parameters"):
+        return error("duplicate_parameter", where=where, got=got, fix=of_repeated(row))
+    return error("key_stands_twice", where=where, got=got, fix=of_repeated(row))
 
 
 def _table_at(text: str, line: int) -> str:

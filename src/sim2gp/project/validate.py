@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from sim2gp.errors import InputError, nearest
+from sim2gp.errors import InputError, error, nearest
 from sim2gp.project import slips
 from sim2gp.project.schema import RESERVED, ProjectSpec, keys_at
 from sim2gp.project.source import Path_, Source
@@ -63,39 +63,21 @@ def _order(source: Source, path: Path_) -> int:
     return int(source.where(*path).split(":line ")[1].split(",")[0])
 
 
-def _missing(source: Source, path: Path_, error: dict[str, Any]) -> InputError:
-    key, value = str(error["loc"][-1]), error["input"]
-    return InputError(
-        "E160",
-        f"missing key {key}",
-        where=source.where(*path),
-        got=", ".join(value)[:60] or "an empty table",
-        expected=f"{key} = ...",
-        fix=f"add {key}",
-    )
+def _missing(source: Source, path: Path_, failure: dict[str, Any]) -> InputError:
+    name, value = str(failure["loc"][-1]), failure["input"]
+    got = ", ".join(value)[:60] or "an empty table"
+    return error("missing_key", where=source.where(*path), got=got, name=name)
 
 
 def _unknown_key(source: Source, path: Path_, value: Any) -> InputError:
     where, key = source.where(*path), str(path[-1])
     if len(path) == 1 and key in RESERVED:
         named = key == "model" and isinstance(value, str)
-        return InputError(
-            "E160",
-            f"[{key}] is not used by any command yet",
-            where=where,
-            got=key,
-            expected="no such section",
-            fix=f"write system = {slips.toml(value)}" if named else "remove it",
-        )
+        fix = f"write system = {slips.toml(value)}" if named else "remove it"
+        return error("reserved_section", where=where, got=key, section=key, fix=fix)
     known = keys_at(path[:-1])
-    return InputError(
-        "E160",
-        "unknown key",
-        where=where,
-        got=key,
-        expected="one of " + ", ".join(known),
-        fix=slips.of_key(path, known) or "remove it",
-    )
+    fix = slips.of_key(path, known) or "remove it"
+    return error("unknown_key", where=where, got=key, known=", ".join(known), fix=fix)
 
 
 def _wrong(
@@ -135,13 +117,10 @@ def unknown(kind: str, name: str, known: Collection[str], where: str) -> InputEr
     """E160 with the name that was probably meant."""
     close = nearest(name, known)
     fix = f"did you mean {close}" if close else slips.elsewhere(name)
-    return InputError(
-        "E160",
-        f"unknown {kind}",
-        where=where,
-        got=name,
-        expected="one of " + ", ".join(known) if known else f"no {kind}",
-        fix=fix or ("use a known name" if known else "remove it"),
+    fix = fix or ("use a known name" if known else "remove it")
+    expected = "one of " + ", ".join(known) if known else f"no {kind}"
+    return error(
+        "unknown_name", where=where, got=name, expected=expected, fix=fix, what=kind
     )
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from sim2gp.errors import InputError, nearest
+from sim2gp.errors import error, nearest
 
 Points = Float[np.ndarray, "k 3"]
 Moving = Float[np.ndarray, "T j 3"]
@@ -284,14 +284,9 @@ def scene_of(about: Mapping[str, Any], state: np.ndarray) -> Scene:
     """The scene of a run's machine; `about` is the summary's entry "animation"."""
     system = str(about.get("system"))
     if system not in SCENES:
-        raise InputError(
-            "E195",
-            "no drawing of this machine",
-            where="summary.json, animation.system",
-            got=system,
-            expected=", ".join(SCENES),
-            fix=f"did you mean {nearest(system, SCENES) or 'furuta'}?",
-        )
+        where, known = "summary.json, animation.system", ", ".join(SCENES)
+        close = nearest(system, SCENES) or "furuta"
+        raise error("no_drawing", where=where, got=system, known=known, close=close)
     params = {k: float(v) for k, v in dict(about.get("params") or {}).items()}
     return SCENES[system](np.asarray(state, dtype=float), params)
 

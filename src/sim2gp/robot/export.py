@@ -13,7 +13,7 @@ import numpy as np
 
 from sim2gp import checks
 from sim2gp.belief import AbstractBelief
-from sim2gp.errors import InputError
+from sim2gp.errors import error
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.planning import Policy
 from sim2gp.robot.format import FORMAT, check_shapes, check_values, header
@@ -92,12 +92,7 @@ def export_model(
     checks.count("export_model", draws=draws)
     known = getattr(belief, "posterior", None)
     if known is None or known.mean.size != len(system.parameters):
-        raise InputError(
-            "E134",
-            f"no constants in a belief of type {type(belief).__name__}",
-            expected="the posterior of a simulator's constants",
-            fix="export the simulator's own belief",
-        )
+        raise error("belief_without_constants", name=type(belief).__name__)
     code = _compiled(belief, system) if compiled else None
     about = {"dt": dt, "posterior": "belief"}
     write_model(known, out, system, draws=draws, key=key, about=about, code=code)
@@ -187,12 +182,7 @@ def _compiled(belief: AbstractBelief, system: AbstractSystem) -> bytes:
     from jax import export
 
     if isinstance(plant_of(system), MuJoCo | BlackBox):
-        raise InputError(
-            "E135",
-            "compiled code cannot be written",
-            got="a simulator that runs on the host",
-            fix="leave compiled out; the model's file has the constants",
-        )
+        raise error("simulator_on_host", got="a simulator that runs on the host")
     step = single(belief.point())
     shapes = [
         jax.ShapeDtypeStruct((len(each),), jnp.float32)
@@ -201,14 +191,8 @@ def _compiled(belief: AbstractBelief, system: AbstractSystem) -> bytes:
     exported = export.export(jax.jit(lambda s, a: step(s, a)))(*shapes)
     try:
         return bytes(exported.serialize())
-    except ImportError as error:
-        raise InputError(
-            "E135",
-            "compiled code cannot be written",
-            got=str(error),
-            expected="flatbuffers",
-            fix="pip install 'sim2gp[deploy]', or leave compiled out",
-        ) from error
+    except ImportError as caught:
+        raise error("no_flatbuffers", got=str(caught)) from caught
 
 
 def _channels(system: AbstractSystem) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from sim2gp.errors import InputError
+from sim2gp.errors import InputError, error
 from sim2gp.runs.archive import Declared
 
 FORMAT = 1
@@ -86,14 +86,7 @@ def header(summary: Mapping[str, Any], where: str) -> dict[str, Any]:
         raise refused(where, "another run")
     number = about.get("format")
     if type(number) is int and number > FORMAT:
-        raise InputError(
-            "E185",
-            "policy of a newer format",
-            where=where,
-            got=number,
-            expected=f"at most {FORMAT}",
-            fix="update sim2gp",
-        )
+        raise error("newer_policy", where=where, got=number, newest=FORMAT)
     for name, (rule, expected) in FIELDS.items():
         if name not in about:
             raise refused(where, f"no field {name}")
@@ -139,14 +132,8 @@ def check_values(arrays: Mapping[str, np.ndarray], where: str) -> None:
     for name, x in arrays.items():
         bad = int(np.size(x) - np.isfinite(x).sum())
         if bad:
-            raise InputError(
-                "E181",
-                "policy with numbers that are not finite",
-                where=f"{where}, array {name}",
-                got=f"{bad} of {np.size(x)}",
-                expected="finite numbers",
-                fix="train it again: its training diverged",
-            )
+            place, got = f"{where}, array {name}", f"{bad} of {np.size(x)}"
+            raise error("policy_not_finite", where=place, got=got)
     for rule, expected in VALUES:
         if not rule(arrays):
             raise refused(where, f"arrays without {expected}")
@@ -154,11 +141,4 @@ def check_values(arrays: Mapping[str, np.ndarray], where: str) -> None:
 
 def refused(where: str, got: str) -> InputError:
     """E133: what is there is no policy of this format."""
-    return InputError(
-        "E133",
-        "not a policy that can be run",
-        where=where,
-        got=got,
-        expected=f"a policy that was exported, of format {FORMAT}",
-        fix="export it again with sim2gp.robot.export",
-    )
+    return error("not_a_policy", where=where, got=got, number=FORMAT)

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from sim2gp.errors import InputError, NotFinite, missing_extra
+from sim2gp.errors import NotFinite, error, missing_extra
 from sim2gp.inference.parameters import unknown_parameter
 from sim2gp.planning.episode import Purpose, key_for
 from sim2gp.planning.mpc import from_unit
@@ -114,7 +114,7 @@ def _kind() -> Any:
             super().reset(seed=seed)
             if options:
                 got = ", ".join(map(str, options))
-                raise InputError("E145", "unknown option of reset", got=got)
+                raise error("unknown_option_of_reset", got=got)
             if seed is not None or self.key is None:
                 drawn = int(self.np_random.integers(SEEDS)) if seed is None else seed
                 self.key, self.episode = key_of(drawn), 0
@@ -175,15 +175,15 @@ def hidden(
     constant that is not a finite number.
     """
     if truth not in (PUBLISHED, *TRUTHS):
-        expected = f"one of {', '.join((PUBLISHED, *TRUTHS))}"
-        raise InputError("E145", "unknown truth", got=truth, expected=expected)
+        known = ", ".join((PUBLISHED, *TRUTHS))
+        raise error("unknown_truth", got=truth, known=known)
     names = MACHINES[machine][0]().parameters.names
     for name, value in params.items():
         if name not in names:
             raise unknown_parameter(name, names)
         if not np.isfinite(value):
             where = f"params of {machine}"
-            raise InputError("E101", f"{name} is not finite", where=where, got=value)
+            raise error("constant_not_finite", where=where, got=value, name=name)
     made = tuple(_effect(machine, e) if isinstance(e, str) else e for e in effects)
     return Hidden(machine, truth, dict(params), made)
 
@@ -246,13 +246,9 @@ def told(met: Seen, over: bool) -> tuple[np.ndarray, float, bool, bool, dict[str
 def check_met(state: AnyArray, reward: AnyArray) -> None:
     """Raise `NotFinite` E203 where a state or a reward is no number."""
     if not (np.isfinite(state).all() and np.isfinite(reward).all()):
-        raise NotFinite(
-            "E203",
-            "a state or a reward of an episode",
-            where="an environment",
-            got=f"{state.tolist()}, {reward.tolist()}",
-            expected="finite numbers",
-            fix="check the constants that were given",
+        got = f"{state.tolist()}, {reward.tolist()}"
+        raise error(
+            "environment_not_finite", NotFinite, where="an environment", got=got
         )
 
 
@@ -260,24 +256,17 @@ def checked(action: Any, shape: tuple[int, ...]) -> np.ndarray:
     """An action in float32 (E140 for another shape, E101 where it is not finite)."""
     u = np.asarray(action, np.float32)
     if u.shape != shape:
-        raise InputError(
-            "E140",
-            "action of another shape",
-            where="step",
-            got=f"shape {u.shape}",
-            expected=f"shape {shape}, one number for each input of the machine",
-            fix="give an action of the environment's action_space",
-        )
+        got = f"shape {u.shape}"
+        raise error("action_of_another_shape", where="step", got=got, shape=shape)
     if not np.isfinite(u).all():
-        raise InputError("E101", "action that is not finite", got=u.tolist())
+        raise error("action_not_finite", got=u.tolist())
     return u
 
 
 def key_of(seed: int) -> Key:
     """A run's key (E149 for a seed that JAX has no key for)."""
     if not 0 <= seed < SEEDS:
-        expected = f"a whole number below {SEEDS}"
-        raise InputError("E149", "seed of a reset", got=seed, expected=expected)
+        raise error("seed_of_reset", got=seed, most=SEEDS)
     return jax.random.key(seed)
 
 

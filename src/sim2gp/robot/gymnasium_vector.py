@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from sim2gp.errors import InputError, missing_extra
+from sim2gp.errors import error, missing_extra
 from sim2gp.planning.episode import Purpose, key_for
 from sim2gp.planning.tasks import Task
 from sim2gp.robot.gymnasium import (
@@ -180,7 +180,7 @@ def _kind() -> Any:
             super().reset(seed=seed if isinstance(seed, int) else None)
             if options:
                 got = ", ".join(map(str, options))
-                raise InputError("E145", "unknown option of reset", got=got)
+                raise error("unknown_option_of_reset", got=got)
             seeds = seeds_of(seed, self.num_envs)
             seen = self.fleet.reset(seeds, self.np_random)
             return seen, {"status": np.full(self.num_envs, "running", object)}
@@ -203,8 +203,7 @@ def seeds_of(seed: int | Sequence[int | None] | None, count: int) -> list[int | 
     if isinstance(seed, int):
         return [seed + i for i in range(count)]
     if len(seed) != count:
-        got, expected = f"{len(seed)} seeds", f"{count}"
-        raise InputError("E140", "a reset", got=got, expected=expected)
+        raise error("seeds_of_reset", got=f"{len(seed)} seeds", count=count)
     return list(seed)
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from sim2gp.errors import NotFinite
+from sim2gp.errors import NotFinite, error
 from sim2gp.robot.format import (
     LARGEST,
     check_shapes,
@@ -48,7 +48,8 @@ class NumpyPolicy:
             mean = self._mean(s)
             # Infinity would be a full action: it is judged before it is squashed.
             if not (np.isfinite(s).all() and np.isfinite(mean).all()):
-                raise NotFinite("E203", "no action", where="a policy", got=s.tolist())
+                got = s.tolist()
+                raise error("no_action", NotFinite, where="a policy", got=got)
         middle, half = 0.5 * (self.high + self.low), 0.5 * (self.high - self.low)
         return np.clip(middle + half * np.tanh(mean), self.low, self.high)
 

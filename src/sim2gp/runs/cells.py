@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from sim2gp.cleanup import replace_file
-from sim2gp.errors import InputError
+from sim2gp.errors import error
 from sim2gp.runs.plain import to_json
 from sim2gp.runs.sealed import is_sealed, parse, seal, unseal
 from sim2gp.runs.sources import Source, digest_of, source_of
@@ -130,14 +130,8 @@ class Cells:
         other = (
             "--keep-old uses them" if keep else "remove them, or choose another --out"
         )
-        raise InputError(
-            "E186",
-            "stored cells that are not of this study",
-            where=str(self.folder),
-            got=", ".join(parts) + (f"; other: {differ}" if differ else ""),
-            expected="whole cells of these arguments, modules and versions",
-            fix=f"--refresh computes them again; {other}",
-        )
+        got = ", ".join(parts) + (f"; other: {differ}" if differ else "")
+        raise error("cells_of_others", where=str(self.folder), got=got, other=other)
 
     def _differences(self, digests: Iterable[str]) -> str:
         """The modules and versions in which other sources differ from this one."""

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from sim2gp.errors import InputError
+from sim2gp.errors import InputError, error
 from sim2gp.runs.sealed import is_sealed, parse, unseal
 
 FORMAT = 2
@@ -62,26 +62,19 @@ def read_manifest(path: Path) -> dict[str, Any]:
         if not stat.S_ISREG(status.st_mode):
             raise not_a_run(path, f"{MANIFEST}: not a file")
         content = target.read_bytes() if status.st_size <= LARGEST else b""
-    except OSError as error:
-        got = f"{MANIFEST}: {(error.strerror or '').lower()}"
-        raise not_a_run(path, got) from error
+    except OSError as caught:
+        got = f"{MANIFEST}: {(caught.strerror or '').lower()}"
+        raise not_a_run(path, got) from caught
     try:
         if status.st_size > LARGEST:
             raise ValueError(f"{status.st_size} bytes, more than {LARGEST}")
         sealed = is_sealed(content)
         manifest = unseal(content) if sealed else parse(content)
-    except ValueError as error:
-        raise damaged(path, MANIFEST, str(error)) from error
+    except ValueError as caught:
+        raise damaged(path, MANIFEST, str(caught)) from caught
     number = manifest.get("format")
     if type(number) is int and number > FORMAT:
-        raise InputError(
-            "E185",
-            "run of a newer format",
-            where=str(target),
-            got=number,
-            expected=f"at most {FORMAT}",
-            fix="update sim2gp",
-        )
+        raise error("newer_run", where=str(target), got=number, newest=FORMAT)
     for name, (rule, expected) in _ENTRIES.items():
         if name not in manifest or not rule(manifest[name]):
             raise damaged(path, MANIFEST, f"an entry {name} that is not {expected}")
@@ -92,23 +85,9 @@ def read_manifest(path: Path) -> dict[str, Any]:
 
 def not_a_run(path: Path, got: str) -> InputError:
     """E130: nothing that a command of ours wrote."""
-    return InputError(
-        "E130",
-        "not a run",
-        where=str(path),
-        got=got,
-        expected="a folder that a sim2gp command wrote",
-        fix="name the --out folder of an earlier command",
-    )
+    return error("not_a_run", where=str(path), got=got)
 
 
 def damaged(path: Path, name: str, got: str) -> InputError:
     """E183: a file of a run is not as it was written."""
-    return InputError(
-        "E183",
-        "damaged run",
-        where=f"{path}/{name}",
-        got=got,
-        expected="the file as it was written",
-        fix="run the command again",
-    )
+    return error("damaged_run", where=f"{path}/{name}", got=got)

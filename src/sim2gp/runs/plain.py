@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sim2gp.errors import Sim2GPError
+from sim2gp.errors import Sim2GPError, error
 
 
 def to_json(values: Mapping[str, Any]) -> str:
@@ -30,10 +30,8 @@ def _plain_values(value: Any, key: str) -> Any:
         return str(value)
     if isinstance(value, float):
         if not math.isfinite(value):
-            where, expected = key.lstrip("."), "a finite number"
-            raise Sim2GPError(
-                "E203", "result", where=where, got=value, expected=expected
-            )
+            where = key.lstrip(".")
+            raise error("result_not_finite", Sim2GPError, where=where, got=value)
         return float(value)
     return _plain_values(np.asarray(value).tolist(), key)
 

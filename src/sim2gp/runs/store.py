@@ -24,7 +24,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from sim2gp import cleanup
-from sim2gp.errors import InputError, Sim2GPError
+from sim2gp.errors import InputError, Sim2GPError, error
 from sim2gp.runs.archive import load_arrays
 from sim2gp.runs.manifest import FORMAT, MANIFEST, damaged, not_a_run, read_manifest
 from sim2gp.runs.plain import environment, to_json, version
@@ -74,8 +74,8 @@ class Writer:
         plain = {key: np.asarray(value) for key, value in arrays.items()}
         for key, value in plain.items():
             if value.dtype.kind not in "biufcSU":
-                got, fix = f"dtype {value.dtype}", "store numbers"
-                raise Sim2GPError("E182", f"array {key}", got=got, fix=fix)
+                got = f"dtype {value.dtype}"
+                raise error("run_array_of_objects", Sim2GPError, got=got, name=key)
         buffer = io.BytesIO()
         np.savez_compressed(buffer, allow_pickle=False, **plain)
         self.write_bytes(name, buffer.getvalue())
@@ -131,14 +131,7 @@ def check_target(path: Path) -> None:
         got = "a folder with other files"
     else:
         got = "a link" if path.is_symlink() else "a file"
-    raise InputError(
-        "E132",
-        "output folder is not a run",
-        where=str(path),
-        got=got,
-        expected="a new folder, an empty one, or an earlier run",
-        fix="choose another --out",
-    )
+    raise error("output_is_not_a_run", where=str(path), got=got)
 
 
 def check_absent(path: Path) -> None:
@@ -146,14 +139,9 @@ def check_absent(path: Path) -> None:
     there = path.exists() or path.is_symlink()
     if path.parent.is_dir() and not there:
         return
-    raise InputError(
-        "E132",
-        "file exists" if there else "no folder for the file",
-        where=str(path if there else path.parent),
-        got="something of that name" if there else "nothing there",
-        expected="a new file" if there else "a folder",
-        fix="choose another --out" + (", or remove it" if there else ""),
-    )
+    if there:
+        raise error("file_exists", where=str(path), got="something of that name")
+    raise error("no_folder_for_file", where=str(path.parent), got="nothing there")
 
 
 @dataclass(frozen=True)
@@ -225,27 +213,20 @@ def _read_file(file: Path, path: Path, entry: dict[str, Any]) -> bytes:
     return content
 
 
-def disk_error(path: Path, error: OSError) -> Sim2GPError:
+def disk_error(path: Path, caught: OSError) -> Sim2GPError:
     """What the disk refused, as an error of ours: E190 (exit 74) or E130 (exit 2)."""
-    reason = (error.strerror or str(error)).lower()
-    if error.errno in _FULL:
-        fix = "make room and run the command again; nothing was changed"
-        return DiskError("E190", "disk failure", where=str(path), got=reason, fix=fix)
-    return InputError(
-        "E130",
-        "output cannot be written",
-        where=str(error.filename or path),
-        got=reason,
-        expected="a folder you may write",
-        fix="choose another --out",
-    )
+    reason = (caught.strerror or str(caught)).lower()
+    if caught.errno in _FULL:
+        return error("disk_failure", DiskError, where=str(path), got=reason)
+    where = str(caught.filename or path)
+    return error("output_cannot_be_written", where=where, got=reason)
 
 
 def _plain(name: str) -> Path:
     """A name below the run directory, never outside it."""
     path = Path(name)
     if path.is_absolute() or ".." in path.parts or name in ("", "."):
-        raise Sim2GPError("E131", "file name", got=name, expected="a name in the run")
+        raise error("file_outside_run", Sim2GPError, got=name)
     return path
 
 
@@ -274,13 +255,8 @@ def _locked(path: Path) -> Iterator[None]:
     lock = FileLock(file, timeout=0)
     try:
         lock.acquire()
-    except Timeout as error:
-        raise RunOwned(
-            "E191",
-            "another process writes this run",
-            where=str(path),
-            fix="wait for it, or choose another --out",
-        ) from error
+    except Timeout as caught:
+        raise error("run_owned", RunOwned, where=str(path)) from caught
     try:
         yield
     finally:

@@ -15,7 +15,7 @@ from itertools import chain, cycle
 from typing import Any, TypeVar
 
 from sim2gp import cleanup, errors
-from sim2gp.errors import Sim2GPError
+from sim2gp.errors import Sim2GPError, error
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -122,19 +122,15 @@ def _next(results: Any, processes: Sequence[Any]) -> Any:
     """The next result, for as long as somebody lives to make it."""
     while True:
         try:
-            number, result, error = results.get(timeout=PATIENCE)
+            number, result, failure = results.get(timeout=PATIENCE)
         except queue.Empty:
             died = [p.exitcode for p in processes if p.exitcode]
             if died:
-                raise Sim2GPError(
-                    "E208",
-                    "a worker process died",
-                    got=f"exit code {died[0]}",
-                    fix="its message stands above; finished cells are kept",
-                ) from None
+                got = f"exit code {died[0]}"
+                raise error("worker_died", Sim2GPError, got=got) from None
             continue
-        if error is not None:
-            kind, fields = error
+        if failure is not None:
+            kind, fields = failure
             raise getattr(errors, kind)(
                 fields.pop("code"), fields.pop("what"), **fields
             )
