@@ -107,8 +107,10 @@ def _change(path: str) -> Any:
     return modifier
 
 
-def write(folder: Path, seconds: float, seed: int, delay: float) -> None:
-    """The arm, its log and its project."""
+def write(
+    folder: Path, seconds: float, seed: int, delay: float, window: float | None = None
+) -> None:
+    """The arm, its log and its project; ``window`` in s as `init` chooses it."""
     (folder / "arm.xml").write_text(servo_arm.model_text())
     servo_arm.record(
         folder / "log.csv",
@@ -117,7 +119,7 @@ def write(folder: Path, seconds: float, seed: int, delay: float) -> None:
         delay=delay,
         values=truth(seed),
     )
-    window = window_of(seconds)
+    window = window or window_of(seconds)
     project = servo_arm.project_text(["log.csv"], constants=OPEN, window=window)
     (folder / "arm.toml").write_text(project)
     told = project.replace("{low = 0.0, high = 0.03}\ntie = true", f"{delay}")

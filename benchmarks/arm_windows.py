@@ -8,7 +8,6 @@ its 22 constants, and how many of their intervals hold the truth, by windows' le
 
 import argparse
 import json
-import re
 import statistics
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
@@ -27,10 +26,7 @@ def cell(seconds: float, window: float, seed: int) -> dict[str, Any]:
     """One machine, its log in windows of one length."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        write(folder, seconds, seed, DELAY)
-        project = folder / "arm.toml"
-        stated = re.sub(r"window = [\d.]+", f"window = {window}", project.read_text())
-        project.write_text(stated)
+        write(folder, seconds, seed, DELAY, window)
         took = timed(folder, [*MAIN, "identify", "arm.toml", "--quick", "--out", "run"])
         summary = json.loads((folder / "run" / "summary.json").read_text())
     said = {"seconds": seconds, "window": window, "seed": seed, "cpu": took["cpu"]}

@@ -13,7 +13,7 @@ import pytest
 from report_example import Run, a_film, full_run
 from sim2gp import reports as report
 from sim2gp.errors import InputError
-from sim2gp.reports import markup
+from sim2gp.reports import numbers
 from sim2gp.runs import store
 from sim2gp.systems.mujoco.film import BYTES
 
@@ -204,6 +204,37 @@ def test_strings_of_a_run_are_text_not_markup(run: Run) -> None:
     assert text.count("<script") == text.count("</script") == 2
 
 
+class Pictures(HTMLParser):
+    """Collects what each picture says to those who cannot see it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.said: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = dict(attrs)
+        if tag == "img":
+            self.said.append(str(given["alt"]))
+        if tag == "svg" and "viewbox" in given:  # not the field inside a chart
+            assert given["role"] == "img"
+            self.said.append(str(given["aria-label"]))
+
+
+def test_every_picture_says_what_it_shows(run: Run) -> None:
+    pictures = Pictures()
+    pictures.feed(report.write_report(*run))
+    assert len(pictures.said) > 10
+    for said in pictures.said:
+        name, _, text = said.partition(": ")
+        assert name
+        assert text
+        assert "nan" not in text
+    (q1,) = (x for x in pictures.said if x.startswith("arm angle theta"))
+    low, high = (float(x.replace("−", "-")) for x in re.findall(r"[−\d.]+", q1)[:2])
+    theta = np.rad2deg(run[1]["animation/state"][:, 0])
+    np.testing.assert_allclose([low, high], [theta.min(), theta.max()], rtol=5e-3)
+
+
 def test_gaps_and_missing_numbers_never_reach_the_page(run: Run) -> None:
     summary = {
         "command": "demo",
@@ -256,7 +287,7 @@ def test_trouble_stands_before_the_result(run: Run) -> None:
 def test_means_are_rounded_by_their_uncertainty(
     mean: float | None, sd: float, text: str
 ) -> None:
-    assert markup.plus_minus(mean, sd) == text
+    assert numbers.plus_minus(mean, sd) == text
 
 
 @pytest.mark.parametrize(
@@ -269,16 +300,16 @@ def test_means_are_rounded_by_their_uncertainty(
     ],
 )  # fmt: skip
 def test_numbers_have_three_digits(value: object, text: str) -> None:
-    assert markup.number(value) == text
+    assert numbers.number(value) == text
 
 
 def test_other_words_for_numbers() -> None:
-    assert markup.interval(8.3123, 8.5123) == "8.312 to 8.512"
-    assert markup.interval(1e-6, 3e-3) == "1.0 × 10⁻⁶ to 0.0030"
-    assert markup.duration(21.37) == "21.4 s"
-    assert markup.duration(754.0) == "12 min 34 s"
-    assert markup.duration(7500) == "2 h 05 min"
-    assert markup.unit_text("kg m^2 s^-1") == "kg m² s⁻¹"
+    assert numbers.interval(8.3123, 8.5123) == "8.312 to 8.512"
+    assert numbers.interval(1e-6, 3e-3) == "1.0 × 10⁻⁶ to 0.0030"
+    assert numbers.duration(21.37) == "21.4 s"
+    assert numbers.duration(754.0) == "12 min 34 s"
+    assert numbers.duration(7500) == "2 h 05 min"
+    assert numbers.unit_text("kg m^2 s^-1") == "kg m² s⁻¹"
 
 
 def test_redraw_gives_the_same_bytes_from_the_files_alone(

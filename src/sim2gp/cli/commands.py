@@ -16,7 +16,6 @@ from sim2gp.cli.late import (
     command,
     function,
     identification,
-    read_run,
     run_directory,
 )
 from sim2gp.cli.log_commands import Compare, Evaluate, Explain, Identify, Init
@@ -34,9 +33,9 @@ from sim2gp.cli.options import (
     Wide,
     Writes,
     option,
-)  # fmt: skip
+)
 from sim2gp.runs.sinks import opened
-from sim2gp.runs.store import check_absent
+from sim2gp.runs.store import check_absent, read_run
 
 
 @dataclass(kw_only=True)
@@ -184,7 +183,7 @@ class Report(Common):
     """The folder of an earlier command."""
 
     def run(self, call: Call) -> dict[str, Any]:
-        summary = read_run(self.path).summary
+        summary: dict[str, Any] = read_run(self.path).summary
         redraw = import_module("sim2gp.reports").redraw
         call.progress.say(f"report: {redraw(self.path)}")
         return summary

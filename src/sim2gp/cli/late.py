@@ -12,8 +12,7 @@ from typing import Any
 
 from sim2gp.cli.options import Reads
 from sim2gp.runs import Progress, new_run
-from sim2gp.runs.store import check_target
-from sim2gp.runs.store import load_run as read_run
+from sim2gp.runs.store import check_target, read_run
 
 
 @dataclass(frozen=True)
@@ -72,7 +71,7 @@ def read_project(path: Path, given: Reads, *, alike: bool = False) -> tuple[Any,
 
 
 def identification(path: Path) -> Any:
-    """An identification read back; a folder that is no run fails before the imports."""
+    """An identification read back; what is no run fails before the heavy imports."""
     read_run(path)
     return function("commands.identification", "restored")(path)
 

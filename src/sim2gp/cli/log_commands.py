@@ -15,7 +15,6 @@ from sim2gp.cli.late import (
     function,
     identification,
     read_project,
-    read_run,
     run_directory,
 )
 from sim2gp.cli.options import (
@@ -32,8 +31,8 @@ from sim2gp.cli.options import (
     SomeCount,
     SomeSeconds,
     option,
-)  # fmt: skip
-from sim2gp.runs.store import check_absent
+)
+from sim2gp.runs.store import check_absent, read_run
 from sim2gp.runs.workers import cores
 
 
@@ -141,8 +140,8 @@ class Evaluate(Reads, Chosen):
             read = read_project(path, self)
             how["workers"] = self.workers
             return call.saved(out, lambda: command("evaluate")(*read, **how))
-        read_run(path)
         if not self.logs:
+            read_run(path)  # a folder that is no run is the first thing to say
             expected, fix = "--logs FILE...", "name the logs to predict"
             raise usage_error("no logs", "no --logs", expected, fix)
         fit = identification(path).within(budget(self.budget))

@@ -25,7 +25,7 @@ from sim2gp.identification.missing_physics.data import (
     WindowData,
 )
 from sim2gp.identification.missing_physics.explain import explain as search_missing
-from sim2gp.identification.missing_physics.search import REFITS
+from sim2gp.identification.missing_physics.search import REFITS, Refitted
 from sim2gp.identification.missing_physics.words import candidate_rows, headline, table
 from sim2gp.planning.tasks import MACHINES
 from sim2gp.project import Project, load_project
@@ -33,7 +33,6 @@ from sim2gp.project.amend import amend
 from sim2gp.project.training_windows import cut_logs
 from sim2gp.runs import Progress, load_run
 from sim2gp.runs.provenance import provenance
-from sim2gp.systems.effects.registry import Candidate
 
 SHARED_SECOND = 1.0  # s of windows whose errors may be correlated
 
@@ -42,7 +41,7 @@ SHARED_SECOND = 1.0  # s of windows whose errors may be correlated
 class MissingPhysics(AbstractResult):
     """What a simulator lacks: nothing, an effect of the library, or none of these."""
 
-    winner: Candidate | None = field(default=None)
+    winner: Refitted | None = field(default=None)
 
     @property
     def answer(self) -> str:
@@ -61,7 +60,7 @@ class MissingPhysics(AbstractResult):
         return list(self.summary["candidates"])
 
     def add_to(self, file: Path) -> "MissingPhysics":
-        """Write the winner into a project file; what was added stands in the summary.
+        """Write the winner into a project file; the summary names the file.
 
         The file is left alone where the answer names no effect.
         """
@@ -69,13 +68,8 @@ class MissingPhysics(AbstractResult):
         if self.winner is None:
             notes.append(f"nothing was added to {file}: {self.answer}")
             return self.with_entries(warnings=notes)
-        known = (row["evidence_gain"] for row in self.candidates)
-        gain = max(gain for gain in known if gain is not None)
-        amend(
-            file,
-            self.winner,
-            f"added by sim2gp explain: {gain:.0f} nats of evidence",
-        )
+        note = f"added by sim2gp explain: {self.winner.gain:.0f} nats of evidence"
+        amend(file, self.winner.scored.candidate, note)
         return self.with_entries(added=str(file))
 
 
@@ -92,7 +86,6 @@ def explain(
     with (progress or Progress()).task("explain", 2 + REFITS) as task:
         found = search_missing(data, on_step=task.advance)
     candidates = candidate_rows(found)
-    best = found.search.best
     gains = np.asarray([s.gain for s in found.search.scored])
     names = np.asarray([s.candidate.name for s in found.search.scored])
     summary: dict[str, Any] = {
@@ -114,7 +107,7 @@ def explain(
     return MissingPhysics(
         summary | provenance(started),
         {"explain/gain": gains, "explain/name": names},
-        winner=best.scored.candidate if best and found.effect else None,
+        winner=found.search.best if found.effect else None,
     )
 
 

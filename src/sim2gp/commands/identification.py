@@ -14,16 +14,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim2gp.commands.result import PROJECT, AbstractResult
-from sim2gp.data.logs import Budget, Log, none_unused
+from sim2gp.data.logs import Budget, Log
 from sim2gp.errors import error
 from sim2gp.identification.forecasts.forecast import Band
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.parameters import Parameters
 from sim2gp.project import Project, load_project
+from sim2gp.project.in_memory import read_logs
 from sim2gp.runs import load_run
 from sim2gp.runs.store import Run
 from sim2gp.systems.base import AbstractSystem
-from sim2gp.systems.variants import index_of
 from sim2gp.types import AnyArray, in_float64
 
 #: The corrected posterior has the report's intervals, the plain one is Laplace's.
@@ -134,18 +134,16 @@ class Identification(AbstractResult):
         *,
         strict: bool = False,
     ) -> tuple[Log, ...]:
-        """Logs of the machine in one configuration (E152 where it has several)."""
-        index_of(configuration, self.machine.variants)
-        found = self._project.read_logs(files, configuration)
-        if strict:
-            none_unused(found)
-        return found
+        """Logs of the machine in one configuration: `sim2gp.read_logs`."""
+        return read_logs(files, self._project, configuration, strict=strict)
 
     def training_logs(
         self, *, strict: bool = False, alike: bool = False
     ) -> tuple[Log, ...]:
         """What it was fitted to: as given, or read from where the files stood."""
         if self.logs is not None:
+            if alike:
+                self._project.check_alike()
             return self.logs
         return self._project.load_logs(strict=strict, alike=alike)
 

@@ -1,9 +1,10 @@
 """A machine and logs from Python, as a project file would have them."""
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import tomlkit
 
 from sim2gp.data.logs import Log, RawLog, none_unused
 from sim2gp.errors import error
@@ -12,6 +13,7 @@ from sim2gp.project.source import parsed
 from sim2gp.project.validate import validated
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.machine import as_machine
+from sim2gp.systems.variants import index_of
 
 Logs = Sequence[Log | RawLog] | Log | RawLog
 
@@ -29,10 +31,8 @@ def project_of_machine(
     Raises `InputError` E141, E144 and E160 as `load_project` does.
     """
     tables = {"likelihood": likelihood, "limits": limits, "rates": rates}
-    text = f"system = {json.dumps(IN_MEMORY)}\n"
-    for table, values in tables.items():
-        rows = [f"{json.dumps(k)} = {_toml(v)}" for k, v in (values or {}).items()]
-        text += "\n".join([f"[{table}]", *rows, ""]) if rows else ""
+    stated = {table: dict(values) for table, values in tables.items() if values}
+    text = tomlkit.dumps({"system": IN_MEMORY} | stated)
     source = parsed(text, f"{name} (in memory)")
     spec, path = validated(source), Path(f"{name}.toml")
     return Project(path, source, spec, as_machine(machine), own=True)
@@ -73,21 +73,12 @@ def read_logs(
 ) -> tuple[Log, ...]:
     """Files of a project's machine, read as its own logs are (E101 to E141).
 
-    ``configuration`` names the machine's, where it has several; ``strict`` refuses
-    columns that nothing takes (E105).
+    ``configuration`` names the machine's, where it has several (E152); ``strict``
+    refuses columns that nothing takes (E105).
     """
+    index_of(configuration, machine.system.variants)
     given = [files] if isinstance(files, Path | str) else list(files)
     found = machine.read_logs(given, configuration)
     if strict:
         none_unused(found)
     return found
-
-
-def _toml(value: Any) -> str:
-    """A number, a word, a pair, or a table of them."""
-    if isinstance(value, Mapping):
-        inner = (f"{json.dumps(str(k))} = {_toml(v)}" for k, v in value.items())
-        return "{" + ", ".join(inner) + "}"
-    if isinstance(value, tuple | list):
-        return "[" + ", ".join(_toml(x) for x in value) + "]"
-    return json.dumps(value) if isinstance(value, str | bool) else repr(float(value))

@@ -12,9 +12,11 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from markupsafe import Markup, escape
 
 from sim2gp.reports import frames, svg
-from sim2gp.reports.markup import Raw, cards, esc, legend
+from sim2gp.reports.numbers import number
+from sim2gp.reports.parameters import Section
 from sim2gp.reports.scenes import Scene, Shape, keep_frames, project, scene_of
 from sim2gp.reports.skeleton import overlaid, skeleton
 
@@ -69,7 +71,7 @@ def _body(index: int, shape: Shape, seen: np.ndarray, scale: np.ndarray) -> str:
     return f'<polygon {tag} class="f-{shape.colour}"{style} points="{corners}"/>'
 
 
-def _still(scene: Scene, title: str, words: str) -> str:
+def _still(scene: Scene, title: str, words: str) -> Markup:
     """The first frame as SVG."""
     pixels, depth = project(scene, scene.points(0))
     bodies = "".join(
@@ -81,10 +83,11 @@ def _still(scene: Scene, title: str, words: str) -> str:
         )
         for index, shape in _ordered(scene, depth)
     )
-    return (
+    label = f"{title}: {words}" if words else f"{title}: a drawing of the machine"
+    return Markup(
         f'<svg class="stage" viewBox="0 0 {scene.width} {scene.height}" role="img" '
-        f'aria-label="{esc(title)}"><g class="bodies">{bodies}</g>'
-        f'<text class="said" x="16" y="28">{esc(words)}</text></svg>'
+        f'aria-label="{escape(label)}"><g class="bodies">{bodies}</g>'
+        f'<text class="said" x="16" y="28">{escape(words)}</text></svg>'
     )
 
 
@@ -137,7 +140,7 @@ def _strip(
     unit: str,
     starts: list[int],
     recorded: np.ndarray | None = None,
-) -> Raw:
+) -> Markup:
     """One signal against time with the cursor that follows the player."""
     lines = np.array(values, dtype=float)
     lines[[s for s in starts if 0 < s < len(lines)]] = np.nan
@@ -160,7 +163,11 @@ def _strip(
         f'<line class="rule {css} cursor" x1="0" x2="0" y1="0" y2="{axes.size[1]:.1f}" '
         f'data-width="{axes.size[0]:.1f}"/>'
     )
-    return svg.chart(axes, marks, title=name, unit=unit)
+    seen = np.asarray(values, float)
+    seen = seen[np.isfinite(seen)]
+    ends = [number(float(end(seen))) for end in (np.min, np.max)] if seen.size else []
+    said = f"from {' to '.join(ends)} over {number(float(time[-1]))} s"
+    return svg.chart(axes, marks, title=name, said=said, unit=unit)
 
 
 def _frames(count: int, dt: float, points: int) -> np.ndarray:
@@ -192,7 +199,7 @@ def _scene(about: Mapping[str, Any], arrays: Arrays) -> tuple[Scene, Scene | Non
 
 def _signals(
     about: Mapping[str, Any], scene: Scene, arrays: Arrays, starts: list[int]
-) -> list[Raw]:
+) -> list[Markup]:
     """Positions, over what was recorded, then inputs."""
     state = np.asarray(arrays["animation/state"], dtype=float)
     recorded, action = arrays.get("animation/recorded"), arrays.get("animation/action")
@@ -215,7 +222,7 @@ def _signals(
     return strips
 
 
-def player(about: Mapping[str, Any], arrays: Arrays) -> Raw:
+def player(about: Mapping[str, Any], arrays: Arrays) -> Section:
     """The machine on the page: a picture that plays, and its signals below.
 
     `about` is the summary's entry "animation": dt (s), title, optional marks (a list of
@@ -238,23 +245,15 @@ def player(about: Mapping[str, Any], arrays: Arrays) -> Raw:
     film = _film(scene, dt * stride, marks, [math.ceil(r / stride) for r in rows])
     film = film[:-1] + frames.pictures(about, arrays) + "}"
     words = marks[0][1] if marks and marks[0][0] <= 0 else ""
-    hint = " Drag the picture to look from another side." if scene.camera.turns else ""
-    colours = [("quiet", "recorded"), ("c1", "forecast")]
-    shown = " The pale shadow is the recording." if other is not None else ""
-    if "frames" in about:
-        shown += " In MuJoCo's picture the forecast is orange."
-    return Raw(
-        f'<div class="player">\n<div>{_still(scene, title, words)}\n'
-        f"{frames.canvas(about)}"
-        '<div class="controls" hidden><button type="button" class="play">Play</button>'
-        '<input type="range" min="0" value="0" step="any" aria-label="time">'
-        '<output>0 s</output><button type="button" class="pace">1×</button>'
-        '<button type="button" class="look" hidden>Figure</button></div>\n'
-        f'<script type="application/json">{film}</script>\n'
-        f'<p class="soft">{esc(title)}.{shown}{hint}</p></div>\n'
-        f"<div>{legend(colours) if other is not None else ''}"
-        f"{cards(strips, 'strips')}</div></div>\n"
-    )
+    return {
+        "title": title,
+        "still": _still(scene, title, words),
+        "film": Markup(film),
+        "canvas": about.get("frames"),
+        "turns": scene.camera.turns,
+        "recorded": other is not None,
+        "strips": strips,
+    }
 
 
 def _paint(scene: Scene, frame: int, trail: range, words: str, grain: int) -> Any:

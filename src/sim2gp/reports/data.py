@@ -1,68 +1,24 @@
 """The sections of a report that hold data against the model."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from sim2gp.reports import svg
-from sim2gp.reports.markup import (
-    MISSING,
-    Raw,
-    cards,
-    esc,
-    is_number,
-    legend,
-    listing,
-    name_text,
-    number,
-    paragraph,
-    percent,
-    section,
-    table,
-    unit_text,
-)
-from sim2gp.reports.parameters import Arrays, Summary
+from sim2gp.reports.numbers import MISSING, is_number, number, percent, unit_text
+from sim2gp.reports.parameters import Arrays, Section, Summary
+from sim2gp.reports.tables import SHARES, Cell, Table, records, shown, table
 from sim2gp.reports.traces import forecasts, unit_of
 
-_COLOURS = ("c0", "c1", "c2", "c3", "c4", "c5")
-_SHARES = ("coverage90", "coverage95", "coverage")
-
-
-def _cell(key: str, value: object) -> object:
-    if key in _SHARES:
-        return percent(value)
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    return number(value) if is_number(value) or value is None else value
-
-
-def records(entries: Mapping[str, Any], first: str) -> Raw:
-    """A table of named entries: one column for every key that any of them has."""
-    rows = {
-        name: value if isinstance(value, Mapping) else {"value": value}
-        for name, value in entries.items()
-    }
-    keys = list(dict.fromkeys(key for row in rows.values() for key in row))
-    words = [
-        index + 1
-        for index, key in enumerate(keys)
-        if any(isinstance(row.get(key), str) for row in rows.values())
-    ]
-    return table(
-        [first, *(key.replace("_", " ") for key in keys)],
-        [
-            [name_text(name), *(_cell(key, row.get(key)) for key in keys)]
-            for name, row in rows.items()
-        ],
-        words=(0, *words),
-    )
+COLOURS = ("c0", "c1", "c2", "c3", "c4", "c5")
 
 
 def _sentence(item: object) -> object:
     if isinstance(item, Mapping):
         return item.get("text") or ", ".join(
-            f"{key.replace('_', ' ')} {_cell(key, value)}"
+            f"{key.replace('_', ' ')} {shown(key, value)}"
             for key, value in item.items()
         )
     return item
@@ -77,14 +33,13 @@ _TESTS = {
 }
 
 
-def _tests(tests: Mapping[str, Any]) -> Raw:
+def _tests(tests: Mapping[str, Any]) -> Table:
     """What the residuals say of the model, test by test."""
 
     def row(name: str, test: Mapping[str, Any]) -> list[object]:
-        tone, word = ("bad", "alarm") if test.get("alarm") else ("good", "passed")
-        chip = Raw(f'<span class="chip {tone}">{word}</span>')
+        chip = ("bad", "alarm") if test.get("alarm") else ("good", "passed")
         statistic, p = number(test.get("statistic")), number(test.get("p"), 2)
-        tested = chip if is_number(test.get("p")) else MISSING
+        tested = Cell(chip=chip) if is_number(test.get("p")) else MISSING
         return [_TESTS.get(name, name), statistic, p, tested, test.get("text")]
 
     return table(
@@ -95,65 +50,51 @@ def _tests(tests: Mapping[str, Any]) -> Raw:
     )
 
 
-def noise_and_misfit(summary: Summary) -> Raw:
+def noise_and_misfit(summary: Summary) -> Section:
     """The noise of every channel, and what the model leaves unexplained."""
     noise, misfit = summary.get("noise"), summary.get("misfit")
-    parts: list[str] = []
-    if isinstance(noise, Mapping) and noise:
+    stated = {}
+    if isinstance(noise, Mapping):
         stated = {
             name: sd
             if isinstance(sd, Mapping)
             else {"sd": sd, "unit": unit_text(unit_of(summary, name)) or "1"}
             for name, sd in noise.items()
         }
-        parts += [Raw("<h3>Noise</h3>\n"), records(stated, "channel")]
-    if isinstance(misfit, Mapping):
-        parts.append(Raw("<h3>Misfit</h3>\n"))
-        if misfit.get("verdict"):
-            parts.append(paragraph(misfit["verdict"]))
-        if misfit.get("tests"):
-            parts.append(_tests(misfit["tests"]))
-        parts.append(listing(map(_sentence, misfit.get("noise") or ())))
-    elif misfit:
-        parts.append(Raw("<h3>Misfit</h3>\n"))
-        parts.append(listing(map(_sentence, misfit)))
-    return section("misfit", "Noise and misfit", *parts)
+    if not stated and not misfit:
+        return None
+    about = misfit if isinstance(misfit, Mapping) else {"noise": misfit}
+    tests: Mapping[str, Any] = about.get("tests") or {}
+    return {
+        "noise": records(stated, "channel") if stated else None,
+        "asked": bool(misfit),
+        "verdict": about.get("verdict"),
+        "tests": _tests(tests) if tests else None,
+        "notes": list(map(_sentence, about.get("noise") or ())),
+    }
 
 
-def calibration(summary: Summary, arrays: Arrays) -> Raw:
+def calibration(summary: Summary, arrays: Arrays) -> Section:
     """How many held-out measurements lie in the bands, level by level."""
     prefix = "calibration/share/"
     names = [key[len(prefix) :] for key in arrays if key.startswith(prefix)]
     if not names:
-        return Raw("")
+        return None
     about = (summary.get("held_out") or summary).get("calibration") or {}
     counted = (
         f"{number(about.get('windows'))} forecasts over {number(about.get('horizon'))} "
         f"s, judged by {about.get('blocks') or 'none'}"
     )
     drawings = [_curve_of_shares(arrays, name, i) for i, name in enumerate(names)]
-    return section(
-        "calibration",
-        "Calibration",
-        paragraph(about.get("text") or ""),
-        cards(drawings, "wide"),
-        paragraph(
-            "How often a band held the measurement, against how often it should: below "
-            "the line bands are too narrow, above it too wide. "
-            f"{counted}. Of 100 forecasts with the right spread, 95 stay in the shade "
-            "at all levels and in all channels; with fewer than eight independent "
-            "blocks of windows there is none.",
-            "soft",
-        ),
-    )
+    return {"text": about.get("text"), "curves": drawings, "counted": counted}
 
 
-def _curve_of_shares(arrays: Arrays, name: str, index: int) -> Raw:
+def _curve_of_shares(arrays: Arrays, name: str, index: int) -> Markup:
     """One channel's calibration curve, with its simultaneous band and the diagonal."""
     levels = np.asarray(arrays["calibration/level"], float)
     share = np.asarray(arrays[f"calibration/share/{name}"], float)
     low, high = (arrays.get(f"calibration/{end}/{name}") for end in ("low", "high"))
-    ends, css = (0.0, 1.0), _COLOURS[index % 6]
+    ends, css = (0.0, 1.0), COLOURS[index % 6]
     axes = svg.Axes(ends, ends, 440.0, 340.0, x_label="stated share")
     marks = [svg.line(axes, np.array(ends), np.array(ends), "quiet")]
     if low is not None and high is not None:
@@ -161,16 +102,15 @@ def _curve_of_shares(arrays: Arrays, name: str, index: int) -> Raw:
         outside = (share < low) | (share > high)
         marks.append(svg.dots(axes, levels[outside], share[outside], css))
     marks.append(svg.line(axes, levels, share, css))
-    return svg.chart(axes, marks, title=name, unit="share inside the band")
+    said = ", ".join(
+        f"of the {percent(a)} band {percent(b)}"
+        for a, b in zip(levels, share, strict=True)
+        if a in (levels[0], levels[-1])
+    )
+    return svg.chart(axes, marks, title=name, said=said, unit="share inside the band")
 
 
-def _with_unit(summary: Summary, channel: str) -> Raw:
-    """A channel's name and the unit of its errors."""
-    unit = unit_text(unit_of(summary, channel))
-    return Raw(f'{name_text(channel)} <span class="soft">{esc(unit)}</span>')
-
-
-def _by_channel(summary: Summary) -> Raw:
+def _by_channel(summary: Summary) -> Table:
     """Errors and coverage with a row per channel and a line for the pooled ones."""
     known = {
         "open_loop_rmse": "error at the horizon",
@@ -187,21 +127,21 @@ def _by_channel(summary: Summary) -> Raw:
         per_channel = value if isinstance(value, Mapping) else {"all": value}
         for channel, x in per_channel.items():
             if is_number(x):
-                shown = percent(x) if key in _SHARES else number(x)
-                rows.setdefault(str(channel), {})[words] = shown
-    if not rows:
-        return Raw("")
+                text = percent(x) if key in SHARES else number(x)
+                rows.setdefault(str(channel), {})[words] = text
     used = [w for w in known.values() if any(w in row for row in rows.values())]
-    return table(
-        ["channel", *used],
-        [[_with_unit(summary, c), *(row.get(w, "") for w in used)]
-         for c, row in rows.items()],
-        words=(0,),
-        cards=True,
-    )  # fmt: skip
+    units = {channel: unit_text(unit_of(summary, channel)) for channel in rows}
+    named = [
+        [Cell(name=channel, unit=units[channel]), *(row.get(w, "") for w in used)]
+        for channel, row in rows.items()
+    ]
+    return table(["channel", *used], named, words=(0,), cards=True)
 
 
-def _curve(summary: Summary, arrays: Arrays, channel: str, methods: list[str]) -> Raw:
+def _curve(
+    summary: Summary, arrays: Arrays, channel: str, methods: list[str]
+) -> Markup:
+    """Each method's error of one channel against the horizon."""
     horizon = np.asarray(arrays["curve/horizon"], dtype=float)
     curves = {
         method: np.asarray(arrays[f"curve/{method}/{channel}"], dtype=float)
@@ -213,89 +153,77 @@ def _curve(summary: Summary, arrays: Arrays, channel: str, methods: list[str]) -
         svg.span(horizon, margin=0.0), (0.0, top), 440.0, 230.0, x_label="horizon, s"
     )
     marks = [
-        svg.line(axes, horizon, curve, _COLOURS[methods.index(method) % 6])
+        svg.line(axes, horizon, curve, COLOURS[methods.index(method) % 6])
         for method, curve in reversed(curves.items())
     ]
-    unit = unit_of(summary, channel)
-    return svg.chart(axes, marks, title=channel, unit=unit)
+    unit, last = unit_of(summary, channel), horizon[-1:]
+    said = ", ".join(f"{m} {number(c[-1])}" for m, c in curves.items() if len(c))
+    said = f"errors after {number(last[0])} s: {said}" if len(last) else "no errors"
+    return svg.chart(axes, marks, title=channel, said=said, unit=unit)
 
 
-def held_out(summary: Summary, arrays: Arrays) -> Raw:
+def held_out(summary: Summary, arrays: Arrays) -> Section:
     """Prediction of what the model was not shown.
 
     Of a run that was fitted, its own section "held_out"; else the run is about nothing
     else.
     """
     about = summary.get("held_out") or summary
-    figures: list[str] = []
-    methods: list[str] = []
-    if "curve/horizon" in arrays:
-        pairs = [
-            key.split("/", 2)[1:] for key in arrays
-            if key.startswith("curve/") and key.count("/") >= 2
-        ]  # fmt: skip
-        methods = list(dict.fromkeys(method for method, _ in pairs))
-        channels = list(dict.fromkeys(channel for _, channel in pairs))
-        figures = [_curve(summary, arrays, channel, methods) for channel in channels]
+    pairs = [
+        key.split("/", 2)[1:]
+        for key in (arrays if "curve/horizon" in arrays else ())
+        if key.startswith("curve/") and key.count("/") >= 2
+    ]
+    methods = list(dict.fromkeys(method for method, _ in pairs))
+    channels = list(dict.fromkeys(channel for _, channel in pairs))
     numbers = _by_channel({"units": summary.get("units")} | dict(about))
-    horizon = about.get("horizon")
-    windows = about.get("windows")
-    unseen = forecasts(summary, arrays, "unseen")
     facts = []
-    if is_number(horizon):
-        facts.append(f"horizon {number(horizon)} s")
-    if is_number(windows):
-        facts.append(f"{number(windows)} windows")
-    return section(
-        "heldout",
-        "Prediction of held-out data",
-        paragraph(about["text"]) if about.get("text") else "",
-        paragraph(", ".join(facts), "soft") if facts and numbers else "",
-        numbers,
-        Raw("<h3>Error against horizon</h3>\n" if figures else ""),
-        legend([(_COLOURS[i % 6], m) for i, m in enumerate(methods)])
-        if figures
-        else "",
-        cards(figures, "wide"),
-        Raw("<h3>Forecasts</h3>\n") + unseen if unseen else "",
-    )
+    if is_number(about.get("horizon")):
+        facts.append(f"horizon {number(about['horizon'])} s")
+    if is_number(about.get("windows")):
+        facts.append(f"{number(about['windows'])} windows")
+    found = {
+        "text": about.get("text"),
+        "facts": ", ".join(facts) if numbers.rows else "",
+        "channels": numbers if numbers.rows else None,
+        "curves": [_curve(summary, arrays, channel, methods) for channel in channels],
+        "forecasts": forecasts(summary, arrays, "unseen"),
+    }
+    keys = [(COLOURS[i % 6], m) for i, m in enumerate(methods)]
+    return found | {"legend": keys} if any(found.values()) else None
 
 
-def extra_tables(summary: Summary) -> Raw:
+def extra_tables(summary: Summary) -> list[dict[str, Any]]:
     """Further tables of a run: a list of {title, columns, rows, note}."""
-    parts: list[str] = []
+    parts = []
     for entry in summary.get("tables") or ():
-        rows: Iterable[Sequence[object]] = entry.get("rows") or ()
-        shown = [[_cell("", cell) for cell in row] for row in rows]
+        rows = entry.get("rows") or ()
         words = [
             i
             for i in range(len(entry["columns"]))
-            if any(isinstance(row[i], str) for row in entry.get("rows") or ())
+            if any(isinstance(row[i], str) for row in rows)
         ]
-        parts.append(Raw(f"<h3>{esc(entry.get('title', ''))}</h3>\n"))
-        parts.append(table(entry["columns"], shown, words=words))
-        if entry.get("note"):
-            parts.append(paragraph(entry["note"], "soft"))
-    return section("tables", "More numbers", *parts)
+        cells = [[shown("", cell) for cell in row] for row in rows]
+        drawn = table(entry["columns"], cells, words=words)
+        title = entry.get("title", "")
+        parts.append({"title": title, "table": drawn, "note": entry.get("note")})
+    return parts
 
 
-def claims(summary: Summary) -> Raw:
+def claims(summary: Summary) -> Table | None:
     """What a reproduction claims, and whether it holds here."""
     rows = [
-        (
-            Raw(f"<b>{esc(name.replace('_', ' '))}</b>"),
-            Raw('<span class="chip good">holds</span>')
-            if entry.get("holds")
-            else Raw('<span class="chip bad">does not hold</span>'),
-            _cell("", entry.get("figure")),
-            Raw(f'<span class="why">{esc(entry.get("text") or "")}</span>'),
-        )
+        [
+            Cell(name=name.replace("_", " ")),
+            Cell(
+                chip=("good", "holds")
+                if entry.get("holds")
+                else ("bad", "does not hold")
+            ),
+            shown("", entry.get("figure")),
+            Cell(why=entry.get("text") or ""),
+        ]
         for name, entry in (summary.get("claims") or {}).items()
     ]
-    if not rows:
-        return Raw("")
-    return section(
-        "claims",
-        "Claims",
-        table(["claim", "", "figure", ""], rows, words=(0, 1, 3), cards=True),
-    )
+    columns = ["claim", "", "figure", ""]
+    return table(columns, rows, words=(0, 1, 3), cards=True) if rows else None

@@ -5,23 +5,17 @@ import shlex
 from collections.abc import Mapping
 from typing import Any
 
+from markupsafe import Markup
+
 from sim2gp.reports import data, parameters
 from sim2gp.reports.animation import player
 from sim2gp.reports.experiment import experiment
-from sim2gp.reports.glance import glance, has_glance, unique
-from sim2gp.reports.markup import (
-    Raw,
-    asset,
-    duration,
-    esc,
-    is_number,
-    number,
-    page,
-    paragraph,
-    section,
-)
-from sim2gp.reports.parameters import Arrays, Summary
+from sim2gp.reports.glance import glance, unique
+from sim2gp.reports.numbers import duration, is_number, number
+from sim2gp.reports.parameters import Arrays, Section, Summary
 from sim2gp.reports.returns import returns
+from sim2gp.reports.tables import Table
+from sim2gp.reports.template import asset, render
 from sim2gp.reports.traces import traces
 
 #: Plain numbers of the summary that belong at the top, where present.
@@ -78,44 +72,22 @@ def _problems(summary: Summary) -> list[tuple[str, str]]:
     return unique(found)
 
 
-def _status(summary: Summary) -> Raw:
+def _status(summary: Summary) -> dict[str, Any]:
     """The box at the top: what went wrong, or that nothing did."""
-    problems = _problems(summary)
-    if not problems:
-        good = "Converged. " if summary.get("converged") else ""
-        text = f"{good}No warnings."
-        return Raw(f'<div class="status"><p><strong>{text}</strong></p></div>\n')
-    tone = "bad" if any(weight == "bad" for weight, _ in problems) else "warn"
-    items = "".join(f"<li>{esc(words)}</li>" for _, words in problems)
-    title = "Read this first" if tone == "bad" else "Keep in mind"
-    return Raw(
-        f'<div class="status {tone}"><p><strong>{title}</strong></p>'
-        f"<ul>{items}</ul></div>\n"
-    )
+    found = _problems(summary)
+    return {
+        "problems": [words for _, words in found],
+        "tone": "bad" if any(weight == "bad" for weight, _ in found) else "warn",
+        "converged": bool(summary.get("converged")),
+    }
 
 
-def _learned(summary: Summary) -> str:
-    """What was learned, whether to believe it, and how far it predicts."""
-    said = [str(summary["headline"])] if summary.get("headline") else []
-    misfit, unseen = summary.get("misfit"), summary.get("held_out")
-    if (
-        isinstance(misfit, Mapping)
-        and misfit.get("verdict")
-        and not misfit.get("alarm")
-    ):
-        said.append(str(misfit["verdict"]))
-    if isinstance(unseen, Mapping) and unseen.get("headline"):
-        said.append(str(unseen["headline"]))
-    return " ".join(filter(None, said))
-
-
-def _made(summary: Summary) -> Raw:
+def _made(summary: Summary) -> Section:
     """Command line, size, time and versions."""
     rows: list[tuple[str, object]] = []
     line = summary.get("command_line")
-    if line:
-        text = line if isinstance(line, str) else shlex.join(map(str, line))
-        rows.append(("command", Raw(f"<code>{esc(text)}</code>")))
+    if line and not isinstance(line, str):
+        line = shlex.join(map(str, line))
     for key, words in _FACTS.items():
         if is_number(summary.get(key)):
             rows.append((words, number(summary[key], 4)))
@@ -134,19 +106,17 @@ def _made(summary: Summary) -> Raw:
     versions = summary.get("versions") or {}
     if versions:
         rows.append(("versions", ", ".join(f"{n} {v}" for n, v in versions.items())))
-    inner = "".join(f"<dt>{esc(k)}</dt><dd>{esc(v)}</dd>\n" for k, v in rows)
-    facts = Raw(f'<dl class="facts">\n{inner}</dl>\n' if inner else "")
-    return section("made", "How this was made", facts)
+    return {"command": line, "rows": rows} if line or rows else None
 
 
-def _machine(summary: Summary, arrays: Arrays) -> Raw:
+def _machine(summary: Summary, arrays: Arrays) -> Section:
     about, state = summary.get("animation"), arrays.get("animation/state")
     if not about or state is None or len(state) < 2:
-        return Raw("")
-    return section("machine", "The machine", player(about, arrays))
+        return None
+    return player(about, arrays)
 
 
-def _figure(summary: Summary, arrays: Arrays) -> Raw:
+def _figure(summary: Summary, arrays: Arrays) -> Section:
     """The paper's figure that this run reproduces."""
     from sim2gp.reports.figure1 import figure1, figure_bytes
     from sim2gp.reports.figure2 import figure2
@@ -177,29 +147,52 @@ def _figure(summary: Summary, arrays: Arrays) -> Raw:
             "shown. Lines are medians over seeds, shades quartiles."
         )
     else:
-        return Raw("")
+        return None
     code = base64.b64encode(figure_bytes(drawn, "png")).decode("ascii")
-    return section(
-        name.lower().replace(" ", ""),
-        name,
-        Raw(
-            f'<div class="picture"><img alt="{name}: {words}" '
-            f'src="data:image/png;base64,{code}"></div>\n'
+    return {"title": name, "alt": f"{name}: {words}", "png": code, "more": more}
+
+
+def _sections(summary: Summary, arrays: Arrays) -> list[dict[str, Any]]:
+    """What there is to show, in the order in which a reader asks for it."""
+    figure, flown = _figure(summary, arrays), returns(summary, arrays)
+    machine = ("machine", "The machine", _machine(summary, arrays))
+    title = figure["title"] if figure else ""
+    found: list[tuple[str, str, Any]] = [
+        ("claims", "Claims", data.claims(summary)),
+        ("figure", title, figure),
+        *([machine] if flown else []),
+        ("returns", "Returns", flown),
+        ("experiment", "The experiment", experiment(summary, arrays)),
+        ("parameters", "Parameters", parameters.parameter_table(summary)),
+        ("directions", "Combinations", parameters.directions(summary)),
+        ("misfit", "Noise and misfit", data.noise_and_misfit(summary)),
+        ("heldout", "Prediction of held-out data", data.held_out(summary, arrays)),
+        ("calibration", "Calibration", data.calibration(summary, arrays)),
+        *([] if flown else [machine]),
+        ("traces", "Measured against simulated", traces(summary, arrays)),
+        (
+            "densities",
+            "Before and after the data",
+            parameters.parameter_densities(summary, arrays),
         ),
-        paragraph(more, "soft"),
-    )
-
-
-def _contents(sections: list[Raw]) -> Raw:
-    """Links to the sections that are there."""
-    links = []
-    for text in sections:
-        if not text:
-            continue
-        anchor = text.split('id="', 1)[1].split('"', 1)[0]
-        title = text.split("<h2>", 1)[1].split("</h2>", 1)[0]
-        links.append(f'<a href="#{anchor}">{title}</a>')
-    return Raw(f"<nav>{' '.join(links)}</nav>\n" if len(links) > 2 else "")
+        (
+            "correlation",
+            "What moves together",
+            parameters.correlations(summary, arrays),
+        ),
+        ("tables", "More numbers", data.extra_tables(summary)),
+        ("made", "How this was made", _made(summary)),
+    ]
+    return [
+        {
+            "kind": kind,
+            "anchor": title.lower().replace(" ", "") if kind == "figure" else kind,
+            "title": title,
+            "about": about,
+        }
+        for kind, title, about in found
+        if about
+    ]
 
 
 def write_report(summary: Summary, arrays: Arrays) -> str:
@@ -207,37 +200,27 @@ def write_report(summary: Summary, arrays: Arrays) -> str:
 
     A section is drawn only if its data are there; the same input gives the same bytes.
     """
-    moved, flown = _machine(summary, arrays), returns(summary, arrays)
-    sections = [
-        data.claims(summary),
-        _figure(summary, arrays),
-        *((moved, flown) if flown else ()),
-        experiment(summary, arrays),
-        parameters.parameter_table(summary),
-        parameters.directions(summary),
-        data.noise_and_misfit(summary),
-        data.held_out(summary, arrays),
-        data.calibration(summary, arrays),
-        *(() if flown else (moved,)),
-        traces(summary, arrays),
-        parameters.parameter_densities(summary, arrays),
-        parameters.correlations(summary, arrays),
-        data.extra_tables(summary),
-        _made(summary),
-    ]
+    sections = _sections(summary, arrays)
     name = f"sim2gp {summary.get('command') or 'run'}"
-    learned = "" if has_glance(summary) else _learned(summary)
-    body = "".join(
-        [
-            f"<header>\n<h1>{esc(summary.get('title') or name)}</h1>\n",
-            _status(summary),
-            paragraph(learned, "lead") if learned else "",
-            glance(summary) if has_glance(summary) else "",
-            _contents(sections),
-            "</header>\n",
-            *sections,
-        ]
+    answers = glance(summary)
+    scripts = [asset("player.js")] * any(x["kind"] == "machine" for x in sections)
+    scripts += [asset("tables.js")] * any(_has_table(x["about"]) for x in sections)
+    return render(
+        "page.html",
+        name=name,
+        title=summary.get("title") or name,
+        style=Markup(asset("page.css")),
+        script=Markup("".join(scripts)),
+        status=_status(summary),
+        headline="" if answers else summary.get("headline"),
+        glance=answers,
+        sections=sections,
     )
-    script = asset("player.js") if 'class="player"' in body else ""
-    script += asset("tables.js") if "<table" in body else ""
-    return page(name, body, script)
+
+
+def _has_table(about: Any) -> bool:
+    """Whether a section shows a table."""
+    if isinstance(about, Table):
+        return bool(about.rows)
+    parts = about.values() if isinstance(about, dict) else about
+    return isinstance(about, dict | list) and any(map(_has_table, parts))

@@ -6,17 +6,17 @@ from typing import Any
 import numpy as np
 
 from sim2gp.reports import svg
-from sim2gp.reports.markup import Raw, cards, paragraph, section
-from sim2gp.reports.parameters import Arrays, Summary
+from sim2gp.reports.numbers import number
+from sim2gp.reports.parameters import Arrays, Section, Summary
 
 _SIZE = 420.0, 190.0
 NEAR = 0.5  # of a chart's height: limits no farther from the motion are drawn
 
 
-def experiment(summary: Summary, arrays: Arrays) -> Raw:
+def experiment(summary: Summary, arrays: Arrays) -> Section:
     """Commands, and the states they should lead to, with the draws' 5 % and 95 %."""
     if "design/time" not in arrays:
-        return Raw("")
+        return None
     t = np.asarray(arrays["design/time"], float)
     units: Mapping[str, Any] = summary.get("units") or {}
 
@@ -42,19 +42,7 @@ def experiment(summary: Summary, arrays: Arrays) -> Raw:
         else ""
     )
     kept += _said(summary)
-    return section(
-        "experiment",
-        "The experiment",
-        paragraph(kept) if kept else "",
-        Raw("<h3>Commands</h3>\n"),
-        cards(commands, "wide"),
-        Raw("<h3>Expected motion</h3>\n"),
-        cards(states, "wide"),
-        paragraph(
-            "Shades hold nine in ten of the machines drawn; level lines are limits.",
-            "soft",
-        ),
-    )
+    return {"kept": kept, "commands": commands, "states": states}
 
 
 def _said(summary: Summary) -> str:
@@ -81,4 +69,6 @@ def _chart(
     if len(values) == 3:
         marks.append(svg.band(axes, t, values[1], values[2], "c1"))
     marks.append(svg.line(axes, t, values[0], "c1"))
-    return svg.chart(axes, marks, title=name, unit=unit)
+    ends = (number(float(end(values[0]))) for end in (np.nanmin, np.nanmax))
+    said = f"from {' to '.join(ends)} over {number(float(t[-1] - t[0]))} s"
+    return svg.chart(axes, marks, title=name, said=said, unit=unit)

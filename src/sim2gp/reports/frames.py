@@ -19,12 +19,3 @@ def pictures(about: Mapping[str, Any], arrays: Arrays) -> str:
     coded = [base64.b64encode(part.tobytes()).decode("ascii") for part in parts]
     apart = float(about["dt"]) * int(about["frames"]["every"])
     return f',"apart":{apart:.6g},"frames":{json.dumps(coded, separators=(",", ":"))}'
-
-
-def canvas(about: Mapping[str, Any]) -> str:
-    """Where the frames are shown, once they are there."""
-    size = about.get("frames")
-    if not size:
-        return ""
-    width, height = int(size["width"]), int(size["height"])
-    return f'<canvas class="stage" width="{width}" height="{height}" hidden></canvas>\n'

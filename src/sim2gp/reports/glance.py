@@ -4,27 +4,27 @@ from collections.abc import Mapping, Sequence
 from statistics import median
 from typing import Any
 
-from sim2gp.reports.markup import Raw, esc, number
+from sim2gp.reports.numbers import number
 
 Summary = Mapping[str, Any]
 MANY = 4  # names that a sentence lists
 
 
-def glance(summary: Summary) -> Raw:
-    """What was learned, how sure, does it predict, what is missing, what next."""
-    found = {
-        "What was learned": summary.get("headline"),
+def glance(summary: Summary) -> dict[str, str]:
+    """What was learned, how sure, does it predict, what is missing, what next.
+
+    Nothing where the run is not an identification that came to its end.
+    """
+    finished = summary.get("command") == "identify" and not summary.get("first_answer")
+    if not finished or not _entries(summary):
+        return {}
+    return {
+        "What was learned": str(summary.get("headline") or ""),
         "How sure": _sure(summary),
         "Does it predict": _predicts(summary),
         "What is missing": _missing(summary),
         "What next": _next(summary),
     }
-    rows = "".join(
-        f"<dt>{question}</dt><dd>{esc(answer)}</dd>\n"
-        for question, answer in found.items()
-        if answer
-    )
-    return Raw(f'<dl class="glance">\n{rows}</dl>\n')
 
 
 def _entries(summary: Summary) -> Mapping[str, Mapping[str, Any]]:
@@ -63,7 +63,7 @@ def _predicts(summary: Summary) -> str:
 
 
 def _missing(summary: Summary) -> str:
-    """What the residuals say; the corrected intervals may name effects."""
+    """What the residuals say of the model."""
     misfit = summary.get("misfit") or {}
     if misfit.get("alarm"):
         return "Something: the residuals contradict the model, as said above."
@@ -96,12 +96,6 @@ def _listed(names: Sequence[str]) -> str:
     shown = ", ".join(names[:MANY])
     rest = len(names) - MANY
     return f"{shown} and {number(rest)} more" if rest > 0 else shown
-
-
-def has_glance(summary: Summary) -> bool:
-    """Whether the run is an identification that came to its end."""
-    finished = summary.get("command") == "identify" and not summary.get("first_answer")
-    return finished and bool(_entries(summary))
 
 
 def unique(problems: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:

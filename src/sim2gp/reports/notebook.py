@@ -9,6 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from sim2gp.reports.document import write_report
+from sim2gp.reports.template import render
 from sim2gp.runs import load_run as loaded
 
 
@@ -44,14 +45,8 @@ class Shown:
 def brief(summary: Mapping[str, Any]) -> str:
     """What a notebook shows of a result: its headline, and its main table."""
     columns, rows = _main_table(summary)
-    head = "".join(f"<th>{html.escape(str(c))}</th>" for c in columns)
-    body = "".join(
-        "<tr>" + "".join(f"<td>{html.escape(str(x))}</td>" for x in row) + "</tr>"
-        for row in rows
-    )
-    said = html.escape(str(summary.get("headline") or summary.get("title") or ""))
-    table = f"<thead><tr>{head}</tr></thead><tbody>{body}</tbody>" if rows else ""
-    return f"<p>{said}</p><table>{table}</table>" if table else f"<p>{said}</p>"
+    said = summary.get("headline") or summary.get("title") or ""
+    return render("brief.html", said=said, columns=columns, rows=rows)
 
 
 def _main_table(summary: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:

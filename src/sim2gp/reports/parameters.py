@@ -4,28 +4,23 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup, escape
 
 from sim2gp.reports import densities, svg
-from sim2gp.reports.markup import (
+from sim2gp.reports.numbers import (
     MISSING,
-    Raw,
-    cards,
-    esc,
     interval,
     is_number,
-    legend,
-    listing,
-    name_text,
     number,
-    paragraph,
     plus_minus,
-    section,
-    table,
     unit_text,
 )
+from sim2gp.reports.tables import Cell, table
 
 Summary = Mapping[str, Any]
 Arrays = Mapping[str, np.ndarray]
+#: What the template needs of a section; None where the run has nothing for it.
+Section = dict[str, Any] | None
 
 #: What each verdict of contracts.md means, and how serious it is.
 VERDICTS = {
@@ -38,32 +33,28 @@ VERDICTS = {
 }
 
 
-def verdict_chip(verdict: object) -> Raw:
-    """The verdict in its colour."""
+def verdict_chip(verdict: object) -> tuple[str, str]:
+    """The verdict's tone and its words."""
     tone, _ = VERDICTS.get(str(verdict), ("warn", ""))
-    words = str(verdict or MISSING).replace("_", " ")
-    return Raw(f'<span class="chip {tone}">{esc(words)}</span>')
+    return tone, str(verdict or MISSING).replace("_", " ")
 
 
-def _remaining(entry: Mapping[str, Any]) -> Raw:
+def _remaining(entry: Mapping[str, Any]) -> Cell:
     """How much of the prior's spread is left, as a bar and a percentage."""
     sd, before = entry.get("sd"), entry.get("prior_sd")
     if not (is_number(sd) and is_number(before)) or not float(before) > 0:  # type: ignore[arg-type]
-        return Raw(MISSING)
+        return Cell(MISSING)
     share = float(sd) / float(before)  # type: ignore[arg-type]
     text = f"{number(100 * share, 2)} %" if share < 0.1 else f"{100 * share:.0f} %"
-    width = f"{100 * min(share, 1.0):.0f}%"
-    return Raw(f'<span class="bar"><i style="width:{width}"></i></span>{text}')
+    return Cell(text, share=f"{100 * min(share, 1.0):.0f}%")
 
 
-def _interval(entry: Mapping[str, Any]) -> Raw:
+def _interval(entry: Mapping[str, Any]) -> Cell:
     """The run's interval; below it the plain one, where that is another."""
-    text = esc(interval(entry.get("q025"), entry.get("q975")))
-    plain = entry.get("plain")
+    text, plain = interval(entry.get("q025"), entry.get("q975")), entry.get("plain")
     if not isinstance(plain, Mapping):
-        return Raw(text)
-    below = esc(interval(plain.get("q025"), plain.get("q975")))
-    return Raw(f'{text}<span class="why">plain: {below}</span>')
+        return Cell(text)
+    return Cell(text, why=f"plain: {interval(plain.get('q025'), plain.get('q975'))}")
 
 
 def _row(name: str, entry: Mapping[str, Any], truth: bool) -> list[object]:
@@ -71,10 +62,8 @@ def _row(name: str, entry: Mapping[str, Any], truth: bool) -> list[object]:
     why = entry.get("note") or VERDICTS.get(str(verdict), ("", ""))[1]
     if verdict == "identified":  # its note says by how much, as "spread left" does
         why = VERDICTS["identified"][1]
-    meaning = entry.get("meaning") or ""
-    below = f'<span class="why">{esc(meaning)}</span>' if meaning else ""
     row: list[object] = [
-        Raw(f"{name_text(name)}{below}"),
+        Cell(name=name, why=entry.get("meaning") or ""),
         unit_text(entry.get("unit")) or "1",
         plus_minus(entry.get("prior_mean"), entry.get("prior_sd")),
         plus_minus(entry.get("mean"), entry.get("sd")),
@@ -83,41 +72,24 @@ def _row(name: str, entry: Mapping[str, Any], truth: bool) -> list[object]:
     ]
     if truth:
         row.append(number(entry.get("truth"), 4))
-    return [
-        *row,
-        Raw(f'{verdict_chip(verdict)}<span class="why">{esc(why)}</span>'),
-    ]
+    return [*row, Cell(chip=verdict_chip(verdict), why=why)]
 
 
-def parameter_table(summary: Summary) -> Raw:
+def parameter_table(summary: Summary) -> Section:
     """Prior, posterior and verdict of every parameter."""
     entries: Mapping[str, Any] = summary.get("parameters") or {}
     if not entries:
-        return Raw("")
+        return None
     truth = any(is_number(entry.get("truth")) for entry in entries.values())
     columns = ["parameter", "unit", "prior", "posterior", "95 % interval"]
     columns += ["spread left", *(["truth"] if truth else []), "verdict"]
     rows = [_row(name, entry, truth) for name, entry in entries.items()]
-    last = len(columns) - 1
-    return section(
-        "parameters",
-        "Parameters",
-        paragraph(
-            "Mean ± standard deviation in physical units, before and after the data. "
-            "“Spread left” is the posterior's standard deviation as a share of the "
-            "prior's.",
-            "soft",
-        ),
-        *(_said(summary.get(key)) for key in ("intervals", "longer", "check", "nuts")),
-        table(columns, rows, words=(0, 1, last), cards=True),
-    )
-
-
-def _said(about: object) -> Raw:
-    """Which intervals these are; what --longer, --check and --nuts found beside."""
-    if not isinstance(about, Mapping) or not about.get("text"):
-        return Raw("")
-    return paragraph(about["text"])
+    # Which intervals these are; what --longer, --check and --nuts found.
+    about = [summary.get(key) for key in ("intervals", "longer", "check", "nuts")]
+    return {
+        "said": [x.get("text") for x in about if isinstance(x, Mapping)],
+        "table": table(columns, rows, words=(0, 1, len(columns) - 1), cards=True),
+    }
 
 
 def _area(axes: svg.Axes, draws: np.ndarray, axis: densities.View, css: str) -> str:
@@ -136,13 +108,13 @@ def _density(
     entry: Mapping[str, Any],
     prior: np.ndarray | None,
     posterior: np.ndarray,
-) -> Raw:
+) -> Section:
     """One parameter before and after the data."""
     truth = float(entry["truth"]) if is_number(entry.get("truth")) else None
     clouds = [posterior] if prior is None else [prior, posterior]
     axis = densities.view(clouds, entry.get("low"), entry.get("high"), truth)
     if axis is None:
-        return Raw("")
+        return None
     axes = svg.Axes(
         (axis.low, axis.high), (0.0, 1.12), height=150.0, log_x=axis.log, y_labels=False
     )
@@ -154,20 +126,24 @@ def _density(
     if truth is not None and is_number(entry.get("sd")) and float(entry["sd"]) > 0:
         away = (float(entry["mean"]) - truth) / float(entry["sd"])
         caption += f"; truth {number(truth, 4)}, {abs(away):.1f} sd away"
+    before = plus_minus(entry.get("prior_mean"), entry.get("prior_sd"))
+    said = f"{before} before the data, {caption} after"
     unit = unit_text(entry.get("unit"))
-    chip = verdict_chip(entry["verdict"]) if entry.get("verdict") else ""
-    drawing = svg.chart(axes, marks, title=name, unit=unit)
-    return Raw(f"{drawing}<figcaption>{esc(caption)} {chip}</figcaption>")
+    return {
+        "drawing": svg.chart(axes, marks, title=name, said=said, unit=unit),
+        "caption": caption,
+        "chip": verdict_chip(entry["verdict"]) if entry.get("verdict") else None,
+    }
 
 
-def parameter_densities(summary: Summary, arrays: Arrays) -> Raw:
+def parameter_densities(summary: Summary, arrays: Arrays) -> Section:
     """A drawing per parameter: the prior, the posterior, the truth where known."""
     entries: Mapping[str, Any] = summary.get("parameters") or {}
     samples = arrays.get("parameters/samples")
     if samples is None or not entries:
-        return Raw("")
+        return None
     before = arrays.get("parameters/prior_samples")
-    figures = [
+    drawn = [
         _density(name, entry, None if before is None else before[:, i], samples[:, i])
         for i, (name, entry) in enumerate(entries.items())
     ]
@@ -175,13 +151,7 @@ def parameter_densities(summary: Summary, arrays: Arrays) -> Raw:
     keys.append(("c0", "posterior"))
     if any(is_number(entry.get("truth")) for entry in entries.values()):
         keys.append(("truth", "truth"))
-    return section(
-        "densities",
-        "Before and after the data",
-        legend(keys),
-        cards(figure for figure in figures if figure),
-        paragraph("Every curve is scaled to its own peak.", "soft"),
-    )
+    return {"legend": keys, "drawn": [each for each in drawn if each]}
 
 
 def _square(x: float, y: float, cell: float, r: float) -> str:
@@ -201,7 +171,7 @@ def _square(x: float, y: float, cell: float, r: float) -> str:
     )
 
 
-def _matrix(names: list[str], correlation: np.ndarray) -> Raw:
+def _matrix(names: list[str], correlation: np.ndarray) -> Markup:
     """The correlations as coloured squares with their numbers in per cent."""
     count = len(names)
     cell = 34.0 if count <= 14 else 20.0
@@ -216,75 +186,71 @@ def _matrix(names: list[str], correlation: np.ndarray) -> Raw:
         if i > 0:
             parts.append(
                 f'<text x="{side - 8:.1f}" y="{y + cell / 2 + 4:.1f}" '
-                f'text-anchor="end">{esc(name)}</text>'
+                f'text-anchor="end">{escape(name)}</text>'
             )
         if i < count - 1:
             parts.append(
                 f'<text transform="translate({x + cell / 2:.1f} {top - 6:.1f}) '
-                f'rotate(-45)">{esc(name)}</text>'
+                f'rotate(-45)">{escape(name)}</text>'
             )
         for j in range(i):
             r = float(correlation[i, j])
             if np.isfinite(r):
                 parts.append(_square(side + cell * j, y, cell, r))
     height = top + cell * (count - 1) + 4
-    return Raw(
-        f'<div class="scroll"><svg viewBox="0 0 {width:.0f} {height:.0f}" role="img" '
+    return Markup(
+        f'<svg viewBox="0 0 {width:.0f} {height:.0f}" role="img" '
         f'style="max-width:{width:.0f}px;min-width:{min(width, 340):.0f}px" '
-        f'aria-label="posterior correlations">{"".join(parts)}</svg></div>'
+        f'aria-label="{escape(_strongest(names, correlation))}">{"".join(parts)}</svg>'
     )
 
 
-def correlations(summary: Summary, arrays: Arrays) -> Raw:
+def _strongest(names: list[str], correlation: np.ndarray) -> str:
+    """The largest correlation in words."""
+    below = np.tril(np.isfinite(correlation), -1)
+    off = np.where(below, np.abs(correlation), -1.0)  # what is not known never wins
+    i, j = np.unravel_index(int(np.argmax(off)), off.shape)
+    r = number(float(correlation[i, j]), 2)
+    return f"posterior correlations: the strongest is {r}, of {names[i]} and {names[j]}"
+
+
+def correlations(summary: Summary, arrays: Arrays) -> Section:
     """The posterior's correlation matrix."""
     entries: Mapping[str, Any] = summary.get("parameters") or {}
     matrix = arrays.get("parameters/correlation")
     if matrix is None or matrix.shape != (len(entries),) * 2 or len(entries) < 2:
-        return Raw("")
-    return section(
-        "correlation",
-        "What moves together",
-        paragraph(
-            "Posterior correlations in per cent. A strong one means that the data fix "
-            "a combination of the two better than either alone.",
-            "soft",
-        ),
-        _matrix(list(entries), matrix),
-        legend([("c1", "rise together"), ("c0", "one rises, the other falls")]),
-    )
+        return None
+    return {"drawing": _matrix(list(entries), matrix)}
 
 
-def _direction(entry: Mapping[str, Any]) -> Raw:
-    text = entry.get("text") or ""
-    combination = entry.get("combination")
-    parts = [esc(text)]
-    if combination and str(combination) not in str(text):
-        parts.append(f"<code>{esc(combination)}</code>")
-    if is_number(entry.get("information")):
-        parts.append(f'<span class="soft">({number(entry["information"])} nats)</span>')
-    if entry.get("flat"):
-        parts.append('<span class="chip warn">flat</span>')
-    return Raw(" ".join(part for part in parts if part))
+def _direction(entry: Mapping[str, Any]) -> dict[str, Any]:
+    text, combination = entry.get("text") or "", entry.get("combination")
+    told, nats = str(combination) in str(text), entry.get("information")
+    return {
+        "text": text,
+        "combination": None if told else combination,
+        "nats": number(nats) if is_number(nats) else None,
+        "flat": bool(entry.get("flat")),
+    }
 
 
-def directions(summary: Summary) -> Raw:
+def directions(summary: Summary) -> Section:
     """Which combinations of parameters the data fix, and which they leave open."""
     entries = summary.get("directions") or []
     base = summary.get("base_parameters") or []
+    if not entries and not base:
+        return None
     rows = [
-        (
-            name_text(unit_text(entry.get("text"))),
+        [
+            Cell(name=unit_text(entry.get("text"))),
             plus_minus(entry.get("value"), entry.get("sd")),
             unit_text(entry.get("unit")) or "1",
-            verdict_chip(entry.get("verdict")),
-        )
+            Cell(chip=verdict_chip(entry.get("verdict"))),
+        ]
         for entry in base
     ]
     columns = ["combination", "value", "unit", "verdict"]
-    return section(
-        "directions",
-        "Combinations",
-        listing(_direction(entry) for entry in entries),
-        Raw("<h3>Base parameters: what these data do determine</h3>\n" if rows else ""),
-        table(columns, rows, words=(0, 2, 3), cards=True) if rows else "",
-    )
+    return {
+        "found": [_direction(entry) for entry in entries],
+        "base": table(columns, rows, words=(0, 2, 3), cards=True),
+    }

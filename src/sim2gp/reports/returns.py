@@ -5,18 +5,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from sim2gp.reports import svg
-from sim2gp.reports.data import _COLOURS
-from sim2gp.reports.markup import (
-    Raw,
-    esc,
-    is_number,
-    legend,
-    number,
-    paragraph,
-    section,
-    table,
-)
-from sim2gp.reports.parameters import Arrays, Summary
+from sim2gp.reports.data import COLOURS
+from sim2gp.reports.numbers import is_number, number
+from sim2gp.reports.parameters import Arrays, Section, Summary
+from sim2gp.reports.tables import Cell, Table, table
 
 
 def _series(summary: Summary, arrays: Arrays) -> dict[str, np.ndarray]:
@@ -79,27 +71,27 @@ def _scores(summary: Summary, values: np.ndarray) -> tuple[str, str]:
     return number(last), f"{score:.2f}"
 
 
-def _methods(summary: Summary, series: Mapping[str, np.ndarray]) -> Raw:
+def _methods(summary: Summary, series: Mapping[str, np.ndarray]) -> Table:
     rows = []
     for method, values in series.items():
         last, score = _scores(summary, values)
         best = number(float(np.nanmedian(np.nanmax(values, axis=1))))
         reached = _episodes_to_95(summary, method, len(series) == 1)
-        rows.append((Raw(f"<b>{method_name(method)}</b>"), reached, best, last, score))
+        rows.append([Cell(name=method_name(method)), reached, best, last, score])
     columns = ["method", "episodes to 95 %", "best return", "last return", "score"]
     return table(columns, rows, words=(0,), cards=True)
 
 
 def method_name(method: str) -> str:
     """The words for a method's key."""
-    return esc(method.replace("_", " "))
+    return method.replace("_", " ")
 
 
-def returns(summary: Summary, arrays: Arrays) -> Raw:
+def returns(summary: Summary, arrays: Arrays) -> Section:
     """Return of every episode, beside the oracle and doing nothing."""
     series = _series(summary, arrays)
     if not series:
-        return Raw("")
+        return None
     references = {
         words: float(summary[key])
         for key, words in (("oracle_return", "oracle"), ("hang_return", "hanging"))
@@ -115,22 +107,18 @@ def returns(summary: Summary, arrays: Arrays) -> Raw:
         svg.level(axes, value, "quiet", words) for words, value in references.items()
     ]
     for index, values in enumerate(series.values()):
-        marks += _lines(axes, values, _COLOURS[index % len(_COLOURS)])
-    drawing = svg.chart(axes, marks, title="return")
-    keys = [(_COLOURS[i % 6], name.replace("_", " ")) for i, name in enumerate(series)]
-    seeds = max(len(values) for values in series.values())
-    text = (
-        f"{seeds} seeds: the line is their median, the shade their quartiles. "
-        if seeds > 1
-        else ""
+        marks += _lines(axes, values, COLOURS[index % len(COLOURS)])
+    said = "; ".join(
+        f"{method_name(name)} {number(float(np.nanmedian(values[:, 0])))} in the first "
+        f"episode, {number(float(np.nanmedian(values[:, -1])))} in the last"
+        for name, values in series.items()
     )
-    if "oracle" in references and "hanging" in references:
-        text += "Score: 0 is hanging still, 1 is the planner that knows the truth."
-    return section(
-        "returns",
-        "Returns",
-        legend(keys) if len(keys) > 1 else "",
-        Raw(f'<figure class="solo">{drawing}</figure>\n'),
-        _methods(summary, series),
-        paragraph(text, "soft") if text else "",
-    )
+    keys = [(COLOURS[i % 6], method_name(name)) for i, name in enumerate(series)]
+    scored = {"oracle", "hanging"} <= references.keys()
+    return {
+        "legend": keys if len(keys) > 1 else [],
+        "drawing": svg.chart(axes, marks, title="return", said=said),
+        "methods": _methods(summary, series),
+        "seeds": max(len(values) for values in series.values()),
+        "scored": scored,
+    }

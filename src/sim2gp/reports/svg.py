@@ -10,8 +10,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from markupsafe import Markup, escape
 
-from sim2gp.reports.markup import Raw, esc, power_of_ten
+from sim2gp.reports.numbers import power_of_ten
 
 _TOP, _RIGHT = 26.0, 10.0
 _DIGIT_WIDTH = 6.6  # pixels of a digit of the tick labels
@@ -204,7 +205,7 @@ def level(axes: Axes, y: float, css: str, words: str) -> str:
         f'<line class="rule {css}" x1="0" x2="{width:.1f}" y1="{at:.1f}" '
         f'y2="{at:.1f}"/>'
         f'<text class="note" x="{width - 4:.1f}" y="{below:.1f}" '
-        f'text-anchor="end">{esc(words)}</text>'
+        f'text-anchor="end">{escape(words)}</text>'
     )
 
 
@@ -246,7 +247,7 @@ def _frame(axes: Axes) -> str:
     )
     parts.append(
         f'<text class="tick" x="{axes.width - 2:.1f}" y="{axes.height - 6:.1f}" '
-        f'text-anchor="end">{esc(axes.x_label)}</text>'
+        f'text-anchor="end">{escape(axes.x_label)}</text>'
     )
     return "".join(parts)
 
@@ -256,23 +257,27 @@ def chart(
     marks: Sequence[str],
     *,
     title: str,
+    said: str,
     unit: str = "",
     remark: str = "",
-) -> Raw:
-    """A titled chart; `marks` are drawn in their order, cut at the field's edge."""
+) -> Markup:
+    """A titled chart; `marks` are drawn in their order, cut at the field's edge.
+
+    `said` tells what it shows to those who cannot see it.
+    """
     width, height = axes.size
-    words = f"{title} [{unit}]" if unit else title
+    words = f"{title} [{unit}]: {said}" if unit else f"{title}: {said}"
     aside = (
         f'<text class="tick" x="{axes.width - 2:.1f}" y="15" '
-        f'text-anchor="end">{esc(remark)}</text>'
+        f'text-anchor="end">{escape(remark)}</text>'
         if remark
         else ""
     )
-    tail = f'<tspan class="unit"> {esc(unit)}</tspan>' if unit else ""
-    return Raw(
+    tail = f'<tspan class="unit"> {escape(unit)}</tspan>' if unit else ""
+    return Markup(
         f'<svg viewBox="0 0 {axes.width:g} {axes.height:g}" role="img" '
-        f'aria-label="{esc(words)}">'
-        f'<text class="title" x="2" y="15">{esc(title)}{tail}</text>{aside}'
+        f'aria-label="{escape(words)}">'
+        f'<text class="title" x="2" y="15">{escape(title)}{tail}</text>{aside}'
         f"{_frame(axes)}"
         f'<svg x="{axes.left:.1f}" y="{_TOP:g}" width="{width:.1f}" '
         f'height="{height:.1f}">{"".join(marks)}</svg></svg>'

@@ -3,10 +3,11 @@
 from collections.abc import Mapping
 
 import numpy as np
+from markupsafe import Markup
 
 from sim2gp.reports import svg
-from sim2gp.reports.markup import Raw, cards, esc, legend, number, paragraph, section
-from sim2gp.reports.parameters import Arrays, Summary
+from sim2gp.reports.numbers import number
+from sim2gp.reports.parameters import Arrays, Section, Summary
 
 #: Drawings; more would make the page heavy, not clearer.
 _MOST = {"trace": 40, "unseen": 16}
@@ -43,7 +44,7 @@ def unit_of(summary: Summary, channel: str) -> str:
 
 def _trace(
     arrays: Arrays, base: str, channel: str, unit: str, rows: slice, title: str
-) -> Raw:
+) -> Markup:
     time = arrays[f"{base}/time"][rows]
     curves = {
         kind: np.asarray(arrays[f"{base}/{kind}/{channel}"][rows], dtype=float)
@@ -69,7 +70,12 @@ def _trace(
         gap = curves["predicted"] - curves["measured"]
         if np.isfinite(gap).any():
             remark = f"rms difference {number(float(np.sqrt(np.nanmean(gap**2))))}"
-    return svg.chart(axes, marks, title=title, unit=unit, remark=f"{remark} {unit}")
+    seconds = " to ".join(number(float(t)) for t in svg.span(time, margin=0.0))
+    kinds = " and ".join(kind for kind in ("measured", "predicted") if kind in curves)
+    said = f"{kinds} from {seconds} s; {remark}"
+    return svg.chart(
+        axes, marks, title=title, said=said, unit=unit, remark=f"{remark} {unit}"
+    )
 
 
 def _closest_look(arrays: Arrays, base: str, channels: list[str]) -> slice | None:
@@ -98,9 +104,9 @@ def _closest_look(arrays: Arrays, base: str, channels: list[str]) -> slice | Non
     return slice(start, int(ends[start]))
 
 
-def forecasts(summary: Summary, arrays: Arrays, prefix: str) -> Raw:
+def forecasts(summary: Summary, arrays: Arrays, prefix: str) -> Section:
     """Every log below a prefix, and a closer look where it differs most."""
-    parts: list[str] = []
+    parts: list[tuple[str, list[Markup]]] = []
     drawn, left = 0, 0
     banded = False
     for log in _under(arrays, f"{prefix}/"):
@@ -121,23 +127,11 @@ def forecasts(summary: Summary, arrays: Arrays, prefix: str) -> Raw:
             for c in channels
             for rows, suffix in looks
         ]
-        parts.append(Raw(f"<h3>{esc(log)}</h3>\n"))
-        parts.append(cards(figures, "wide"))
-    if not parts:
-        return Raw("")
-    text = f"{left} more logs are in arrays.npz and not drawn." if left else ""
-    return Raw(
-        legend([("quiet", "measured"), ("c1", "simulated")])
-        + (paragraph("The shade is the 90 % band.", "soft") if banded else "")
-        + "".join(parts)
-        + (paragraph(text, "soft") if text else "")
-    )
+        parts.append((log, figures))
+    return {"logs": parts, "banded": banded, "left": left} if parts else None
 
 
-def traces(summary: Summary, arrays: Arrays) -> Raw:
+def traces(summary: Summary, arrays: Arrays) -> Section:
     """Every log against the simulation, and a closer look where they differ most."""
-    drawn, note = forecasts(summary, arrays, "trace"), summary.get("trace_note")
-    if not drawn:
-        return Raw("")
-    said = paragraph(note, "soft") if note else ""
-    return section("traces", "Measured against simulated", said, drawn)
+    drawn = forecasts(summary, arrays, "trace")
+    return drawn and {"forecasts": drawn, "note": summary.get("trace_note")}

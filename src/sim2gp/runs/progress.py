@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 from sim2gp import cleanup
@@ -25,11 +25,16 @@ class Task:
     total: int
     show: Callable[["Task", str], None]
     done: int = 0
+    started: float = field(default_factory=time.monotonic)
 
     def advance(self, note: str = "", count: int = 1) -> None:
         """``count`` more parts are finished; ``note`` is shown beside them."""
         self.done += count
         self.show(self, note)
+
+    def left(self) -> str:
+        """How long the rest takes at the same pace."""
+        return time_left(self.done, self.total, time.monotonic() - self.started)
 
 
 def _silent(task: Task, note: str) -> None:
@@ -38,7 +43,7 @@ def _silent(task: Task, note: str) -> None:
 
 def _lines(seconds: float = 2.0) -> Callable[[Task, str], None]:
     """A line for the last part, and before it at most one every two seconds."""
-    last, started = float("-inf"), time.monotonic()
+    last = float("-inf")
 
     def show(task: Task, note: str) -> None:
         nonlocal last
@@ -47,7 +52,7 @@ def _lines(seconds: float = 2.0) -> Callable[[Task, str], None]:
             return
         last = now
         text = f"{task.label}: {task.done}/{task.total}  {note}".rstrip()
-        left = time_left(task.done, task.total, now - started)
+        left = task.left()
         print(f"{text}, {left}" if left else text, file=sys.stderr, flush=True)
 
     return show
@@ -100,18 +105,15 @@ def _in_notebook(label: str, total: int) -> Callable[[Task, str], None]:
     """One line of the cell's output, drawn again after each part."""
     from IPython.display import HTML, display
 
-    started = time.monotonic()
-
-    def page(done: int, note: str) -> Any:
-        left = time_left(done, total, time.monotonic() - started)
+    def page(done: int, note: str, left: str) -> Any:
         words = " &middot; ".join(html.escape(x) for x in (note, left) if x)
         bar = f'<progress value="{done}" max="{total}"></progress>'
         return HTML(f"{html.escape(label)} {bar} {done}/{total} {words}")
 
-    shown = display(page(0, ""), display_id=True)
+    shown = display(page(0, "", ""), display_id=True)
 
     def show(task: Task, note: str) -> None:
-        shown.update(page(task.done, note))
+        shown.update(page(task.done, note, task.left()))
 
     return show
 
@@ -138,10 +140,8 @@ def _bar(label: str, total: int) -> Iterator[Task]:
     bars = Bars(*columns, console=Console(stderr=True))
     with bars, cleanup.registered(bars.stop):  # or the cursor stays hidden
         number = bars.add_task(label, total=total, note="", left="")
-        started = time.monotonic()
 
         def show(task: Task, note: str) -> None:
-            left = time_left(task.done, total, time.monotonic() - started)
-            bars.update(number, completed=task.done, note=note, left=left)
+            bars.update(number, completed=task.done, note=note, left=task.left())
 
         yield Task(label, total, show)

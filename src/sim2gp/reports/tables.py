@@ -1,0 +1,87 @@
+"""Tables as data; the template draws them."""
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sim2gp.reports.numbers import is_number, number, percent
+
+SHARES = ("coverage90", "coverage95", "coverage")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One cell, in the order in which it is read.
+
+    A bar of a ``share`` ("40%"), a ``name`` in bold, ``text``, its ``unit``, a ``chip``
+    (tone and word), and below them ``why``.
+    """
+
+    text: object = ""
+    name: object = ""
+    share: str | None = None
+    unit: str = ""
+    chip: tuple[str, str] | None = None
+    why: object = ""
+
+    @property
+    def empty(self) -> bool:
+        """Whether nothing is shown."""
+        shown = (self.text, self.name, self.unit, self.chip, self.why)
+        return self.share is None and not any(str(x) for x in shown if x is not None)
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns and rows; ``words`` are the columns of text, not of numbers.
+
+    With ``cards`` every row becomes a card of its own on a narrow screen.
+    """
+
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+    words: Collection[int]
+    cards: bool = False
+
+
+def table(
+    columns: Sequence[str],
+    rows: Iterable[Sequence[object]],
+    *,
+    words: Collection[int],
+    cards: bool = False,
+) -> Table:
+    """A table whose cells may be plain text."""
+    cells = [[x if isinstance(x, Cell) else Cell(x) for x in row] for row in rows]
+    return Table(columns, cells, words, cards)
+
+
+def shown(key: str, value: object) -> object:
+    """A value of a summary as text."""
+    if key in SHARES:
+        return percent(value)
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return number(value) if is_number(value) or value is None else value
+
+
+def records(entries: Mapping[str, Any], first: str) -> Table:
+    """A table of named entries: one column for every key that any of them has."""
+    rows = {
+        name: value if isinstance(value, Mapping) else {"value": value}
+        for name, value in entries.items()
+    }
+    keys = list(dict.fromkeys(key for row in rows.values() for key in row))
+    words = [
+        index + 1
+        for index, key in enumerate(keys)
+        if any(isinstance(row.get(key), str) for row in rows.values())
+    ]
+    return table(
+        [first, *(key.replace("_", " ") for key in keys)],
+        [
+            [Cell(name=name), *(shown(key, row.get(key)) for key in keys)]
+            for name, row in rows.items()
+        ],
+        words=(0, *words),
+    )
