@@ -69,11 +69,3 @@ def test_an_error_has_the_words_of_its_entry(monkeypatch: pytest.MonkeyPatch) ->
     other = error("few", NotConverged, what="row", expected="more", fix="wait")
     assert isinstance(other, NotConverged)
     assert str(other) == "E116 no row: expected more. Fix: wait."
-
-
-def test_the_page_of_codes_is_made_from_the_catalogue() -> None:
-    page = (ROOT / "docs" / "codes.md").read_text(encoding="utf-8")
-    codes = tomllib.loads(CODES.read_text(encoding="utf-8"))
-    for chapter, table in codes.items():
-        rows = "".join(f"| `{code}` | {what} |\n" for code, what in table.items())
-        assert f"## {chapter}\n\n| code | what |\n|---|---|\n{rows}" in page

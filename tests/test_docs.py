@@ -34,8 +34,9 @@ PAGES = [*sorted(DOCS.glob("*.md")), *sorted(ROOT.glob("*.md"))]
 CODE = re.compile(r"[EW]\d{3}")
 
 
-def load_stage() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("stage", DOCS / "site" / "stage.py")
+def of_site(name: str) -> ModuleType:
+    """A module that makes the site, or pages of it."""
+    spec = importlib.util.spec_from_file_location(name, DOCS / "site" / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -43,7 +44,7 @@ def load_stage() -> ModuleType:
     return module
 
 
-STAGE = load_stage()
+STAGE, TABLES = of_site("stage"), of_site("tables")
 
 
 def rows(text: str) -> list[list[str]]:
@@ -63,83 +64,19 @@ def section(page: str, heading: str) -> str:
 # ---------------------------------------------------------------- the project file
 
 
-def words(schema: dict[str, Any]) -> str:
-    """What a key may hold, from its JSON schema, as the page says it."""
-    if "$ref" in schema:
-        prior = schema["$ref"].endswith(("PriorSpec", "ParameterSpec"))
-        return "prior" if prior else "table"
-    if "anyOf" in schema:
-        kinds = [words(each) for each in schema["anyOf"] if each.get("type") != "null"]
-        if kinds[-1] == "prior":  # a number is the shortest prior
-            kinds = ["prior", *kinds[1:-1]]
-        return " or ".join(dict.fromkeys(kinds))
-    if "enum" in schema:
-        return "one of " + ", ".join(str(each) for each in schema["enum"])
-    if "const" in schema:
-        return f'"{schema["const"]}"'
-    if schema.get("maxItems") == 2:
-        return "[low, high]"
-    inner = schema.get("items", schema.get("additionalProperties"))
-    many = words(inner) if isinstance(inner, dict) else ""
-    many = "tables" if many.startswith("table") else many
-    many = "priors" if many == "prior" else many
-    of = f" of {many}" if many else ""
-    names = {"number": "number", "integer": "whole number", "string": "text"}
-    names |= {"boolean": "true or false", "array": f"list{of}", "object": f"table{of}"}
-    least = {"exclusiveMinimum": " > 0", "minimum": " >= 0"}
-    bound = next((text for key, text in least.items() if key in schema), "")
-    return names[schema["type"]] + bound
+@pytest.mark.parametrize("page", ["project_file.md", "codes.md"])
+def test_a_page_has_the_tables_that_the_code_writes(page: str) -> None:
+    """`python docs/site/tables.py` writes them."""
+    assert (DOCS / page).read_text(encoding="utf-8") == TABLES.pages()[page]
 
 
-def stated(schema: dict[str, Any], key: str, required: list[str]) -> str:
-    """A key's default as the page says it."""
-    value = schema.get("default")
-    if key in required:
-        return "required"
-    if value is None or isinstance(value, dict):
-        return "-"
-    return str(value).lower() if isinstance(value, bool) else str(value)
-
-
-SPEC = ProjectSpec.model_json_schema()
-SECTIONS = {
-    "The whole file": "",
-    "[parameters.NAME]": "ParameterSpec",
-    "[effects.CHANNEL.NAME]": "EffectSpec",
-    "[[logs]]": "LogSpec",
-    "[logs.columns.CHANNEL]": "ColumnSpec",
-    "[logs.resample]": "ResampleSpec",
-    "[[weighed]]": "WeighedSpec",
-    "[actuators.INPUT]": "ActuatorSpec",
-    "[likelihood]": "LikelihoodSpec",
-}
-
-
-@pytest.mark.parametrize("heading", SECTIONS)
-def test_every_key_of_a_project_file_is_told(heading: str) -> None:
-    """A failure shows the rows to be written: key, value, default; then its meaning."""
-    name = SECTIONS[heading]
-    table = SPEC["$defs"][name] if name else SPEC
-    known = table["properties"]
-    if name == "EffectSpec":  # beside a prior's keys
-        known = {k: v for k, v in known.items() if k not in prior_keys()}
-    required = table.get("required", [])
-    expected = [
-        [f"`{key}`", words(value), stated(value, key, required)]
-        for key, value in known.items()
-    ]
-    told = rows(section("project_file.md", heading))[2:]
-    assert [row[:3] for row in told] == expected
-    assert all(len(row) == 4 and row[3] for row in told)
-
-
-def prior_keys() -> set[str]:
-    return set(SPEC["$defs"]["PriorSpec"]["properties"])
-
-
-def test_every_section_of_a_project_file_is_told() -> None:
-    assert set(SPEC["$defs"]) - {"PriorSpec"} == set(SECTIONS.values()) - {""}
-    assert prior_keys() < set(SPEC["$defs"]["ParameterSpec"]["properties"])
+def test_every_section_and_key_of_a_project_file_is_told() -> None:
+    known = ProjectSpec.model_json_schema()["$defs"].keys() - {"PriorSpec"}
+    models = {model.__name__ for model in TABLES.SECTIONS.values()}
+    assert models == known | {"ProjectSpec"}
+    for model in TABLES.SECTIONS.values():
+        own = set(model.__annotations__) - {"model_config"}
+        assert set(TABLES.meanings(model)) == own
 
 
 def test_every_machine_of_a_project_file_is_told() -> None:

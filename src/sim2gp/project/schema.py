@@ -5,7 +5,8 @@
     [actuators.INPUT]  [likelihood]  [limits]  [rates]
 
 Types are strict: a number in quotes is text. Every key here is read by some command:
-one that nothing reads is an error (`sim2gp.project.validate`).
+one that nothing reads is an error (`sim2gp.project.validate`). The text below a key is
+its row in docs/project_file.md, which ``python docs/site/tables.py`` writes.
 """
 
 from typing import Annotated, Any, Literal
@@ -36,41 +37,48 @@ _OLDER = {"box": "bounded", "log_box": "log_bounded"}
 
 
 class PriorSpec(Section):
-    """What is believed of one constant: a value, moments, a box, or both of these.
-
-    ``sd`` or ``relative_sd`` (a share) alone are about the machine's own number.
-    """
+    """What is believed of one constant: a value, moments, a box, or both of these."""
 
     value: FiniteFloat | None = None
+    """Fixes the constant."""
     mean: FiniteFloat | None = None
+    """Prior mean; needs `sd` or `relative_sd`."""
     sd: FiniteFloat | None = None
+    """Prior standard deviation, > 0; about `mean`, or alone about the machine's own
+    number."""
     relative_sd: Positive | None = None
+    """The sd as a share of the mean, or of the machine's own number."""
     low: FiniteFloat | None = None
+    """Lower bound."""
     high: FiniteFloat | None = None
+    """Upper bound."""
     map: Map | None = None
+    """How it is unbounded for the fit (older files say box and log_box): by its place
+    in the box, the same of the logarithm, its logarithm, itself; the last two
+    without bounds."""
 
 
 class ParameterSpec(PriorSpec):
-    """A prior of a constant of the machine, or of all that a pattern names.
-
-    ``tie`` makes the constants of a pattern one number for each quantity (of a model's
-    file alone).
-    """
+    """A prior of a constant of the machine, or of all that a pattern names."""
 
     tie: bool = False
+    """The constants of a pattern are one number for each quantity (model's file alone).
+    """
 
 
 class EffectSpec(PriorSpec):
     """Physics that the machine's equations lack: its magnitude, as any constant's.
 
     ``[effects.theta.coulomb]`` adds the constant ``theta.coulomb``; a bare number
-    fixes it. ``width`` and ``speed`` (velocities) and ``smoothing`` (an input) are
-    options of the effects that have them.
+    fixes it. Below are options of the effects that have them.
     """
 
     width: Positive | None = None
+    """Of the smoothed step of a dry friction (the channel's velocity)."""
     speed: Positive | None = None
+    """Over which Stribeck friction falls (the channel's velocity)."""
     smoothing: Positive | None = None
+    """Of the edge of a dead zone (the input's unit)."""
 
 
 #: What an effect has beside the prior of its magnitude.
@@ -83,11 +91,18 @@ class ColumnSpec(Section):
     """A column of a file, and how its numbers become a channel's."""
 
     column: str
+    """The column's name in the file."""
     unit: str | None = None
+    """What the file holds (`deg`, `mm`, `ms`, `rpm`, ...); the channel's own if not
+    said."""
     sign: Literal[1, -1] = 1
+    """The sensor's or motor's sign."""
     scale: FiniteFloat = 1.0
+    """A further factor."""
     offset: FiniteFloat = 0.0
+    """In the channel's unit, added last."""
     saturation: Pair | None = None
+    """In the file's unit: measurements there are masked, commands clipped."""
 
 
 class ResampleSpec(Section):
@@ -97,81 +112,117 @@ class ResampleSpec(Section):
     """
 
     method: Literal["linear", "hold"] = "linear"
+    """How states between two samples are read."""
     period: Positive | None = None
+    """Seconds between the rows that come out."""
     stamps: str | None = None
+    """A stream whose stamps are the rows, instead."""
 
 
 class LogSpec(Section):
-    """A group of files with the same columns, of the machine in one configuration.
-
-    ``time`` is a column (default "time"; in a bag "header" or "log"), or rows have a
-    fixed ``period``. ``episode`` is a column of episode numbers. ``name`` is that of
-    the configuration (default the group's number): ``fixed`` are constants known in it
-    alone, ``free`` those that it does not share with the other groups.
-    """
+    """A group of files with the same columns, of the machine in one configuration."""
 
     files: Annotated[list[str], Field(min_length=1)]
+    """Paths or patterns (`*`, `**`); folders too."""
     name: Annotated[str, Field(pattern=r"^[^\s@]+$")] | None = None
+    """The machine's configuration in this group; its number if it has `fixed` or `free`
+    alone."""
     time: str | ColumnSpec | None = None
+    """The column of time, s, or in full as a column; "header" or "log" in a bag; the
+    column `time` if neither it nor `period` stands."""
     period: Positive | None = None
+    """Seconds between rows, where no column says the time."""
     episode: str | None = None
+    """A column of episode numbers."""
     resample: ResampleSpec | None = None
+    """How streams with clocks of their own become one."""
     keep_first: bool = False
+    """Keep the first row of each stamp instead of `E108`."""
     exclude: list[Pair] = []
+    """Seconds of each log to leave out."""
     columns: dict[str, str | FiniteFloat | ColumnSpec]
+    """By channel: its column; of an input also a constant number, `0.0` where it was
+    not driven."""
     fixed: dict[str, FiniteFloat] = {}
+    """Constants known in this configuration alone, as a payload's mass."""
     free: list[str] = []
+    """Constants of this configuration alone, `x @ name` in the tables; all others are
+    shared."""
     drop_nonfinite: bool = False
+    """Mask measurements and cut at inputs that are not finite instead of `E101`."""
 
 
 class WeighedSpec(Section):
     """A measured sum of constants, each times its weight (default 1)."""
 
     of: Annotated[list[str], Field(min_length=1)]
+    """Constants by name; one of a configuration as `x @ name`."""
     weights: list[FiniteFloat] | None = None
+    """Of each in the sum, 1 if left out."""
     value: FiniteFloat
+    """The sum as measured."""
     sd: Positive
+    """Its standard deviation."""
 
 
 class ActuatorSpec(Section):
-    """Gain, offset, delay of one input: a number fixes, a table or "free" learns.
-
-    ``tie`` makes all inputs of a pattern share each of the three.
-    """
+    """Gain, offset, delay of one input: a number fixes, a table or "free" learns."""
 
     gain: FiniteFloat | Literal["free"] | PriorSpec = 1.0
+    """Factor; free: within 0.5 and 2."""
     offset: FiniteFloat | Literal["free"] | PriorSpec = 0.0
+    """In the input's unit; free: within a tenth of its range."""
     delay: FiniteFloat | Literal["free"] | PriorSpec = 0.0
+    """Seconds; free: from 0 to 0.02."""
     tie: bool = False
+    """All inputs of a pattern share gain, offset and delay."""
 
 
 class LikelihoodSpec(Section):
-    """Windows of a length in s (0: one step); what noise and start are allowed.
-
-    ``start``: a window's start is guessed from the samples around it ("smoothed"), or
-    from the past alone ("causal"), as whoever predicts with the model will do.
-    """
+    """The fit's windows: their length, their starts, and the noise."""
 
     window: Annotated[FiniteFloat, Field(ge=0)] = 0.2
+    """Seconds that the simulator runs before it starts anew; 0 predicts one row from
+    the last, and needs every state measured."""
     start: Literal["smoothed", "causal"] = "smoothed"
+    """A window's start is guessed from the samples around it, or from the past alone as
+    a predictor must."""
     robust: bool = False
+    """A Student-t weight (4 degrees of freedom) for each window: for pushes and
+    collisions."""
     start_sd: Positive | dict[str, Positive] | None = None
+    """Sd of the start about that guess, by channel or for all; if not said 100 sensor
+    steps of a measured state, and the size of an unmeasured one."""
     noise_floor: Positive | dict[str, Positive] | None = None
+    """The least noise, by channel or for all; if not said the sensor's step as the log
+    shows it."""
 
 
 class ProjectSpec(Section):
     """The whole file."""
 
     system: str
+    """A bundled [machine](#machines), or the path of an MJCF or URDF file."""
     options: dict[str, Any] = {}
+    """Settings of the [machine](#machines); of a model's file `root`, the folder its
+    parts must lie in."""
     parameters: dict[str, FiniteFloat | ParameterSpec] = {}
+    """What is believed of its constants."""
     effects: dict[str, dict[str, FiniteFloat | EffectSpec]] = {}
+    """[physics](#effectschannelname) that its equations lack."""
     weighed: list[WeighedSpec] = []
+    """[sums of constants](#weighed) that were measured."""
     logs: list[LogSpec] = []
+    """Groups of recordings."""
     actuators: dict[str, ActuatorSpec] = {}
+    """What lies between a command and the force."""
     likelihood: LikelihoodSpec = LikelihoodSpec()
+    """What the fit holds the recordings against."""
     limits: dict[str, Pair] = {}
+    """By channel, in its unit: of the next experiment; samples beyond a state's are
+    masked."""
     rates: dict[str, Positive] = {}
+    """By input, its unit per second: the steepest command of an experiment."""
 
     def configuration(self, group: int) -> str:
         """Name of the configuration that a group of logs recorded."""
