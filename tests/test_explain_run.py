@@ -60,6 +60,19 @@ def explained(run: Path, out: Path, *, add: bool) -> dict[str, Any]:
 
 
 @pytest.mark.usefixtures("few")
+@pytest.mark.nightly  # two processes that compile for themselves
+def test_processes_find_the_same(run: Path) -> None:
+    found = explainable(run)
+    assert found.project is not None
+    assert found.project.can_be_loaded
+    one, two = (explain(found, workers=n, progress=QUIET) for n in (1, 2))
+    assert one.summary["candidates"] == two.summary["candidates"]
+    assert one.summary["misfit"] == two.summary["misfit"]
+    assert two.winner is not None
+    assert two.winner.scored.candidate.name == "theta.spring"
+
+
+@pytest.mark.usefixtures("few")
 def test_a_spring_is_found_in_logs_and_added(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     summary = explained(run, out, add=True)
@@ -140,8 +153,9 @@ def test_the_command_line_hands_on(
             added.append(file)
             return self
 
-    def told(found: Any, *, progress: Progress) -> Any:
+    def told(found: Any, *, workers: int, progress: Progress) -> Any:
         assert found.training_logs()
+        assert workers == 1
         return Missing({"answer": "missing", "path": str(found.path)})
 
     monkeypatch.setattr("sim2gp.commands.explain.explain", told)

@@ -157,6 +157,8 @@ class Explain(Reads):
     """The folder of identify or demo."""
     add: Flag = False
     """Write the winner into the project file, so that identify fits it."""
+    workers: Count = 1
+    """Processes for the fits of the best candidates."""
 
     def run(self, call: Call) -> dict[str, Any]:
         out = run_directory(self.out, f"explain-{self.path.name}")
@@ -167,7 +169,9 @@ class Explain(Reads):
         file = function(module, "project_file")(run) if self.add else None
 
         def found() -> Any:
-            missing = command("explain")(run, progress=call.progress)
+            missing = command("explain")(
+                run, workers=self.workers, progress=call.progress
+            )
             return missing if file is None else missing.add_to(file)
 
         return call.saved(out, found)

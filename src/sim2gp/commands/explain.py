@@ -7,11 +7,14 @@ answer is one of three: nothing, an effect, or none of these.
 
 import dataclasses
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from sim2gp.commands.demo import Demonstration
@@ -25,14 +28,20 @@ from sim2gp.identification.missing_physics.data import (
     WindowData,
 )
 from sim2gp.identification.missing_physics.explain import explain as search_missing
-from sim2gp.identification.missing_physics.search import REFITS, Refitted
+from sim2gp.identification.missing_physics.score import Scored
+from sim2gp.identification.missing_physics.search import REFITS, Refitted, refit
 from sim2gp.identification.missing_physics.words import candidate_rows, headline, table
+from sim2gp.inference.estimate import Estimate
 from sim2gp.planning.tasks import MACHINES
 from sim2gp.project import Project, load_project
 from sim2gp.project.amend import amend
 from sim2gp.project.training_windows import cut_logs
 from sim2gp.runs import Progress, load_run
 from sim2gp.runs.provenance import provenance
+from sim2gp.runs.workers import spread
+from sim2gp.systems.assemble import free_parts
+from sim2gp.systems.effects.registry import candidates as registered
+from sim2gp.types import in_float64
 
 SHARED_SECOND = 1.0  # s of windows whose errors may be correlated
 
@@ -74,17 +83,26 @@ class MissingPhysics(AbstractResult):
 
 
 def explain(
-    run: Identification | Demonstration, *, progress: Progress | None = None
+    run: Identification | Demonstration,
+    *,
+    workers: int = 1,
+    progress: Progress | None = None,
 ) -> MissingPhysics:
     """Search what the run's machine lacks.
 
-    Every effect of the library is scored, the best few are fitted. Raises `InputError`
+    Every effect of the library is scored, the best few are fitted; of a project file
+    that is as the run had it by so many processes, ``workers``. Raises `InputError`
     E130 for a run of another command, and what reading the run's logs raises.
     """
     started = time.perf_counter()
     data = _data(run)
+    fits = None
+    match run:
+        case Identification(project=Project(can_be_loaded=True, path=path)):
+            if workers > 1:
+                fits = partial(_in_processes, path, _logs(run), workers)
     with (progress or Progress()).task("explain", 2 + REFITS) as task:
-        found = search_missing(data, on_step=task.advance)
+        found = search_missing(data, fits=fits, on_step=task.advance)
     candidates = candidate_rows(found)
     gains = np.asarray([s.gain for s in found.search.scored])
     names = np.asarray([s.candidate.name for s in found.search.scored])
@@ -114,12 +132,66 @@ def explain(
 def _data(run: Identification | Demonstration) -> AbstractData:
     """The rows of a run, with their likelihood."""
     if isinstance(run, Identification):
-        logs = run.training_logs(alike=True)
         assert run.project is not None
-        return window_data(run.project, logs, int(run.summary.get("seed", 0)))
+        return window_data(run.project, _logs(run), int(run.summary.get("seed", 0)))
     if isinstance(run, Demonstration):
         return _flown(run)
     raise _nothing_to_explain(getattr(run, "path", run), getattr(run, "summary", {}))
+
+
+def _logs(run: Identification) -> tuple[Log, ...]:
+    return run.training_logs(alike=True)
+
+
+class RefitJob(NamedTuple):
+    """One candidate's fit, as another process needs it; arrays are NumPy's."""
+
+    path: Path
+    logs: tuple[Log, ...]
+    seed: int
+    name: str
+    starts: np.ndarray
+    bare: Estimate
+
+
+def _in_processes(
+    path: Path,
+    logs: tuple[Log, ...],
+    workers: int,
+    data: AbstractData,
+    bare: Estimate,
+    ranked: Sequence[Scored],
+) -> Iterator[tuple[str, Refitted | None]]:
+    """The fits of the best candidates, as processes are free."""
+    assert isinstance(data, WindowData)
+    asked = {one.candidate.name: one for one in ranked}
+    sent = jax.tree.map(np.asarray, bare)  # whose numbers keep their 64 bits
+    jobs = [
+        RefitJob(path, logs, data.seed, name, one.starts, sent)
+        for name, one in asked.items()
+    ]
+    for job, fit in spread(_refit_of, [[job] for job in jobs], workers):
+        if fit is None:
+            yield job.name, None
+            continue
+        fitted, *numbers = fit
+        back = jax.tree.map(jnp.asarray, fitted)
+        yield job.name, Refitted(asked[job.name], back, *numbers)
+
+
+@in_float64
+def _refit_of(job: RefitJob) -> tuple[Estimate, float, float, float, float] | None:
+    """A candidate's fit in a process of its own: all of `Refitted` but ``scored``."""
+    data = window_data(load_project(job.path), job.logs, job.seed)
+    known = {c.name: c for c in registered(data.system, windows=True)}
+    candidate = known[job.name]
+    system = free_parts(data.system, [candidate.effect])
+    scored = Scored(candidate, system, 0.0, 1.0, (), job.starts)  # scores are unused
+    found = refit(data, jax.tree.map(jnp.asarray, job.bare), scored)
+    if found is None:
+        return None
+    fitted = jax.tree.map(np.asarray, found.fitted)
+    return fitted, found.gain, found.value, found.sd, found.inflation
 
 
 def window_data(project: Project, logs: Sequence[Log], seed: int = 0) -> WindowData:

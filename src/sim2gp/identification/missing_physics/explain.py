@@ -12,7 +12,12 @@ from typing import Literal
 
 from sim2gp.identification.misfit.tests import Misfit
 from sim2gp.identification.missing_physics.data import AbstractData
-from sim2gp.identification.missing_physics.search import REFITS, Search, search
+from sim2gp.identification.missing_physics.search import (
+    REFITS,
+    Fits,
+    Search,
+    search,
+)
 from sim2gp.systems.effects.registry import Candidate
 
 Answer = Literal["nothing missing", "missing", "none of these"]
@@ -50,13 +55,15 @@ def explain(
     candidates: Sequence[Candidate] | None = None,
     *,
     refits: int = REFITS,
+    fits: Fits | None = None,
     on_step: Callable[[str], None] = lambda _: None,
 ) -> Explanation:
     """Search the library of the data's machine, and test what is left over.
 
-    ``candidates`` take the library's place. Raises what the bare machine's fit raises.
+    ``candidates`` take the library's place, ``fits`` that of the loop over fits. Raises
+    what the bare machine's fit raises.
     """
-    found = search(data, candidates, refits=refits, on_step=on_step)
+    found = search(data, candidates, refits=refits, fits=fits, on_step=on_step)
     best = bare = data.misfit(data.system, found.bare)
     if found.best is not None:
         best = data.misfit(found.best.scored.system, found.best.fitted)

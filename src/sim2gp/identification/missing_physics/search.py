@@ -6,7 +6,7 @@ from them and is not ranked.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -85,18 +85,25 @@ class Search:
         )
 
 
+#: How the best candidates are fitted: the name of each, and its fit or None.
+Fits = Callable[
+    [AbstractData, Estimate, Sequence[Scored]], Iterable[tuple[str, Refitted | None]]
+]
+
+
 @in_float64
 def search(
     data: AbstractData,
     candidates: Sequence[Candidate] | None = None,
     *,
     refits: int = REFITS,
+    fits: Fits | None = None,
     on_step: Callable[[str], None] = lambda _: None,
 ) -> Search:
     """Fit the bare machine, score every candidate, fit the best few.
 
-    Raises what the fit of the bare machine raises; a candidate's failure is kept in
-    ``failed``.
+    ``fits`` replaces the loop over these, as processes do. Raises what the fit of the
+    bare machine raises; a candidate's failure is kept in ``failed``.
     """
     if candidates is None:
         candidates = registered(data.system, windows=not data.period)
@@ -106,15 +113,29 @@ def search(
     ranked = sorted((s for s in scored if not s.alias), key=lambda s: -s.gain)
     on_step(f"{len(scored)} effects scored")
     found, failed = [], []
-    for one in ranked[:refits]:
-        try:
-            found.append(_refit(data, bare, one))
-            on_step(f"fitted with {one.candidate.name}")
-        except (NotConverged, NotFinite):
-            failed.append(one.candidate.name)
-            on_step(f"no fit with {one.candidate.name}")
+    for name, fit in (fits or _in_turn)(data, bare, ranked[:refits]):
+        if fit is None:
+            failed.append(name)
+        else:
+            found.append(fit)
+        on_step(f"no fit with {name}" if fit is None else f"fitted with {name}")
     found.sort(key=lambda refit: -refit.gain)
     return Search(bare, tuple(scored), tuple(found), tuple(failed))
+
+
+def _in_turn(
+    data: AbstractData, bare: Estimate, ranked: Sequence[Scored]
+) -> Iterator[tuple[str, "Refitted | None"]]:
+    for one in ranked:
+        yield one.candidate.name, refit(data, bare, one)
+
+
+def refit(data: AbstractData, bare: Estimate, scored: Scored) -> Refitted | None:
+    """A candidate fitted in earnest; None where that does not converge."""
+    try:
+        return _refit(data, bare, scored)
+    except (NotConverged, NotFinite):
+        return None
 
 
 def _refit(data: AbstractData, bare: Estimate, scored: Scored) -> Refitted:
