@@ -24,18 +24,21 @@ QUIET = Progress(quiet=True)
 SPRING = sy.Spring("theta", 4.5e-3)
 
 
-@pytest.fixture
-def few(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two candidates instead of eighteen: the whole library takes minutes."""
+def only(monkeypatch: pytest.MonkeyPatch, *kinds: str) -> None:
+    """These candidates instead of eighteen: the whole library takes minutes."""
 
     def short(system: Any, *, windows: bool = False) -> tuple[sy.Candidate, ...]:
-        kinds = ("theta.spring", "theta.viscous")
         every = sy.candidates(system, windows=windows)
         return tuple(c for c in every if c.name in kinds)
 
     monkeypatch.setattr(
         "sim2gp.identification.missing_physics.search.registered", short
     )
+
+
+@pytest.fixture
+def few(monkeypatch: pytest.MonkeyPatch) -> None:
+    only(monkeypatch, "theta.spring", "theta.viscous")
 
 
 @pytest.fixture(scope="module")
@@ -59,9 +62,9 @@ def explained(run: Path, out: Path, *, add: bool) -> dict[str, Any]:
     return missing.summary
 
 
-@pytest.mark.usefixtures("few")
 @pytest.mark.nightly  # two processes that compile for themselves
-def test_processes_find_the_same(run: Path) -> None:
+def test_processes_find_the_same(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    only(monkeypatch, "theta.spring", "theta.coulomb", "theta.drag")
     found = explainable(run)
     assert found.project is not None
     assert found.project.can_be_loaded

@@ -7,11 +7,19 @@ import numpy as np
 from markupsafe import Markup
 
 from sim2gp.reports import svg
-from sim2gp.reports.numbers import MISSING, is_number, number, percent, unit_text
+from sim2gp.reports.numbers import (
+    MISSING,
+    is_number,
+    number,
+    percent,
+    power_of_ten,
+    unit_text,
+)
 from sim2gp.reports.parameters import Arrays, Section, Summary
 from sim2gp.reports.tables import SHARES, Cell, Table, records, shown, table
 from sim2gp.reports.traces import forecasts, unit_of
 
+NARROW = 3  # columns that a telephone shows side by side
 COLOURS = ("c0", "c1", "c2", "c3", "c4", "c5")
 
 
@@ -24,6 +32,7 @@ def _sentence(item: object) -> object:
     return item
 
 
+_LEAST = 1e-99  # of a p-value that is told
 #: What each misfit test asks.
 _TESTS = {
     "chi2": "reduced chi-squared: as large as the noise?",
@@ -33,12 +42,18 @@ _TESTS = {
 }
 
 
+def _p_value(p: object) -> str:
+    """Two digits; what is next to nothing has none."""
+    tiny = is_number(p) and float(p) < _LEAST  # type: ignore[arg-type]
+    return f"< {power_of_ten(-99)}" if tiny else number(p, 2)
+
+
 def _tests(tests: Mapping[str, Any]) -> Table:
     """What the residuals say of the model, test by test."""
 
     def row(name: str, test: Mapping[str, Any]) -> list[object]:
         chip = ("bad", "alarm") if test.get("alarm") else ("good", "passed")
-        statistic, p = number(test.get("statistic")), number(test.get("p"), 2)
+        statistic, p = number(test.get("statistic")), _p_value(test.get("p"))
         tested = Cell(chip=chip) if is_number(test.get("p")) else MISSING
         return [_TESTS.get(name, name), statistic, p, tested, test.get("text")]
 
@@ -64,11 +79,12 @@ def noise_and_misfit(summary: Summary) -> Section:
     if not stated and not misfit:
         return None
     about = misfit if isinstance(misfit, Mapping) else {"noise": misfit}
+    told = summary.get("command") == "explain"  # its headline is about it
     tests: Mapping[str, Any] = about.get("tests") or {}
     return {
         "noise": records(stated, "channel") if stated else None,
         "asked": bool(misfit),
-        "verdict": about.get("verdict"),
+        "verdict": None if told else about.get("verdict"),
         "tests": _tests(tests) if tests else None,
         "notes": list(map(_sentence, about.get("noise") or ())),
     }
@@ -204,7 +220,8 @@ def extra_tables(summary: Summary) -> list[dict[str, Any]]:
             if any(isinstance(row[i], str) for row in rows)
         ]
         cells = [[shown("", cell) for cell in row] for row in rows]
-        drawn = table(entry["columns"], cells, words=words)
+        many = len(entry["columns"]) > NARROW
+        drawn = table(entry["columns"], cells, words=words, cards=many, prose=False)
         title = entry.get("title", "")
         parts.append({"title": title, "table": drawn, "note": entry.get("note")})
     return parts
@@ -226,4 +243,10 @@ def claims(summary: Summary) -> Table | None:
         for name, entry in (summary.get("claims") or {}).items()
     ]
     columns = ["claim", "", "figure", ""]
-    return table(columns, rows, words=(0, 1, 3), cards=True) if rows else None
+    return table(columns, rows, words=(0, 1, 2, 3), cards=True) if rows else None
+
+
+def claims_in_a_sentence(summary: Summary) -> str:
+    """How many claims hold; nothing where there are none."""
+    holds = [bool(e.get("holds")) for e in (summary.get("claims") or {}).values()]
+    return f"{sum(holds)} of {len(holds)} claims hold." if holds else ""

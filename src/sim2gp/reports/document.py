@@ -59,7 +59,11 @@ def _problems(summary: Summary) -> list[tuple[str, str]]:
     if idle:
         found.append(("bad", f"The data do not depend on: {idle}."))
     misfit = summary.get("misfit")
-    if isinstance(misfit, Mapping) and misfit.get("alarm"):
+    if summary.get("none_of_these"):
+        text = "No effect of the library explains what the simulator lacks."
+        found.append(("warn", text))
+    told = summary.get("command") == "explain"  # its headline is about it
+    if isinstance(misfit, Mapping) and misfit.get("alarm") and not told:
         found.append(("warn", str(misfit.get("verdict"))))
     for item in summary.get("prior_conflicts") or ():
         found.append(("warn", f"Data against prior: {_said(item)}"))
@@ -80,6 +84,11 @@ def _status(summary: Summary) -> dict[str, Any]:
         "tone": "bad" if any(weight == "bad" for weight, _ in found) else "warn",
         "converged": bool(summary.get("converged")),
     }
+
+
+def _headline(summary: Summary) -> str:
+    """What came out, in a sentence; of a study how many claims hold."""
+    return str(summary.get("headline") or "") or data.claims_in_a_sentence(summary)
 
 
 def _made(summary: Summary) -> Section:
@@ -212,7 +221,7 @@ def write_report(summary: Summary, arrays: Arrays) -> str:
         style=Markup(asset("page.css")),
         script=Markup("".join(scripts)),
         status=_status(summary),
-        headline="" if answers else summary.get("headline"),
+        headline="" if answers else _headline(summary),
         glance=answers,
         sections=sections,
     )

@@ -88,9 +88,12 @@ def method_name(method: str) -> str:
 
 
 def returns(summary: Summary, arrays: Arrays) -> Section:
-    """Return of every episode, beside the oracle and doing nothing."""
+    """Return of every episode, with the oracle's and that of doing nothing.
+
+    A study has hundreds of them, and figures and tables of its own.
+    """
     series = _series(summary, arrays)
-    if not series:
+    if not 0 < len(series) <= len(COLOURS):
         return None
     references = {
         words: float(summary[key])

@@ -35,13 +35,15 @@ class Cell:
 class Table:
     """Columns and rows; ``words`` are the columns of text, not of numbers.
 
-    With ``cards`` every row becomes a card of its own on a narrow screen.
+    With ``cards`` every row becomes a card of its own on a narrow screen, which begins
+    with the first column and, where the last one is ``prose``, with that.
     """
 
     columns: Sequence[str]
     rows: Sequence[Sequence[Cell]]
     words: Collection[int]
     cards: bool = False
+    prose: bool = True
 
 
 def table(
@@ -50,10 +52,11 @@ def table(
     *,
     words: Collection[int],
     cards: bool = False,
+    prose: bool = True,
 ) -> Table:
     """A table whose cells may be plain text."""
     cells = [[x if isinstance(x, Cell) else Cell(x) for x in row] for row in rows]
-    return Table(columns, cells, words, cards)
+    return Table(columns, cells, words, cards, prose)
 
 
 def shown(key: str, value: object) -> object:

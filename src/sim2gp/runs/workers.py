@@ -32,9 +32,9 @@ def spread(
 ) -> Iterator[tuple[Job, Result]]:
     """``work(job)`` of every job as it gets done; ``work`` must be importable.
 
-    One worker is this process itself. What comes back from another one is plain data:
-    numbers, text, lists and dictionaries. Raises what ``work`` raises of `Sim2GPError`,
-    and E208 when a process dies of anything else.
+    One worker is this process itself. Jobs and results are pickled; arrays of 64 bits
+    must be NumPy's, since JAX would read them with 32. Raises what ``work`` raises of
+    `Sim2GPError`, and E208 when a process dies of anything else.
     """
     groups = [group for group in groups if group]
     workers = min(workers, len(groups))
