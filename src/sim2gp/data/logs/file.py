@@ -66,7 +66,7 @@ def kind_of(path: Path) -> str:
     if path.suffix.lower() == ".safetensors":
         raise _tensors(read_bytes(path, first=16), shown(path))
     kind = SUFFIXES.get(path.suffix.lower(), "csv")
-    if kind != "csv":
+    if kind in MAGIC:  # a format of text has no first bytes of its own
         _check_magic(read_bytes(path, first=16), kind, shown(path))
     return kind
 

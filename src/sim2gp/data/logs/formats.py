@@ -27,6 +27,8 @@ BAGS = ("rosbag1", "rosbag2", "mcap")
 CLOCKS = ("header", "log")  # what ``time`` may be in a bag
 #: What LeRobot numbers its rows by.
 BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+#: Formats of one table, by their kind (`sim2gp.data.logs.file.SUFFIXES`).
+ONE_TABLE = {"csv": read_table, "npz": read_npz, "parquet": read_parquet}
 TIME = "time"  # the column of time, where nothing else is said
 
 
@@ -92,8 +94,7 @@ def _recordings(
     elif kind == "hdf5":
         pieces = read_hdf5(path, asked, clock, meter)
     else:
-        read = {"npz": read_npz, "parquet": read_parquet}.get(kind, read_table)
-        pieces = [("", read(path, asked, clock, meter))]
+        pieces = [("", ONE_TABLE[kind](path, asked, clock, meter))]
     return _by_episode(pieces, episode)
 
 
