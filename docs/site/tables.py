@@ -18,7 +18,7 @@ from sim2gp.project import schema
 
 DOCS = Path(__file__).resolve().parents[1]
 SPEC = schema.ProjectSpec.model_json_schema()
-#: What is told below each heading: a section the first time that it occurs.
+#: The section whose keys each heading lists, where it occurs first.
 SECTIONS: dict[str, type[schema.Section]] = {
     "The whole file" if not path else header: model
     for header, path, model in reversed(schema.TABLES)
@@ -32,8 +32,8 @@ def pages() -> dict[str, str]:
     tables = {
         "project_file.md": {head: keys(model) for head, model in SECTIONS.items()},
         "codes.md": {
-            chapter: table(["code", "what"], [[f"`{c}`", t] for c, t in told.items()])
-            for chapter, told in codes.items()
+            chapter: table(["code", "what"], [[f"`{c}`", t] for c, t in meant.items()])
+            for chapter, meant in codes.items()
         },
     }
     return {

@@ -28,12 +28,10 @@ from sim2gp.cli.options import (
     Reads,
     Seconds,
     Seed,
-    SomeCount,
     SomeSeconds,
     option,
 )
 from sim2gp.runs.store import check_absent, read_run
-from sim2gp.runs.workers import cores
 
 
 @dataclass(kw_only=True)
@@ -187,8 +185,8 @@ class Compare(Reads):
     """Draws networks and forecasts."""
     horizon: ManySeconds = (0.2, 0.5)
     """Open-loop horizons in s."""
-    workers: SomeCount = None
-    """Processes; default one per core."""
+    workers: Count = 1
+    """Processes for the folds; networks then differ by rounding."""
 
     def run(self, call: Call) -> dict[str, Any]:
         out = run_directory(self.out, f"compare-{self.project.stem}")
@@ -196,7 +194,7 @@ class Compare(Reads):
         how = {
             "horizons": self.horizon,
             "seed": self.seed,
-            "workers": self.workers or cores(),
+            "workers": self.workers,
             "progress": call.progress,
         }
         return call.saved(out, lambda: command("compare")(*read, **how))

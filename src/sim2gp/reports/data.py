@@ -32,7 +32,7 @@ def _sentence(item: object) -> object:
     return item
 
 
-_LEAST = 1e-99  # of a p-value that is told
+_LEAST = 1e-99  # p-value that is written out
 #: What each misfit test asks.
 _TESTS = {
     "chi2": "reduced chi-squared: as large as the noise?",
@@ -79,12 +79,12 @@ def noise_and_misfit(summary: Summary) -> Section:
     if not stated and not misfit:
         return None
     about = misfit if isinstance(misfit, Mapping) else {"noise": misfit}
-    told = summary.get("command") == "explain"  # its headline is about it
+    explains = summary.get("command") == "explain"  # its headline says it
     tests: Mapping[str, Any] = about.get("tests") or {}
     return {
         "noise": records(stated, "channel") if stated else None,
         "asked": bool(misfit),
-        "verdict": None if told else about.get("verdict"),
+        "verdict": None if explains else about.get("verdict"),
         "tests": _tests(tests) if tests else None,
         "notes": list(map(_sentence, about.get("noise") or ())),
     }

@@ -62,8 +62,8 @@ def _problems(summary: Summary) -> list[tuple[str, str]]:
     if summary.get("none_of_these"):
         text = "No effect of the library explains what the simulator lacks."
         found.append(("warn", text))
-    told = summary.get("command") == "explain"  # its headline is about it
-    if isinstance(misfit, Mapping) and misfit.get("alarm") and not told:
+    explains = summary.get("command") == "explain"  # its headline says it
+    if isinstance(misfit, Mapping) and misfit.get("alarm") and not explains:
         found.append(("warn", str(misfit.get("verdict"))))
     for item in summary.get("prior_conflicts") or ():
         found.append(("warn", f"Data against prior: {_said(item)}"))

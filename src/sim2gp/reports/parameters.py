@@ -225,10 +225,10 @@ def correlations(summary: Summary, arrays: Arrays) -> Section:
 
 def _direction(entry: Mapping[str, Any]) -> dict[str, Any]:
     text, combination = entry.get("text") or "", entry.get("combination")
-    told, nats = str(combination) in str(text), entry.get("information")
+    repeated, nats = str(combination) in str(text), entry.get("information")
     return {
         "text": text,
-        "combination": None if told else combination,
+        "combination": None if repeated else combination,
         "nats": number(nats) if is_number(nats) else None,
         "flat": bool(entry.get("flat")),
     }
