@@ -1,4 +1,4 @@
-"""The catalogue of errors: complete, used, and what the page of codes says."""
+"""The catalogue of errors: complete, and used."""
 
 import ast
 import string

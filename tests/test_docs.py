@@ -74,6 +74,9 @@ def test_every_section_and_key_of_a_project_file_is_told() -> None:
     known = ProjectSpec.model_json_schema()["$defs"].keys() - {"PriorSpec"}
     models = {model.__name__ for model in TABLES.SECTIONS.values()}
     assert models == known | {"ProjectSpec"}
+    text = (DOCS / "project_file.md").read_text(encoding="utf-8")
+    headings = re.findall(r"^## (.*)$", text, re.MULTILINE)
+    assert set(headings) == set(TABLES.SECTIONS) | {"Machines"}
     for model in TABLES.SECTIONS.values():
         own = set(model.__annotations__) - {"model_config"}
         assert set(TABLES.meanings(model)) == own

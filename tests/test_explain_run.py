@@ -16,6 +16,7 @@ from sim2gp.commands.identify import identify
 from sim2gp.errors import InputError
 from sim2gp.project import load_project
 from sim2gp.runs import Progress, load_run, new_run
+from sim2gp.runs.workers import spread
 from sim2gp.studies import explain_study as study
 from simulated_logs import simulated
 from test_identify import project_in, write
@@ -65,11 +66,20 @@ def explained(run: Path, out: Path, *, add: bool) -> dict[str, Any]:
 @pytest.mark.nightly  # two processes that compile for themselves
 def test_processes_find_the_same(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     only(monkeypatch, "theta.spring", "theta.coulomb", "theta.drag")
+    asked = []
+
+    def counted(work: Any, groups: Any, workers: int) -> Any:
+        asked.append((len(groups), workers))
+        return spread(work, groups, workers)
+
+    monkeypatch.setattr("sim2gp.commands.explain.spread", counted)
     found = explainable(run)
-    assert found.project is not None
-    assert found.project.can_be_loaded
     one, two = (explain(found, workers=n, progress=QUIET) for n in (1, 2))
+    ((jobs, processes),) = asked
+    assert jobs > 1
+    assert processes == 2
     assert one.summary["candidates"] == two.summary["candidates"]
+    assert one.summary["warnings"] == two.summary["warnings"]
     assert one.summary["misfit"] == two.summary["misfit"]
     assert two.winner is not None
     assert two.winner.scored.candidate.name == "theta.spring"
@@ -158,13 +168,13 @@ def test_the_command_line_hands_on(
 
     def told(found: Any, *, workers: int, progress: Progress) -> Any:
         assert found.training_logs()
-        assert workers == 1
+        assert workers == 2
         return Missing({"answer": "missing", "path": str(found.path)})
 
     monkeypatch.setattr("sim2gp.commands.explain.explain", told)
     text = (run / "project.toml").read_text()
     (run.parent / "machine.toml").write_text(text)  # as it was identified
-    assert main(["explain", str(run), "--add", "--json"]) == 0
+    assert main(["explain", str(run), "--add", "--workers", "2", "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert said["path"] == str(run)
     assert added == [run.parent / "machine.toml"]

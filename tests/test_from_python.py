@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -120,6 +121,50 @@ def test_a_machine_without_a_project_file(
     assert many.summary["n_windows"] == 2 * own.summary["n_windows"]
     with pytest.raises(InputError, match=r"likelihood.windw"):
         sg.project_of_machine(robot, likelihood={"windw": 0.1})
+
+
+@pytest.mark.parametrize(
+    "number", [np.float32(0.5), np.int64(2), jnp.asarray(0.5), np.array(0.25)]
+)
+def test_numbers_of_arrays_are_numbers(found: Any, number: Any) -> None:
+    robot = found.project.system
+    made = sg.project_of_machine(
+        robot, likelihood={"window": number}, limits={"hinge": (-number, number)}
+    )
+    assert made.spec.likelihood.window == float(number)
+    assert made.spec.limits == {"hinge": [-float(number), float(number)]}
+    with pytest.raises(InputError, match="E160 wrong value in machine"):
+        sg.project_of_machine(robot, likelihood={"window": object()})
+
+
+def test_logs_are_read_by_the_name_of_their_group(found: Any) -> None:
+    """Of a machine in one configuration the name chooses the columns."""
+    text = Path("pendulum.toml").read_text()
+    text = text.replace('files = ["a.csv"', 'name = "bench"\nfiles = ["a.csv"')
+    Path("named.toml").write_text(text)
+    robot = sg.load_project("named.toml")
+    (log,) = sg.read_logs("c.csv", robot, "bench")
+    assert log.name == "c"
+    with pytest.raises(InputError, match=r"E152.*bench"):
+        sg.read_logs("c.csv", robot, "bank")
+
+
+def test_only_an_unchanged_project_goes_to_other_processes(found: Any) -> None:
+    text = Path("pendulum.toml").read_text()
+    for name, content in (
+        ("crlf", text.replace("\n", "\r\n").encode()),
+        ("bom", b"\xef\xbb\xbf" + text.encode()),
+    ):
+        file = Path(f"{name}.toml")
+        file.write_bytes(content)
+        assert sg.load_project(file).can_be_loaded
+    Path("other.xml").write_text(Path("pendulum.xml").read_text())
+    assert not sg.load_project("pendulum.toml", model=Path("other.xml")).can_be_loaded
+    project = sg.load_project(file)
+    file.write_bytes(b"\xff\xfe")
+    assert not project.can_be_loaded
+    file.unlink()
+    assert not project.can_be_loaded
 
 
 def test_apply_shows_and_writes(found: Any, tmp_path: Path) -> None:

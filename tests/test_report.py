@@ -235,15 +235,27 @@ def test_every_picture_says_what_it_shows(run: Run) -> None:
     np.testing.assert_allclose([low, high], [theta.min(), theta.max()], rtol=5e-3)
 
 
-def test_gaps_and_missing_numbers_never_reach_the_page(run: Run) -> None:
+def test_gaps_and_missing_numbers_never_reach_the_page() -> None:
+    nothing = np.full(4, np.nan)
     summary = {
         "command": "demo",
         "parameters": {"a": {"mean": None, "sd": None, "verdict": None}},
         "oracle_return": None,
         "episodes_to_95": None,
         "open_loop_rmse": {"q1": None},
+        "animation": {"dt": 0.1, "system": "furuta", "params": {}},
+        "misfit": {"alarm": True, "tests": {"chi2": {"p": None}}},
     }
     arrays = {
+        "returns/nothing": np.full(3, np.nan),
+        "animation/state": np.zeros((4, 4)),
+        "animation/action": nothing[:, None],
+        "design/time": np.arange(4.0),
+        "design/command/u": nothing[:-1],
+        "calibration/level": np.array([0.5, 0.9]),
+        "calibration/share/q": nothing[:2],
+        "trace/one/time": np.array([1.0]),
+        "trace/one/measured/q": np.array([2.0]),
         "returns/x": np.array([1.0, np.nan, 3.0]),
         "trace/a/time": np.array([0.0, 1.0, np.nan, 2.0]),
         "trace/a/measured/q": np.array([0.0, np.nan, 1.0, 2.0]),
@@ -255,6 +267,37 @@ def test_gaps_and_missing_numbers_never_reach_the_page(run: Run) -> None:
     read(text)
     body = text.split("</style>")[1]
     assert not re.search(r"\b(nan|inf|None)\b", body)
+    pictures = Pictures()
+    pictures.feed(text)
+    for said in pictures.said:
+        assert not re.search(r"from +(to|over|$)|–, of|[;:,] *$", said), said
+    assert "u: no values, time from 0.00 to 2.00 s" in pictures.said
+    assert "q: measured, time from 1.00 to 1.00 s" in pictures.said
+
+
+def test_correlations_that_are_not_known_are_not_the_strongest() -> None:
+    entries = {name: {"mean": 1.0, "sd": 0.1} for name in "abc"}
+    matrix = np.full((3, 3), np.nan)
+    for known, words in (({}, "none is known"), ({(2, 1): -0.5}, "of c and b")):
+        for place, r in known.items():
+            matrix[place] = r
+        arrays = {"parameters/correlation": matrix}
+        pictures = Pictures()
+        pictures.feed(report.write_report({"parameters": entries}, arrays))
+        assert words in pictures.said[-1]
+
+
+@pytest.mark.parametrize("columns", ["abc", "abcd"])
+def test_a_row_longer_than_its_header_is_drawn(columns: str) -> None:
+    rows = [[str(k) for k in range(len(columns) + 1)]]
+    entry = {"title": "t", "columns": list(columns), "rows": rows}
+    assert f">{len(columns)}<" in report.write_report({"tables": [entry]}, {})
+
+
+def test_many_series_of_returns_are_counted() -> None:
+    arrays = {f"returns/{k}": np.arange(3.0) for k in range(7)}
+    text = report.write_report({}, arrays)
+    assert "7 series of returns are in arrays.npz" in text
 
 
 def test_trouble_stands_before_the_result(run: Run) -> None:

@@ -18,7 +18,8 @@ from sim2gp.project import schema
 
 DOCS = Path(__file__).resolve().parents[1]
 SPEC = schema.ProjectSpec.model_json_schema()
-#: The section whose keys each heading lists, where it occurs first.
+#: The section whose keys each heading lists. `TABLES` has some twice: the last one
+#: put in wins, so that is the first.
 SECTIONS: dict[str, type[schema.Section]] = {
     "The whole file" if not path else header: model
     for header, path, model in reversed(schema.TABLES)
@@ -63,7 +64,7 @@ def table(columns: list[str], rows: list[list[str]]) -> str:
 
 def keys(model: type[schema.Section]) -> str:
     """Key, value, default and meaning of every key of a section."""
-    about = SPEC["$defs"].get(model.__name__, SPEC)
+    about = SPEC if model is schema.ProjectSpec else SPEC["$defs"][model.__name__]
     meant = meanings(model)
     if model is schema.ParameterSpec:
         meant = meanings(schema.PriorSpec) | meant

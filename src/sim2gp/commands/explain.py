@@ -90,17 +90,16 @@ def explain(
 ) -> MissingPhysics:
     """Search what the run's machine lacks.
 
-    Every effect of the library is scored, the best few are fitted; of a project file
-    that is as the run had it by so many processes, ``workers``. Raises `InputError`
-    E130 for a run of another command, and what reading the run's logs raises.
+    Every effect of the library is scored, the best few are fitted. With ``workers`` > 1
+    the fits run in that many processes if the project file has not changed since the
+    run, else in this one. Raises `InputError` E130 for a run of another command, and
+    what reading the run's logs raises.
     """
     started = time.perf_counter()
-    data = _data(run)
-    fits = None
-    match run:
-        case Identification(project=Project(can_be_loaded=True, path=path)):
-            if workers > 1:
-                fits = partial(_in_processes, path, _logs(run), workers)
+    logs = run.training_logs(alike=True) if isinstance(run, Identification) else ()
+    data, fits, project = _data(run, logs), None, run.project
+    if workers > 1 and logs and project is not None and project.can_be_loaded:
+        fits = partial(_in_processes, project.path, logs, workers)
     with (progress or Progress()).task("explain", 2 + REFITS) as task:
         found = search_missing(data, fits=fits, on_step=task.advance)
     candidates = candidate_rows(found)
@@ -129,18 +128,14 @@ def explain(
     )
 
 
-def _data(run: Identification | Demonstration) -> AbstractData:
+def _data(run: Identification | Demonstration, logs: Sequence[Log]) -> AbstractData:
     """The rows of a run, with their likelihood."""
     if isinstance(run, Identification):
         assert run.project is not None
-        return window_data(run.project, _logs(run), int(run.summary.get("seed", 0)))
+        return window_data(run.project, logs, int(run.summary.get("seed", 0)))
     if isinstance(run, Demonstration):
         return _flown(run)
     raise _nothing_to_explain(getattr(run, "path", run), getattr(run, "summary", {}))
-
-
-def _logs(run: Identification) -> tuple[Log, ...]:
-    return run.training_logs(alike=True)
 
 
 class RefitJob(NamedTuple):

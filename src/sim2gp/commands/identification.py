@@ -217,7 +217,8 @@ def project_of(
     """
     place = stood(run, stored.summary)
     found = load_project(run / PROJECT, place.parent, model, system=machine)
-    return replace(found, path=place)
+    # The copy's folder is the run's: what was moved is the copy alone.
+    return replace(found, path=place, own=model is not None or machine is not None)
 
 
 @in_float64

@@ -4,16 +4,18 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
+import numpy as np
 import tomlkit
 
 from sim2gp.data.logs import Log, RawLog, none_unused
 from sim2gp.errors import error
 from sim2gp.project.project import IN_MEMORY, Project
 from sim2gp.project.source import parsed
-from sim2gp.project.validate import validated
+from sim2gp.project.validate import validated, wrong_value
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.machine import as_machine
-from sim2gp.systems.variants import index_of
+from sim2gp.systems.variants import index_of, which
 
 Logs = Sequence[Log | RawLog] | Log | RawLog
 
@@ -23,17 +25,22 @@ def project_of_machine(
     *,
     name: str = "machine",
     likelihood: Mapping[str, Any] | None = None,
-    limits: Mapping[str, tuple[float, float]] | None = None,
-    rates: Mapping[str, float] | None = None,
+    limits: Mapping[str, Any] | None = None,
+    rates: Mapping[str, Any] | None = None,
 ) -> Project:
     """A project without a file; the tables are those of the project file.
 
     Raises `InputError` E141, E144 and E160 as `load_project` does.
     """
     tables = {"likelihood": likelihood, "limits": limits, "rates": rates}
-    stated = {table: dict(values) for table, values in tables.items() if values}
-    text = tomlkit.dumps({"system": IN_MEMORY} | stated)
-    source = parsed(text, f"{name} (in memory)")
+    stated = {table: _plain(values) for table, values in tables.items() if values}
+    where = f"{name} (in memory)"
+    try:
+        text = tomlkit.dumps({"system": IN_MEMORY} | stated)
+    except (ValueError, TypeError) as caught:
+        got, expected = repr(stated), "numbers, text, lists and tables of them"
+        raise wrong_value("E160", where, got, expected, "") from caught
+    source = parsed(text, where)
     spec, path = validated(source), Path(f"{name}.toml")
     return Project(path, source, spec, as_machine(machine), own=True)
 
@@ -73,12 +80,27 @@ def read_logs(
 ) -> tuple[Log, ...]:
     """Files of a project's machine, read as its own logs are (E101 to E141).
 
-    ``configuration`` names the machine's, where it has several (E152); ``strict``
-    refuses columns that nothing takes (E105).
+    ``configuration`` names the machine's, where it has several, or a group of logs
+    whose columns these files have (E152); ``strict`` refuses columns that nothing takes
+    (E105).
     """
-    index_of(configuration, machine.system.variants)
+    if machine.system.variants:
+        index_of(configuration, machine.system.variants)
+    elif configuration is not None and configuration not in machine.spec.configurations:
+        raise which(configuration, machine.spec.configurations)
     given = [files] if isinstance(files, Path | str) else list(files)
     found = machine.read_logs(given, configuration)
     if strict:
         none_unused(found)
     return found
+
+
+def _plain(value: Any) -> Any:
+    """Numbers of NumPy and JAX as Python's, mappings as dictionaries."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(x) for key, x in value.items()}
+    if isinstance(value, tuple | list):
+        return [_plain(x) for x in value]
+    if isinstance(value, np.ndarray | np.generic | jax.Array):
+        return np.asarray(value).tolist()
+    return value

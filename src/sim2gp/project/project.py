@@ -56,7 +56,7 @@ _PREFIX = re.compile(r"(?i)^(mujoco|mjcf|mjx|urdf|xml)\s*:\s*")
 class Project:
     """A validated project file; ``budget`` is what reading one of its logs may take.
 
-    ``own`` is one whose machine was given from Python.
+    ``own`` is one whose machine, model or folder was given from Python.
     """
 
     path: Path
@@ -69,9 +69,12 @@ class Project:
     @property
     def can_be_loaded(self) -> bool:
         """Whether another process gets the same project from its file."""
-        if self.own or not self.path.is_file():
+        if self.own:
             return False
-        return self.path.read_text(encoding="utf-8") == self.source.text
+        try:
+            return read_source(self.path).text == self.source.text
+        except InputError:
+            return False
 
     @property
     def name(self) -> str:
@@ -135,9 +138,9 @@ class Project:
                 try:
                     logs += self._read(path, group, spec)
                     break
-                except InputError as error:
-                    first = first or error
-                    if error.code != "E103":
+                except InputError as caught:
+                    first = first or caught
+                    if caught.code != "E103":
                         raise
             else:
                 raise first or _no_group(self.source)
@@ -225,7 +228,8 @@ def load_project(
 
     if system is not None and spec.system == IN_MEMORY:
         return Project(path, source, spec, as_machine(system), own=True)
-    own = system is not None
+    moved = folder is not None and folder.resolve() != path.parent.resolve()
+    own = system is not None or model is not None or moved
     if system is not None:
         system = build_own(spec, source, system)
     elif is_model(spec.system):

@@ -15,8 +15,7 @@ from jaxtyping import Float
 from markupsafe import Markup, escape
 
 from sim2gp.reports import frames, svg
-from sim2gp.reports.numbers import number
-from sim2gp.reports.parameters import Section
+from sim2gp.reports.parameters import Arrays, Section
 from sim2gp.reports.scenes import Scene, Shape, keep_frames, project, scene_of
 from sim2gp.reports.skeleton import overlaid, skeleton
 
@@ -33,7 +32,6 @@ _INK = {
 }  # fmt: skip
 
 States = Float[np.ndarray, "T n"]
-Arrays = Mapping[str, np.ndarray]
 
 
 def _front(corners: np.ndarray) -> bool:
@@ -163,10 +161,7 @@ def _strip(
         f'<line class="rule {css} cursor" x1="0" x2="0" y1="0" y2="{axes.size[1]:.1f}" '
         f'data-width="{axes.size[0]:.1f}"/>'
     )
-    seen = np.asarray(values, float)
-    seen = seen[np.isfinite(seen)]
-    ends = [number(float(end(seen))) for end in (np.min, np.max)] if seen.size else []
-    said = f"from {' to '.join(ends)} over {number(float(time[-1]))} s"
+    said = f"{svg.extent(values)}, time {svg.extent(time, 's')}"
     return svg.chart(axes, marks, title=name, said=said, unit=unit)
 
 
@@ -245,11 +240,12 @@ def player(about: Mapping[str, Any], arrays: Arrays) -> Section:
     film = _film(scene, dt * stride, marks, [math.ceil(r / stride) for r in rows])
     film = film[:-1] + frames.pictures(about, arrays) + "}"
     words = marks[0][1] if marks and marks[0][0] <= 0 else ""
+    size = about.get("frames")
     return {
         "title": title,
         "still": _still(scene, title, words),
         "film": Markup(film),
-        "canvas": about.get("frames"),
+        "canvas": {k: int(size[k]) for k in ("width", "height")} if size else None,
         "turns": scene.camera.turns,
         "recorded": other is not None,
         "strips": strips,

@@ -23,6 +23,11 @@ NARROW = 3  # columns that a telephone shows side by side
 COLOURS = ("c0", "c1", "c2", "c3", "c4", "c5")
 
 
+def colour(index: int) -> str:
+    """The class of the colour of a line; after six they begin again."""
+    return COLOURS[index % len(COLOURS)]
+
+
 def _sentence(item: object) -> object:
     if isinstance(item, Mapping):
         return item.get("text") or ", ".join(
@@ -55,7 +60,7 @@ def _tests(tests: Mapping[str, Any]) -> Table:
         chip = ("bad", "alarm") if test.get("alarm") else ("good", "passed")
         statistic, p = number(test.get("statistic")), _p_value(test.get("p"))
         tested = Cell(chip=chip) if is_number(test.get("p")) else MISSING
-        return [_TESTS.get(name, name), statistic, p, tested, test.get("text")]
+        return [_TESTS.get(name, name), statistic, p, tested, test.get("text") or ""]
 
     return table(
         ["what is asked of the residuals", "statistic", "p", "verdict", "in words"],
@@ -110,7 +115,7 @@ def _curve_of_shares(arrays: Arrays, name: str, index: int) -> Markup:
     levels = np.asarray(arrays["calibration/level"], float)
     share = np.asarray(arrays[f"calibration/share/{name}"], float)
     low, high = (arrays.get(f"calibration/{end}/{name}") for end in ("low", "high"))
-    ends, css = (0.0, 1.0), COLOURS[index % 6]
+    ends, css = (0.0, 1.0), colour(index)
     axes = svg.Axes(ends, ends, 440.0, 340.0, x_label="stated share")
     marks = [svg.line(axes, np.array(ends), np.array(ends), "quiet")]
     if low is not None and high is not None:
@@ -119,10 +124,11 @@ def _curve_of_shares(arrays: Arrays, name: str, index: int) -> Markup:
         marks.append(svg.dots(axes, levels[outside], share[outside], css))
     marks.append(svg.line(axes, levels, share, css))
     said = ", ".join(
-        f"of the {percent(a)} band {percent(b)}"
+        f"the {percent(a)} band holds {percent(b)}"
         for a, b in zip(levels, share, strict=True)
         if a in (levels[0], levels[-1])
     )
+    said = said or "no bands"
     return svg.chart(axes, marks, title=name, said=said, unit="share inside the band")
 
 
@@ -169,7 +175,7 @@ def _curve(
         svg.span(horizon, margin=0.0), (0.0, top), 440.0, 230.0, x_label="horizon, s"
     )
     marks = [
-        svg.line(axes, horizon, curve, COLOURS[methods.index(method) % 6])
+        svg.line(axes, horizon, curve, colour(methods.index(method)))
         for method, curve in reversed(curves.items())
     ]
     unit, last = unit_of(summary, channel), horizon[-1:]
@@ -205,7 +211,7 @@ def held_out(summary: Summary, arrays: Arrays) -> Section:
         "curves": [_curve(summary, arrays, channel, methods) for channel in channels],
         "forecasts": forecasts(summary, arrays, "unseen"),
     }
-    keys = [(COLOURS[i % 6], m) for i, m in enumerate(methods)]
+    keys = [(colour(i), m) for i, m in enumerate(methods)]
     return found | {"legend": keys} if any(found.values()) else None
 
 

@@ -64,7 +64,8 @@ def _problems(summary: Summary) -> list[tuple[str, str]]:
         found.append(("warn", text))
     explains = summary.get("command") == "explain"  # its headline says it
     if isinstance(misfit, Mapping) and misfit.get("alarm") and not explains:
-        found.append(("warn", str(misfit.get("verdict"))))
+        verdict = misfit.get("verdict") or "The residuals contradict the model."
+        found.append(("warn", str(verdict)))
     for item in summary.get("prior_conflicts") or ():
         found.append(("warn", f"Data against prior: {_said(item)}"))
     flat = [d for d in summary.get("directions") or () if d.get("flat")]

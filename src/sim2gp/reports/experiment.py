@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 
 from sim2gp.reports import svg
-from sim2gp.reports.numbers import number
 from sim2gp.reports.parameters import Arrays, Section, Summary
 
 _SIZE = 420.0, 190.0
@@ -69,6 +68,5 @@ def _chart(
     if len(values) == 3:
         marks.append(svg.band(axes, t, values[1], values[2], "c1"))
     marks.append(svg.line(axes, t, values[0], "c1"))
-    ends = (number(float(end(values[0]))) for end in (np.nanmin, np.nanmax))
-    said = f"from {' to '.join(ends)} over {number(float(t[-1] - t[0]))} s"
+    said = f"{svg.extent(values[0])}, time {svg.extent(t, 's')}"
     return svg.chart(axes, marks, title=name, said=said, unit=unit)

@@ -5,8 +5,8 @@ from statistics import median
 from typing import Any
 
 from sim2gp.reports.numbers import number
+from sim2gp.reports.parameters import Summary
 
-Summary = Mapping[str, Any]
 MANY = 4  # names that a sentence lists
 
 

@@ -127,7 +127,8 @@ def _density(
         away = (float(entry["mean"]) - truth) / float(entry["sd"])
         caption += f"; truth {number(truth, 4)}, {abs(away):.1f} sd away"
     before = plus_minus(entry.get("prior_mean"), entry.get("prior_sd"))
-    said = f"{before} before the data, {caption} after"
+    said = "" if before == MISSING else f"{before} before the data, "
+    said += "a curve" if caption == MISSING else f"{caption} after the data"
     unit = unit_text(entry.get("unit"))
     return {
         "drawing": svg.chart(axes, marks, title=name, said=said, unit=unit),
@@ -208,6 +209,8 @@ def _matrix(names: list[str], correlation: np.ndarray) -> Markup:
 def _strongest(names: list[str], correlation: np.ndarray) -> str:
     """The largest correlation in words."""
     below = np.tril(np.isfinite(correlation), -1)
+    if not below.any():
+        return "posterior correlations: none is known"
     off = np.where(below, np.abs(correlation), -1.0)  # what is not known never wins
     i, j = np.unravel_index(int(np.argmax(off)), off.shape)
     r = number(float(correlation[i, j]), 2)

@@ -5,8 +5,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from sim2gp.reports import svg
-from sim2gp.reports.data import COLOURS
-from sim2gp.reports.numbers import is_number, number
+from sim2gp.reports.data import COLOURS, colour
+from sim2gp.reports.numbers import MISSING, is_number, number
 from sim2gp.reports.parameters import Arrays, Section, Summary
 from sim2gp.reports.tables import Cell, Table, table
 
@@ -25,7 +25,8 @@ def _series(summary: Summary, arrays: Arrays) -> dict[str, np.ndarray]:
             name: np.atleast_2d(np.asarray(values, dtype=float))
             for name, values in named.items()
         }
-    return {name: value for name, value in found.items() if value.size}
+    known = {name: x[np.isfinite(x).any(axis=1)] for name, x in found.items()}
+    return {name: value for name, value in known.items() if value.size}
 
 
 def _lines(axes: svg.Axes, values: np.ndarray, css: str) -> list[str]:
@@ -82,6 +83,12 @@ def _methods(summary: Summary, series: Mapping[str, np.ndarray]) -> Table:
     return table(columns, rows, words=(0,), cards=True)
 
 
+def _median(values: np.ndarray) -> str:
+    """The median of what is known."""
+    known = values[np.isfinite(values)]
+    return number(float(np.median(known))) if known.size else MISSING
+
+
 def method_name(method: str) -> str:
     """The words for a method's key."""
     return method.replace("_", " ")
@@ -93,7 +100,9 @@ def returns(summary: Summary, arrays: Arrays) -> Section:
     A study has hundreds of them, and figures and tables of its own.
     """
     series = _series(summary, arrays)
-    if not 0 < len(series) <= len(COLOURS):
+    if len(series) > len(COLOURS):
+        return {"many": len(series)}
+    if not series:
         return None
     references = {
         words: float(summary[key])
@@ -110,15 +119,16 @@ def returns(summary: Summary, arrays: Arrays) -> Section:
         svg.level(axes, value, "quiet", words) for words, value in references.items()
     ]
     for index, values in enumerate(series.values()):
-        marks += _lines(axes, values, COLOURS[index % len(COLOURS)])
+        marks += _lines(axes, values, colour(index))
     said = "; ".join(
-        f"{method_name(name)} {number(float(np.nanmedian(values[:, 0])))} in the first "
-        f"episode, {number(float(np.nanmedian(values[:, -1])))} in the last"
+        f"{method_name(name)} {_median(values[:, 0])} in the first episode, "
+        f"{_median(values[:, -1])} in the last"
         for name, values in series.items()
     )
-    keys = [(COLOURS[i % 6], method_name(name)) for i, name in enumerate(series)]
+    keys = [(colour(i), method_name(name)) for i, name in enumerate(series)]
     scored = {"oracle", "hanging"} <= references.keys()
     return {
+        "many": 0,
         "legend": keys if len(keys) > 1 else [],
         "drawing": svg.chart(axes, marks, title="return", said=said),
         "methods": _methods(summary, series),

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from markupsafe import Markup, escape
 
-from sim2gp.reports.numbers import power_of_ten
+from sim2gp.reports.numbers import number, power_of_ten
 
 _TOP, _RIGHT = 26.0, 10.0
 _DIGIT_WIDTH = 6.6  # pixels of a digit of the tick labels
@@ -78,6 +78,16 @@ def span(*values: np.ndarray | float, margin: float = 0.06) -> tuple[float, floa
     if high - low <= 1e-9 * max(abs(low), abs(high)):
         pad = 0.05 * max(abs(low), abs(high)) or 1.0
     return low - pad, high + pad
+
+
+def extent(values: np.ndarray | float, unit: str = "") -> str:
+    """The least and the largest finite value in words, with their unit."""
+    flat = np.ravel(np.asarray(values, dtype=float))
+    flat = flat[np.isfinite(flat)]
+    if flat.size == 0:
+        return "no values"
+    text = f"from {number(float(flat.min()))} to {number(float(flat.max()))}"
+    return f"{text} {unit}".rstrip()
 
 
 def ticks(

@@ -27,8 +27,8 @@ class Cell:
     @property
     def empty(self) -> bool:
         """Whether nothing is shown."""
-        shown = (self.text, self.name, self.unit, self.chip, self.why)
-        return self.share is None and not any(str(x) for x in shown if x is not None)
+        shown = (str(self.text), self.share, self.name, self.unit, self.chip, self.why)
+        return not any(shown)
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,10 @@ def table(
     prose: bool = True,
 ) -> Table:
     """A table whose cells may be plain text."""
-    cells = [[x if isinstance(x, Cell) else Cell(x) for x in row] for row in rows]
+    cells = [
+        [x if isinstance(x, Cell) else Cell("" if x is None else x) for x in row]
+        for row in rows
+    ]
     return Table(columns, cells, words, cards, prose)
 
 

@@ -35,6 +35,7 @@ def _environment() -> "Environment":
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
+        keep_trailing_newline=True,
     )
     made.filters |= {"breakable": breakable, "coded": coded}
     return made

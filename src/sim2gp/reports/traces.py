@@ -70,9 +70,8 @@ def _trace(
         gap = curves["predicted"] - curves["measured"]
         if np.isfinite(gap).any():
             remark = f"rms difference {number(float(np.sqrt(np.nanmean(gap**2))))}"
-    seconds = " to ".join(number(float(t)) for t in svg.span(time, margin=0.0))
     kinds = " and ".join(kind for kind in ("measured", "predicted") if kind in curves)
-    said = f"{kinds} from {seconds} s; {remark}"
+    said = f"{kinds}, time {svg.extent(time, 's')}" + (f"; {remark}" if remark else "")
     return svg.chart(
         axes, marks, title=title, said=said, unit=unit, remark=f"{remark} {unit}"
     )

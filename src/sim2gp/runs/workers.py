@@ -146,9 +146,9 @@ def _serve(work: Callable[[Any], Any], jobs: Any, results: Any) -> None:
         for number, job in enumerate(group, first):
             try:
                 results.put((number, work(job), None))
-            except Sim2GPError as error:
-                fields = {name: str(value) for name, value in vars(error).items()}
-                results.put((number, None, (type(error).__name__, fields)))
+            except Sim2GPError as caught:
+                fields = {name: str(value) for name, value in vars(caught).items()}
+                results.put((number, None, (type(caught).__name__, fields)))
                 return
 
 

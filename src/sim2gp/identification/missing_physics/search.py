@@ -119,7 +119,9 @@ def search(
         else:
             found.append(fit)
         on_step(f"no fit with {name}" if fit is None else f"fitted with {name}")
-    found.sort(key=lambda refit: -refit.gain)
+    rank = {one.candidate.name: k for k, one in enumerate(ranked)}  # not who was first
+    failed.sort(key=lambda name: rank[name])
+    found.sort(key=lambda fit: (-fit.gain, rank[fit.scored.candidate.name]))
     return Search(bare, tuple(scored), tuple(found), tuple(failed))
 
 
