@@ -26,6 +26,7 @@ _CONTENTS = {
     "apply": "commands.apply",
     "export": "commands.export",
     "demo": "commands.demo",
+    "example": "commands.example",
     "init": "commands.init",
     "selftest": "commands.selftest",
     "reproduce": "commands.reproduce",

@@ -18,7 +18,14 @@ from sim2gp.cli.late import (
     identification,
     run_directory,
 )
-from sim2gp.cli.log_commands import Compare, Evaluate, Explain, Identify, Init
+from sim2gp.cli.log_commands import (
+    Compare,
+    Evaluate,
+    Example,
+    Explain,
+    Identify,
+    Init,
+)
 from sim2gp.cli.options import (
     Chosen,
     Common,
@@ -248,6 +255,7 @@ class Reproduce(Writes):
 
 COMMANDS: dict[str, type[Common]] = {
     "demo": Demo,
+    "example": Example,
     "init": Init,
     "identify": Identify,
     "evaluate": Evaluate,

@@ -35,6 +35,19 @@ from sim2gp.runs.store import check_absent, read_run
 
 
 @dataclass(kw_only=True)
+class Example(Common):
+    """Write a complete small project to begin with: model, logs, project file."""
+
+    folder: Annotated[Positional[Path], arg(metavar="FOLDER")]
+    """A new folder."""
+
+    def run(self, call: Call) -> dict[str, Any]:
+        check_absent(self.folder)
+        path = command("example")(self.folder, progress=call.progress)
+        return {"project": str(path)}
+
+
+@dataclass(kw_only=True)
 class Init(Common):
     """Draft a project file from a model and logs: columns, signs, units, zeros."""
 
