@@ -71,12 +71,11 @@ class Init(Common):
     """Draws the phases of the first experiment."""
 
     def run(self, call: Call) -> dict[str, Any]:
-        out = self.out or Path(Path(self.model).stem + ".toml")
-        check_absent(out)
+        check_absent(self.out or Path(f"{Path(self.model).stem}.toml"))
         return command("init")(
             self.model,
             self.logs,
-            out=out,
+            out=self.out,
             root=self.root,
             period=self.period,
             constant=numbers("--constant", self.constant),

@@ -18,29 +18,37 @@ from sim2gp.systems.base import AbstractSystem
 
 
 def init(
-    model: str,
-    logs: Sequence[Path],
+    model: Path | str,
+    logs: Sequence[Path | str] = (),
     *,
-    out: Path,
-    root: Path | None,
-    period: float | None,
-    constant: Mapping[str, float],
-    readings: bool,
-    seconds: float,
-    seed: int,
-    progress: Progress,
+    out: Path | str | None = None,
+    root: Path | None = None,
+    period: float | None = None,
+    constant: Mapping[str, float] | None = None,
+    readings: bool = True,
+    seconds: float = 60.0,
+    seed: int = 0,
+    progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Write the project file, and without logs a first experiment; the summary.
+    """Write the project file ``out``, and without logs a first experiment; the summary.
 
-    Raises `InputError` as `sim2gp.project.draft.draft_project` does.
+    ``model`` is a bundled machine's name or a model's file, whose name is ``out``'s
+    where that is None. ``root`` holds all files of the model, ``period`` is the time
+    between rows in s where no column says it, ``constant`` the inputs without a column.
+    ``readings`` tries signs, units and zeros, in so many ``seconds``. Raises
+    `InputError` as `sim2gp.project.draft.draft_project` does, and E132 where ``out``
+    exists.
     """
+    progress = progress or Progress()
+    out = Path(f"{Path(model).stem}.toml" if out is None else out)
+    check_absent(out)
     asked = Request(
-        model,
-        logs,
+        str(model),
+        [Path(log) for log in logs],
         out,
         root=root,
         period=period,
-        constant=constant,
+        constant=constant or {},
         readings=readings,
         seconds=seconds,
         started=time.monotonic(),
