@@ -177,6 +177,7 @@ def test_every_page_and_package_stands_in_the_navigation_once() -> None:
     expected = [page.name for page in DOCS.glob("*.md")]
     expected += [f"reference/{name}.md" for name in ["index", *STAGE.modules()]]
     expected += STAGE.TOP.values()
+    expected += [f"example_{file.stem}.md" for file in (ROOT / "examples").glob("*.py")]
     assert sorted(navigation(project["nav"])) == sorted(expected)
 
 
@@ -205,7 +206,7 @@ def test_pages_are_staged(tmp_path: Path) -> None:
     assert "```python\n" in text
     assert "```python nightly" not in text
     assert fence.findall(text) == fence.findall(page.read_text(encoding="utf-8"))
-    assert "](contributing.md#a-new-system)" in text
+    assert "](contributing.md#how-to-add)" in text
     links = (
         "[a](images/demo.gif) [b](../README.md#c) [d](theory.md#e) [f](https://x.y/z)"
     )
@@ -214,6 +215,17 @@ def test_pages_are_staged(tmp_path: Path) -> None:
         f"[a]({file}) [b](reference/index.md#c) [d](theory.md#e) [f](https://x.y/z)"
     )
     assert (tmp_path / file).read_bytes() == (DOCS / "images/demo.gif").read_bytes()
+
+
+def test_a_notebook_is_a_page_and_a_file() -> None:
+    text = "# %% [markdown]\n# # A `b`\n#\n# word\n\n# %%\nx = 1\ny = 2\n"
+    assert STAGE.as_page(text) == "# A `b`\n\nword\n\n```python\nx = 1\ny = 2\n```\n"
+    made = json.loads(STAGE.as_notebook(text))
+    assert [(c["cell_type"], "".join(c["source"])) for c in made["cells"]] == [
+        ("markdown", "# A `b`\n\nword"),
+        ("code", "x = 1\ny = 2"),
+    ]
+    assert (made["nbformat"], made["nbformat_minor"]) == (4, 5)
 
 
 def test_code_keeps_what_looks_like_a_link(tmp_path: Path) -> None:

@@ -8,9 +8,12 @@ does that of a part of a project file, which names the system that completes it)
 link that leaves docs/ takes its target along, since a site is one folder; and what
 README calls the tree is the reference. That has a page for each package of sim2gp, and
 one for the modules beside them, so that a new module is in it without being entered.
+
+Notebooks of examples/ become pages, with a file for Jupyter and Colab next to each.
 """
 
 import ast
+import json
 import re
 import shutil
 import sys
@@ -36,6 +39,13 @@ def main(out: Path) -> None:
     (out / "reference").mkdir(parents=True)
     for page in sorted((ROOT / "docs").glob("*.md")):
         (out / page.name).write_text(staged(page, out), encoding="utf-8")
+    for file in sorted((ROOT / "examples").glob("*.py")):
+        text = file.read_text(encoding="utf-8")
+        page = relinked_code(as_page(text), file, out)
+        name = f"{file.stem}.ipynb"
+        page += f"\nThis page as a notebook, for Jupyter and Colab: [{name}]({name}).\n"
+        (out / f"example_{file.stem}.md").write_text(page, encoding="utf-8")
+        (out / f"{file.stem}.ipynb").write_text(as_notebook(text), encoding="utf-8")
     for name, target in TOP.items():
         (out / target).write_text(staged(ROOT / name, out), encoding="utf-8")
     (out / "assets").mkdir()
@@ -47,13 +57,63 @@ def main(out: Path) -> None:
 
 def staged(page: Path, out: Path) -> str:
     """The text of a page of the repository as a page of the site."""
-    text = FENCE.sub(r"```\1", page.read_text(encoding="utf-8"))
+    return relinked_code(page.read_text(encoding="utf-8"), page, out)
+
+
+def relinked_code(text: str, page: Path, out: Path) -> str:
+    """The text of a page with links of the site, and plain fences."""
+    text = FENCE.sub(r"```\1", text)
     # Code keeps its brackets: a link is looked for between the pieces of code alone.
     pieces, end = [], 0
     for code in CODE.finditer(text):
         pieces += [relinked(text[end : code.start()], page, out), code[0]]
         end = code.end()
     return "".join([*pieces, relinked(text[end:], page, out)])
+
+
+def cells(text: str) -> list[tuple[str, str]]:
+    """The cells of a notebook in py:percent form: their kind and their text."""
+    found = []
+    for part in re.split(r"^# %%", text, flags=re.MULTILINE)[1:]:
+        head, _, body = part.partition("\n")
+        if "[markdown]" in head:
+            lines = [
+                line.removeprefix("#").removeprefix(" ") for line in body.split("\n")
+            ]
+            found.append(("markdown", "\n".join(lines).strip()))
+        else:
+            found.append(("code", body.strip()))
+    return found
+
+
+def as_page(text: str) -> str:
+    """A notebook as a page."""
+    parts = [
+        body if kind == "markdown" else f"```python\n{body}\n```"
+        for kind, body in cells(text)
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def as_notebook(text: str) -> str:
+    """A notebook as Jupyter and Colab read it (nbformat 4.5)."""
+    made = []
+    for number, (kind, body) in enumerate(cells(text)):
+        cell: dict[str, object] = {"cell_type": kind, "id": f"cell{number}"}
+        cell |= {"metadata": {}, "source": body.splitlines(keepends=True)}
+        if kind == "code":
+            cell |= {"execution_count": None, "outputs": []}
+        made.append(cell)
+    spec = {"name": "python3", "display_name": "Python 3", "language": "python"}
+    return json.dumps(
+        {
+            "nbformat": 4,
+            "nbformat_minor": 5,
+            "metadata": {"kernelspec": spec},
+            "cells": made,
+        },
+        indent=1,
+    )
 
 
 def relinked(text: str, page: Path, out: Path) -> str:
