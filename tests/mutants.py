@@ -1,82 +1,68 @@
-"""Faults that the tests must see: each is put into a copy of the package and hunted.
+"""Errors that the tests must find: each is put into a copy of the package.
 
     python tests/mutants.py            all of them, a table, exit code 1 if one survives
     python tests/mutants.py prior      those whose name contains "prior"
 
-The lists are in the files `mutant_*.py` beside this one.
+They are listed in mutants.toml. What they guard is mathematics, security and data.
 """
 
+import ast
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
+import tomllib
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
-
-from mutant_configurations import CONFIGURATIONS
-from mutant_descent import DESCENTS
-from mutant_design import DESIGN
-from mutant_draft import FIRST_DRAFT
-from mutant_effects import EFFECTS
-from mutant_exploring import EXPLORING
-from mutant_inputs import INPUTS
-from mutant_interop import INTEROP
-from mutant_intervals import INTERVALS
-from mutant_list import MUTANTS as PHYSICS
-from mutant_list import Hunt, Mutant
-from mutant_logs import LOGS
-from mutant_misfit import MISFIT
-from mutant_mujoco import ON_THE_HOST
-from mutant_networks import NETWORKS
-from mutant_sac import OFF_POLICY
-from mutant_slopes import SLOPES_OF_STEPS
-from mutant_studies import STUDIES
-
-MUTANTS = (
-    *PHYSICS,
-    *DESCENTS,
-    *NETWORKS,
-    *MISFIT,
-    *STUDIES,
-    *EXPLORING,
-    *DESIGN,
-    *FIRST_DRAFT,
-    *EFFECTS,
-    *OFF_POLICY,
-    *ON_THE_HOST,
-    *SLOPES_OF_STEPS,
-    *LOGS,
-    *INPUTS,
-    *INTEROP,
-    *INTERVALS,
-    *CONFIGURATIONS,
-)
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "src" / "sim2gp"
+TABLE = Path(__file__).with_name("mutants.toml")
 
 
-def hunt(package: Path, hunt: Hunt) -> tuple[bool, str]:
-    """Whether the tests fail on this copy of the package, and the first that does."""
-    name, only = hunt
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider"]
-    command += [f"tests/{name}", "--durations=0", "--durations-min=1000", "--tb=no"]
-    command += ["-k", only] if only else []
-    path = os.pathsep.join([str(package.parent), os.environ.get("PYTHONPATH", "")])
-    env = os.environ | {"PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1"}
-    done = subprocess.run(
-        command, cwd=ROOT, env=env, capture_output=True, text=True, timeout=900
-    )
-    if done.returncode not in (0, 1):  # nothing collected, or pytest itself failed
-        raise RuntimeError(
-            f"{name}: pytest ended with {done.returncode}\n{done.stdout}"
+@dataclass(frozen=True)
+class Mutant:
+    """``old`` becomes ``new`` in ``file``; ``only`` of the ``tests`` must then fail."""
+
+    name: str
+    file: str
+    old: str
+    new: str
+    tests: str
+    only: str = ""
+
+    def apply(self, package: Path) -> None:
+        """Patch a copy of the package; it must still be Python."""
+        path = package / self.file
+        source = path.read_text()
+        if source.count(self.old) != 1:
+            raise LookupError(f"{self.name}: found {source.count(self.old)} times")
+        changed = source.replace(self.old, self.new)
+        ast.parse(changed)
+        path.write_text(changed)
+
+    def fails(self, package: Path) -> tuple[bool, str]:
+        """Whether the tests fail on this copy of the package, and which one first."""
+        command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider"]
+        command += [f"tests/{self.tests}", "--durations=0", "--durations-min=1000"]
+        command += ["--tb=no", *(["-k", self.only] if self.only else [])]
+        path = os.pathsep.join([str(package.parent), os.environ.get("PYTHONPATH", "")])
+        env = os.environ | {"PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1"}
+        done = subprocess.run(
+            command, cwd=ROOT, env=env, capture_output=True, text=True, timeout=900
         )
-    failed = [line for line in done.stdout.splitlines() if line.startswith("FAILED")]
-    failed += [line for line in done.stdout.splitlines() if line.startswith("ERROR")]
-    what = failed[0].split("::")[1].split(" - ")[0] if failed else ""
-    return done.returncode == 1, what
+        if done.returncode not in (0, 1):  # nothing collected, or pytest itself failed
+            raise RuntimeError(f"{self.tests}: pytest {done.returncode}\n{done.stdout}")
+        lines = done.stdout.splitlines()
+        failed = [line for line in lines if line.startswith(("FAILED", "ERROR"))]
+        what = failed[0].split("::")[1].split(" - ")[0] if failed else ""
+        return done.returncode == 1, what
+
+
+MUTANTS = tuple(Mutant(**row) for row in tomllib.loads(TABLE.read_text())["mutant"])
 
 
 def copy_of_the_package(folder: str) -> Path:
@@ -85,23 +71,23 @@ def copy_of_the_package(folder: str) -> Path:
 
 
 def survivors(mutants: Iterable[Mutant]) -> list[str]:
-    """Hunt each mutant, print a line for each, and name those that live."""
+    """Test each mutant, print a line for each, and name those that survive."""
     mutants, alive = list(mutants), []
     with tempfile.TemporaryDirectory() as folder:
         package = copy_of_the_package(folder)
-        for healthy in sorted({m.hunt for m in mutants}):
-            if hunt(package, healthy)[0]:
-                raise RuntimeError(f"{healthy} fails without any mutant")
-    print(f"{'mutant':38} {'verdict':9} {'s':>4}  by")
+        for each in {(m.tests, m.only): m for m in mutants}.values():
+            if each.fails(package)[0]:
+                raise RuntimeError(f"{each.tests} fails without any mutant")
+    print(f"{'mutant':46} {'verdict':9} {'s':>4}  by")
     for mutant in mutants:
         start = time.monotonic()
         with tempfile.TemporaryDirectory() as folder:
             package = copy_of_the_package(folder)
             mutant.apply(package)
-            killed, by = hunt(package, mutant.hunt)
+            killed, by = mutant.fails(package)
         seconds = time.monotonic() - start
         verdict = "killed" if killed else "SURVIVED"
-        print(f"{mutant.name:38} {verdict:9} {seconds:4.0f}  {by}", flush=True)
+        print(f"{mutant.name:46} {verdict:9} {seconds:4.0f}  {by}", flush=True)
         alive += [] if killed else [mutant.name]
     print(f"{len(mutants) - len(alive)} of {len(mutants)} killed")
     return alive

@@ -129,7 +129,7 @@ class LogSpec(Section):
     alone."""
     time: str | ColumnSpec | None = None
     """The column of time, s, or in full as a column; "header" or "log" in a bag; the
-    column `time` if neither it nor `period` stands."""
+    column `time` if neither it nor `period` is given."""
     period: Positive | None = None
     """Seconds between rows, where no column says the time."""
     episode: str | None = None
@@ -182,7 +182,7 @@ class LikelihoodSpec(Section):
     """The fit's windows: their length, their starts, and the noise."""
 
     window: Annotated[FiniteFloat, Field(ge=0)] = 0.2
-    """Seconds that the simulator runs before it starts anew; 0 predicts one row from
+    """Seconds that the simulator runs before it starts again; 0 predicts one row from
     the last, and needs every state measured."""
     start: Literal["smoothed", "causal"] = "smoothed"
     """A window's start is guessed from the samples around it, or from the past alone as
