@@ -93,7 +93,7 @@ def test_tables_for_people(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     stub_commands.install(monkeypatch, demo=demo(lambda progress: None))
-    assert main(["demo", "--quiet"]) == 0
+    assert main(["demo", "--quiet", "--verbose"]) == 0
     said = capsys.readouterr()
     assert said.err == ""
     rows = [[c for c in line.split() if c != "│"] for line in said.out.splitlines()]

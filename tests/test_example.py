@@ -37,7 +37,7 @@ def test_the_readme_names_commands_and_the_truth(folder: Path) -> None:
     text = (folder / "README.md").read_text()
     named = re.findall(r"sim2gp (\w+) ", text)
     assert set(named) <= set(COMMANDS)
-    stated = re.findall(r"(\w+) = ([\d.]+)", text)
+    stated = re.findall(r"([\w.]+) = ([\d.]+)", text)
     assert {name: float(x) for name, x in stated} == TRUTH
 
 

@@ -151,7 +151,7 @@ def test_identify_forecasts_a_log_that_it_left_out(run: Path) -> None:
     ratio = about["trivial"]["alpha"]["ratio"]
     assert ratio < 0.2
     for words in (about["headline"], (run / "report.html").read_text()):
-        assert "A fit that had not seen log2 forecasts it 0.5 s ahead" in words
+        assert "A fit without log2 predicts it 0.5 s ahead" in words
         assert f"rad, {ratio:.2g} times the error of holding still" in words
     assert about["calibration"]["channels"]["alpha"]["verdict"] == "too few to say"
     logs = {key.split("/")[1] for key in x if key.startswith("unseen/")}

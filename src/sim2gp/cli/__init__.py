@@ -99,9 +99,26 @@ def _run(args: list[str]) -> int:
     if command.json:
         sys.stdout.write(to_json(summary))
     else:
-        print_summary(summary, f"sim2gp {name}")
+        run = call.run
+        print_summary(
+            summary,
+            f"sim2gp {name}",
+            answers=_answers(summary, run) if run else None,
+            report=str(run / "report.html") if run else "",
+            verbose=command.verbose,
+        )
     sys.stdout.flush()
     return BUG if summary.get("passed") is False else OK
+
+
+def _answers(summary: dict[str, Any], run: Path) -> dict[str, str]:
+    """What the report says first, with the run's own folder in its commands."""
+    if summary.get("command") != "identify":
+        return {}
+    from sim2gp.reports.glance import glance
+
+    place = shlex.quote(str(run))
+    return {q: text.replace("RUN", place) for q, text in glance(summary).items()}
 
 
 def _warner(progress: Progress, other: Callable[..., None]) -> Callable[..., None]:

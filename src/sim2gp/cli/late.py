@@ -15,12 +15,16 @@ from sim2gp.runs import Progress, new_run
 from sim2gp.runs.store import check_target, read_run
 
 
-@dataclass(frozen=True)
+@dataclass
 class Call:
-    """How a command was called: what shows its progress, and the line as typed."""
+    """How a command was called: what shows its progress, and the line as typed.
+
+    ``run`` is the folder that it wrote.
+    """
 
     progress: Progress
     line: str
+    run: Path | None = None
 
     def saved(self, out: Path, make: Callable[[], Any]) -> dict[str, Any]:
         """Write the run of the result that ``make`` returns; its summary.
@@ -31,6 +35,7 @@ class Call:
         with new_run(out, name) as writer:
             result = make().with_entries(command_line=self.line).at(out)
             result.write(writer)
+        self.run = out
         summary: dict[str, Any] = result.summary
         return summary
 

@@ -59,6 +59,8 @@ class Common:
     """Print the summary alone, as JSON, on stdout."""
     quiet: Flag = False
     """No progress and no notes."""
+    verbose: Flag = False
+    """Print all numbers of the summary, not only what matters."""
     debug: Flag = False
     """Show the traceback of an error."""
 

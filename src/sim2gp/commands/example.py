@@ -1,8 +1,8 @@
 """Example: a complete small project to begin with, from nothing but this package.
 
-A horizontal arm of two rods swings for ten seconds, twice. Its masses and its friction
-are not those that its project file assumes: what the first `identify` finds can be
-compared with `TRUTH`.
+A horizontal arm of two rods swings for ten seconds, twice. Its masses, its friction and
+its motors' delay are not those that its project file assumes: what the first `identify`
+finds can be compared with `TRUTH`.
 """
 
 import csv
@@ -23,11 +23,14 @@ from sim2gp.systems import UniformRodArm
 from sim2gp.types import in_float64
 
 #: Masses in kg and viscous friction in N m s/rad of the arm that was recorded.
-TRUTH = {"m1": 1.15, "b1": 0.13, "m2": 0.65, "b2": 0.06}
+MECHANICS = {"m1": 1.15, "b1": 0.13, "m2": 0.65, "b2": 0.06}
+LATE = 2  # rows from a command to its torque
 PERIOD, SECONDS = 0.005, 10.0  # s: between rows, of a log
 ENCODER = 5e-4  # rad, sd of an encoder's noise
-TORQUE = (0.8, 0.3)  # N m, amplitude of each sine
+TORQUE = (0.6, 0.2)  # N m, amplitude of each sine
 FREQUENCIES = (0.4, 0.9, 1.7)  # Hz
+
+TRUTH = MECHANICS | {"torque1.delay": LATE * PERIOD}
 
 MODEL = """\
 <!-- A horizontal arm of two uniform rods, as its drawing has it. -->
@@ -52,14 +55,18 @@ MODEL = """\
 </mujoco>
 """
 PROJECT = """\
-# What is known of the arm, and where its recordings are.
+# What is known of the arm before the logs, and where its logs are.
 system = "uniform_rod_arm"        # bundled; arm.xml is the same arm for MuJoCo
 
 [parameters]                      # masses and friction of both joints are learned
-m1 = {mean = 1.0, sd = 0.3}       # kg, from the drawing
+m1 = {mean = 1.0, sd = 0.3}       # kg: from the drawing, known to about 0.3 kg
 m2 = {mean = 0.8, sd = 0.3}
-b1 = {low = 0.01, high = 0.5}     # N m s/rad, anywhere between
+b1 = {low = 0.01, high = 0.5}     # N m s/rad: anywhere between
 b2 = {low = 0.01, high = 0.5}
+
+[actuators."*"]                   # both motors answer a little late
+delay = {low = 0.0, high = 0.03}  # s
+tie = true                        # with the same delay
 
 [[logs]]
 files = ["first.csv", "second.csv"]
@@ -69,30 +76,33 @@ q2 = "q2"
 torque1 = "torque1"
 torque2 = "torque2"
 
-[limits]                          # of the next experiment
+[limits]                          # rad: of the arm; samples beyond them are not used
 q1 = [-3.0, 3.0]
 q2 = [-2.5, 2.5]
 """
 README = """\
 # An arm and two recordings of it
 
-    sim2gp identify arm.toml           # masses and friction, with intervals; a report
-    sim2gp evaluate arm.toml           # each recording predicted by a fit of the other
+    sim2gp identify arm.toml           # masses, friction and delay, with intervals
+    sim2gp evaluate arm.toml           # each log predicted by a fit of the other
     sim2gp explain runs/arm            # is physics missing?
     sim2gp design runs/arm             # which experiment would tell more?
 
 `arm.toml` says what is known of the arm. `first.csv` and `second.csv` have time in s,
-encoder angles in rad and torques in N m, 200 rows a second. The recorded arm has
+encoder angles in rad and commanded torques in N m, 200 rows a second. The recorded arm
+has
 
 {truth}
 
-so the drawing is wrong about both masses. `identify` does not know these numbers.
+so the drawing is wrong about both masses. `identify` does not know these numbers. Its
+results are in `runs/arm/`: open `report.html`.
 
 `arm.xml` is the same arm as a MuJoCo model. With `pip install 'sim2gp[mujoco]'`
 
     sim2gp init arm.xml first.csv second.csv --out mujoco.toml
 
-drafts a project file for it, as for a robot of your own.
+drafts a project file for it, as for a robot of your own, and
+`sim2gp identify mujoco.toml` fits that.
 """
 
 
@@ -104,8 +114,9 @@ def example(folder: Path | str, *, progress: Progress | None = None) -> Path:
     """
     folder = Path(folder)
     check_absent(folder)
+    table = UniformRodArm().parameters
     truth = "\n".join(
-        f"    {name} = {value:g} {UniformRodArm().parameters[name].unit}"
+        f"    {name} = {value:g} {table[name].unit if name in MECHANICS else 's'}"
         for name, value in TRUTH.items()
     )
     texts = {
@@ -135,7 +146,8 @@ def _recorded(seed: int) -> Float[np.ndarray, "T 5"]:
     phase = rng.uniform(0.0, 2.0 * np.pi, (2, len(FREQUENCIES)))
     turns = 2.0 * np.pi * np.multiply.outer(time, np.asarray(FREQUENCIES))
     torque = np.asarray(TORQUE) * np.sin(turns[:, None] + phase).mean(axis=-1)
-    angle = np.asarray(_swung(jnp.asarray(torque)))
+    late = np.concatenate([np.zeros((LATE, 2)), torque[:-LATE]])
+    angle = np.asarray(_swung(jnp.asarray(late)))
     noise = ENCODER * rng.standard_normal(angle.shape)
     return np.column_stack([time, angle + noise, torque])
 
@@ -145,7 +157,7 @@ def _swung(torque: Float[Array, "T 2"]) -> Float[Array, "T 2"]:
     """Both angles at each row, from rest."""
     arm = UniformRodArm()
     known = {name: arm.parameters.nominal()[name] for name in ("l1", "l2")}
-    params = arm.record({k: jnp.asarray(v) for k, v in (known | TRUTH).items()})
+    params = arm.record({k: jnp.asarray(v) for k, v in (known | MECHANICS).items()})
 
     def step(s: Array, u: Array) -> tuple[Array, Array]:
         return arm.flow(params, s, u, PERIOD), s[:2]

@@ -73,7 +73,7 @@ def unseen(
     traces = trace_arrays(picture, found.tested, logs, names, PREFIX)
     summary["left_out"] = part.words
     summary["headline"] = forecast_sentence(
-        f"A fit that had not seen {part.words} forecasts it {horizon:g} s ahead, "
+        f"A fit without {part.words} predicts it {horizon:g} s ahead, "
         "root mean square errors",
         summary["open_loop_rmse"],
         summary["trivial"],

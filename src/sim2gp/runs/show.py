@@ -1,11 +1,11 @@
-"""A summary as tables for people: one for single numbers, one for each group of rows.
+"""A summary for people: what matters, and on request all numbers as tables.
 
 A value that is a table of tables (``parameters.<name>.{mean, sd, ...}``) becomes one
 with a row for each name; a table of plain values becomes rows ``group.name``.
 """
 
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any
 
 LONGEST = 12  # numbers of a list that are still printed
@@ -24,6 +24,8 @@ _HIDDEN = (
     ),
     *("calibration.channels", "held_out.calibration.channels"),
 )
+#: Of a parameter, what is printed without ``--verbose``.
+_MAIN = frozenset(("unit", "mean", "sd", "q025", "q975", "truth", "verdict"))
 _HIDDEN_COLUMNS = {
     "parameters": ("meaning", "note", "partners", "low", "high"),
     "directions": ("combination", "flat"),
@@ -32,32 +34,74 @@ _HIDDEN_COLUMNS = {
 }
 
 
-def print_summary(summary: Mapping[str, Any], title: str) -> None:
-    """Print a summary to stdout, as wide as the terminal allows."""
+def print_summary(
+    summary: Mapping[str, Any],
+    title: str,
+    *,
+    answers: Mapping[str, str] | None = None,
+    report: str = "",
+    verbose: bool = False,
+) -> None:
+    """Print what matters of a summary to stdout, as wide as the terminal allows.
+
+    That is its headline, its parameters, ``answers`` to questions or else its tables,
+    and where the ``report`` is. ``verbose`` prints all numbers.
+    """
     from rich.console import Console
-    from rich.table import Table
 
     sys.stdout.write(summary.get("diff", ""))
     # Away from a terminal nothing may be folded: a pipe has no width.
     width = None if sys.stdout.isatty() else 160
     console = Console(file=sys.stdout, width=width, highlight=False)
-    if summary.get("headline"):
-        console.print(str(summary["headline"]), markup=False)
+    headline = str(summary.get("headline") or "")
+    if headline:
+        console.print(headline, markup=False)
+    groups = dict(_groups(summary))
+    tables = summary.get("tables", ())
+    if verbose or not ("parameters" in groups or tables):
+        for name, rows in groups.items():
+            console.print(_table(name, rows, _HIDDEN_COLUMNS.get(name, ())))
+        _print_singles(console, summary, title)
+    elif "parameters" in groups:
+        rows = groups["parameters"]
+        known = {key for row in rows.values() for key in row}
+        console.print(_table("parameters", rows, known - _MAIN))
+    if verbose or not answers:
+        _print_tables(console, tables)
+    for question, answer in (answers or {}).items():
+        if answer and answer != headline:
+            console.print(f"{question}: {answer}", markup=False)
+    if report:
+        console.print(f"Report: {report}", markup=False, soft_wrap=True)
+
+
+def _table(name: str, rows: Mapping[str, Any], hidden: Collection[str]) -> Any:
+    from rich.table import Table
+
+    columns = list(dict.fromkeys(key for row in rows.values() for key in row))
+    columns = [c for c in columns if c not in hidden]
+    shown = [c for c in columns if any(_is_short(r.get(c)) for r in rows.values())]
+    table = Table("", *shown, title=name, title_justify="left")
+    for label, row in rows.items():
+        cells = [row.get(column) for column in shown]
+        table.add_row(label, *(_text(c) if _is_short(c) else "" for c in cells))
+    return table
+
+
+def _print_singles(console: Any, summary: Mapping[str, Any], title: str) -> None:
+    from rich.table import Table
+
     singles = Table(title=title, show_header=False, title_justify="left")
     for key, text in _singles(summary):
         singles.add_row(key, text)
-    for name, rows in _groups(summary):
-        columns = list(dict.fromkeys(key for row in rows.values() for key in row))
-        columns = [c for c in columns if c not in _HIDDEN_COLUMNS.get(name, ())]
-        shown = [c for c in columns if any(_is_short(r.get(c)) for r in rows.values())]
-        table = Table("", *shown, title=name, title_justify="left")
-        for label, row in rows.items():
-            cells = [row.get(column) for column in shown]
-            table.add_row(label, *(_text(c) if _is_short(c) else "" for c in cells))
-        console.print(table)
     if singles.row_count:
         console.print(singles)
-    for said in summary.get("tables", ()):
+
+
+def _print_tables(console: Any, tables: Iterable[Mapping[str, Any]]) -> None:
+    from rich.table import Table
+
+    for said in tables:
         table = Table(*said["columns"], title=said["title"], title_justify="left")
         for row in said["rows"]:
             table.add_row(*(_text(cell) for cell in row))
