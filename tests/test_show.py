@@ -27,12 +27,12 @@ def test_tables_and_parameters_are_printed(capsys: pytest.CaptureFixture[str]) -
     assert "One machine." in shown
     for hidden in ("a long note", "combination", "0.0\n"):
         assert hidden not in shown
-    print_summary(summary, "sim2gp demo", report="runs/demo/report.html")
+    print_summary(summary, "sim2gp demo", files=["runs/demo/report.html"])
     brief = capsys.readouterr().out
     for wanted in ("It swings.", "m2", "kg", "Score of each", "0.97"):
         assert wanted in brief
     assert "Raise m2" not in brief
-    assert brief.rstrip().endswith("Report: runs/demo/report.html")
+    assert brief.rstrip().endswith("Written: runs/demo/report.html")
 
 
 def test_answers_take_the_place_of_tables(capsys: pytest.CaptureFixture[str]) -> None:

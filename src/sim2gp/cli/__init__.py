@@ -104,7 +104,7 @@ def _run(args: list[str]) -> int:
             summary,
             f"sim2gp {name}",
             answers=_answers(summary, run) if run else None,
-            report=str(run / "report.html") if run else "",
+            files=(*call.files, str(run / "report.html")) if run else (),
             verbose=command.verbose,
         )
     sys.stdout.flush()

@@ -19,12 +19,13 @@ from sim2gp.runs.store import check_target, read_run
 class Call:
     """How a command was called: what shows its progress, and the line as typed.
 
-    ``run`` is the folder that it wrote.
+    ``run`` is the folder that it wrote, ``files`` are what it wrote there for others.
     """
 
     progress: Progress
     line: str
     run: Path | None = None
+    files: tuple[str, ...] = ()
 
     def saved(self, out: Path, make: Callable[[], Any]) -> dict[str, Any]:
         """Write the run of the result that ``make`` returns; its summary.
@@ -35,7 +36,7 @@ class Call:
         with new_run(out, name) as writer:
             result = make().with_entries(command_line=self.line).at(out)
             result.write(writer)
-        self.run = out
+        self.run, self.files = out, tuple(str(out / name) for name in result.files)
         summary: dict[str, Any] = result.summary
         return summary
 

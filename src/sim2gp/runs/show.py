@@ -5,7 +5,7 @@ with a row for each name; a table of plain values becomes rows ``group.name``.
 """
 
 import sys
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 LONGEST = 12  # numbers of a list that are still printed
@@ -39,13 +39,13 @@ def print_summary(
     title: str,
     *,
     answers: Mapping[str, str] | None = None,
-    report: str = "",
+    files: Sequence[str] = (),
     verbose: bool = False,
 ) -> None:
     """Print what matters of a summary to stdout, as wide as the terminal allows.
 
     That is its headline, its parameters, ``answers`` to questions or else its tables,
-    and where the ``report`` is. ``verbose`` prints all numbers.
+    and the ``files`` to open next. ``verbose`` prints all numbers.
     """
     from rich.console import Console
 
@@ -71,8 +71,8 @@ def print_summary(
     for question, answer in (answers or {}).items():
         if answer and answer != headline:
             console.print(f"{question}: {answer}", markup=False)
-    if report:
-        console.print(f"Report: {report}", markup=False, soft_wrap=True)
+    for file in files:
+        console.print(f"Written: {file}", markup=False, soft_wrap=True)
 
 
 def _table(name: str, rows: Mapping[str, Any], hidden: Collection[str]) -> Any:

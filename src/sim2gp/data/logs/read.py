@@ -300,7 +300,8 @@ def _channels(
         mask &= (values > low) & (values < high)
         lost = int((~mask).sum())
         if lost:
-            text = f"{lost} samples of {state.name} in {source} are masked"
+            why = "missing, saturated or beyond its limits"
+            text = f"{lost} samples of {state.name} in {source} are not used: {why}"
             notes.append(Note("W152", text))
         channels[state.name], masks[state.name] = values, mask
     return channels, masks, notes
