@@ -279,7 +279,7 @@ def test_the_words_say_which_intervals_these_are() -> None:
     assert "are 3 times as wide" in intervals.words(found, [3.0, 3.0], 40)
     white = dataclasses.replace(found, inflation=1.0)
     text = intervals.words(white, [1.02, 1.1], 40)
-    assert "those of independent samples, times 1.1 at most" in text
+    assert "at most 1.1 times those of independent samples" in text
     few = dataclasses.replace(found, enough=False)
     assert "3 windows are too few" in intervals.words(few, [1.0], 3)
 

@@ -25,7 +25,7 @@ from sim2gp.types import Key, in_float64
 
 TIMES = 5.0  # as long as the project's
 _UNASKED = (
-    "The misfit tests are silent: longer windows may tell more (identify --longer)."
+    "The misfit tests find nothing: longer windows may narrow the intervals (--longer)."
 )
 WORTH = 0.8  # of the present sd: what some constant's must fall to
 

@@ -88,7 +88,7 @@ def _next(summary: Summary) -> str:
         return str(longer["text"])
     return (
         "sim2gp evaluate RUN --logs FILE: does it predict another recording? "
-        "sim2gp export RUN hands it on."
+        "sim2gp export RUN writes simulators to train on."
     )
 
 

@@ -172,19 +172,20 @@ def _averaged(
 
 
 def words(found: Corrected, widened: Sequence[float], windows: int) -> str:
-    """Which intervals are told and why, in some sentences."""
+    """Which intervals these are and why, in some sentences."""
     if not found.enough:
         return (
             f"Intervals count every sample as new: {windows} windows are too few to "
-            "tell whether errors are coloured, and of a real machine they are."
+            "see whether errors are correlated in time, and of a real machine they are."
         )
     scatter, most = math.sqrt(found.inflation), max(widened, default=1.0)
     lacks = found.missing > NOTHING
     if most < LIKE_WHITE and not lacks:
         return (
-            f"The errors of {windows} windows pull the constants {digits(scatter, 2)} "
-            "times as far as white noise would: intervals are those of independent "
-            f"samples, times {digits(most, 3)} at most. {_allowed(found)}"
+            "Intervals were checked for errors that are correlated in time: those of "
+            f"{windows} windows pull the parameters {digits(scatter, 2)} times as far "
+            f"as white noise would, and intervals are at most {digits(most, 3)} times "
+            f"those of independent samples. {_allowed(found)}"
         )
     text = f"Intervals are {_times(widened)} times as wide as if every sample were new"
     if not lacks or scatter > LIKE_WHITE:
@@ -247,9 +248,9 @@ def _allowed(found: Corrected) -> str:
             "them. sim2gp explain tries the effects one by one."
         )
     return (
-        f"That the model lacks some of {len(found.effects)} effects of its library has "
-        f"a probability of {_sure(found)} and is allowed for; of other physics "
-        "intervals know nothing."
+        f"Intervals allow for {len(found.effects)} effects that the model may be "
+        f"missing, which has a probability of {_sure(found)}; they do not allow for "
+        "other physics."
     )
 
 
