@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 import sim2gp as sg
+from sim2gp.commands.evaluate import Evaluation
 from sim2gp.runs import new_run
 
 
@@ -35,6 +36,15 @@ def test_a_notebook_gets_the_whole_report(tmp_path: Path) -> None:
     assert "</html>" in shown.page
     assert "a &lt; b" in shown.page
     assert len(repr(shown).splitlines()) == 1
+
+
+def test_a_result_shows_its_warnings() -> None:
+    said = ["W128 rows were also fitted to", "W128 rows were also fitted to", "W1 <b>"]
+    made = Evaluation({"command": "evaluate", "headline": "Good.", "warnings": said})
+    assert repr(made).splitlines() == ["Evaluation: Good.", said[0], said[2]]
+    page = made._repr_html_()
+    assert page.count(said[0]) == 1
+    assert "W1 &lt;b&gt;" in page
 
 
 def test_what_is_no_run_is_said(tmp_path: Path) -> None:

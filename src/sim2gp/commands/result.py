@@ -88,7 +88,8 @@ class AbstractResult:
 
     def __repr__(self) -> str:
         said = self.summary.get("headline") or self.summary.get("title") or ""
-        return f"{type(self).__name__}: {said}"
+        warned = dict.fromkeys(map(str, self.summary.get("warnings") or ()))
+        return "\n".join([f"{type(self).__name__}: {said}", *warned])
 
     def _repr_html_(self) -> str:
         from sim2gp.reports.notebook import brief

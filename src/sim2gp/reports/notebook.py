@@ -43,10 +43,11 @@ class Shown:
 
 
 def brief(summary: Mapping[str, Any]) -> str:
-    """What a notebook shows of a result: its headline, and its main table."""
+    """What a notebook shows of a result: headline, warnings, and its main table."""
     columns, rows = _main_table(summary)
     said = summary.get("headline") or summary.get("title") or ""
-    return render("brief.html", said=said, columns=columns, rows=rows)
+    warned = list(dict.fromkeys(map(str, summary.get("warnings") or ())))
+    return render("brief.html", said=said, warned=warned, columns=columns, rows=rows)
 
 
 def _main_table(summary: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
