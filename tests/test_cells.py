@@ -1,5 +1,6 @@
 """Cells of studies: whole, of this source, and otherwise the user's decision."""
 
+import gzip
 import json
 import os
 import subprocess
@@ -12,7 +13,7 @@ import pytest
 
 from sim2gp.cli import main
 from sim2gp.errors import InputError
-from sim2gp.runs import Progress
+from sim2gp.runs import Progress, packed_cells
 from sim2gp.studies import swingup
 from sim2gp.studies.swingup import Cell
 
@@ -319,3 +320,60 @@ def test_imports_are_found_wherever_they_are(tmp_path: Path) -> None:
     modules = set(source_of(tmp_path / "less.py").modules)
     assert "sim2gp.inference.linalg" in modules
     assert "sim2gp.planning.loop" not in modules
+
+
+def test_a_packed_study_is_the_same_study(study: Study) -> None:
+    """Byte for byte, with what came after it; the same files give the same pack."""
+    folder, cells = study
+    for name in ("one", "two"):
+        cells().save(name, ARGUMENTS, {"x": 1.5, "unit": "\u00b5m"})
+    place = folder / "out.cells"
+    files = {
+        p.relative_to(place).as_posix(): p.read_bytes() for p in place.rglob("*.json")
+    }
+    target = packed_cells.pack(place)
+    assert not place.exists()
+    assert packed_cells.unpacked(place) == files
+    first = target.read_bytes()
+    assert cells().load("one", ARGUMENTS) == {"x": 1.5, "unit": "\u00b5m"}
+    assert cells().load("three", ARGUMENTS) is None
+    with pytest.raises(InputError, match="1 with other arguments"):
+        cells().load("one", ARGUMENTS | {"seed": 2})
+    (folder / "helper.py").write_text("GAIN = 3.0\n")
+    with pytest.raises(InputError, match=r"1 of another source \(one\); other: helper"):
+        cells().load("one", ARGUMENTS)
+    (folder / "helper.py").write_text("GAIN = 2.0  # of everything\n")
+    cells().save("three", ARGUMENTS, {"x": 2.5})
+    (place / "picture.png").write_bytes(b"kept")
+    packed_cells.pack(place)
+    assert [p.name for p in place.rglob("*")] == ["picture.png"]
+    assert cells().load("three", ARGUMENTS) == {"x": 2.5}
+    assert cells().load("two", ARGUMENTS) == {"x": 1.5, "unit": "\u00b5m"}
+    for name, content in files.items():
+        path = folder / "again.cells" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+    assert packed_cells.pack(folder / "again.cells").read_bytes() == first
+
+
+def test_a_damaged_pack_is_refused(
+    study: Study, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, cells = study
+    cells().save("one", ARGUMENTS, {"x": 1.0})
+    target = packed_cells.pack(folder / "out.cells")
+    good = target.read_bytes()
+    for k, content in enumerate(
+        (good[:-9], good[:20], b"", b"{}", gzip.compress(b"[1]\n"), good[::-1])
+    ):
+        target.write_bytes(content)
+        os.utime(target, ns=(k, k))  # a clock may not have moved on
+        if content == b"":
+            assert cells().load("one", ARGUMENTS) is None  # no cells, and no harm
+            continue
+        with pytest.raises(InputError, match=r"E183.*out\.cells\.jsonl\.gz"):
+            cells().load("one", ARGUMENTS)
+    target.write_bytes(good)
+    monkeypatch.setattr(packed_cells, "LIMIT", 100)
+    with pytest.raises(InputError, match="E183"):
+        cells().load("one", ARGUMENTS)

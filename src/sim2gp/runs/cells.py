@@ -5,7 +5,8 @@ renamed, so that an interrupted study goes on where it was. It carries the check
 its bytes, its arguments, and the digest of the source that computed it: the modules
 and the versions of `sim2gp.runs.sources`, which ``sources/DIGEST.json`` lists. A cell
 that is damaged, of another source or of other arguments is refused until the user says
-what to do with it.
+what to do with it. The cells of a finished study may be one file
+(`sim2gp.runs.packed_cells`).
 """
 
 import json
@@ -18,6 +19,7 @@ from typing import Any, Literal
 
 from sim2gp.cleanup import replace_file
 from sim2gp.errors import error
+from sim2gp.runs.packed_cells import unpacked
 from sim2gp.runs.plain import to_json
 from sim2gp.runs.sealed import is_sealed, parse, seal, unseal
 from sim2gp.runs.sources import Source, digest_of, source_of
@@ -67,9 +69,9 @@ class Cells:
         """Put a finished cell on the disk; returns what `load` will."""
         digest, plain = self.source.digest, _plain(values)
         content = {"arguments": _plain(arguments), "source": digest, "values": plain}
-        listed = self.folder / "sources" / f"{digest}.json"
-        if not listed.exists():
-            _write(listed, self.source.content.encode("utf-8"))
+        listed = f"sources/{digest}.json"
+        if self._content(listed) is None:
+            _write(self.folder / listed, self.source.content.encode("utf-8"))
         _write(self.folder / f"{name}.json", seal(content))
         return plain
 
@@ -97,13 +99,9 @@ class Cells:
         return about
 
     def _read(self, name: str, arguments: Mapping[str, Any]) -> _Found:
-        path = self.folder / f"{name}.json"
-        try:
-            content = path.read_bytes()
-        except FileNotFoundError:
+        content = self._content(f"{name}.json")
+        if content is None:
             return _Found(name, None)
-        except OSError as error:
-            raise disk_error(self.folder, error) from error
         record = _record(content)
         if record is None:
             return _Found(name, None, _DAMAGED)
@@ -114,6 +112,15 @@ class Cells:
             return _Found(name, values, _UNMARKED)
         reason = "" if source == self.source.digest else _SOURCE
         return _Found(name, values, reason, source)
+
+    def _content(self, name: str) -> bytes | None:
+        """A file of the folder, or of the pack of a finished study."""
+        try:
+            return (self.folder / name).read_bytes()
+        except FileNotFoundError:
+            return unpacked(self.folder).get(name)
+        except OSError as caught:
+            raise disk_error(self.folder, caught) from caught
 
     def _refuse(self, found: Iterable[_Found]) -> None:
         """Raise E186 where the user has not said what to do with one of them."""
@@ -152,12 +159,12 @@ class Cells:
 
     def _listed(self, digest: str) -> Source | None:
         """What a digest stands for; None where its list is gone or damaged."""
+        content = self._content(f"sources/{digest}.json")
         try:
-            content = (self.folder / "sources" / f"{digest}.json").read_bytes()
-            found = parse(content)
-        except (OSError, ValueError):
+            found = parse(content or b"")
+        except ValueError:
             return None
-        if digest_of(content.decode("utf-8")) != digest:
+        if digest_of((content or b"").decode("utf-8")) != digest:
             return None
         return Source(found["modules"], found["versions"])
 
