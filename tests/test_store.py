@@ -19,7 +19,7 @@ from hypothesis.extra import numpy as hnp
 from sim2gp.errors import InputError, Sim2GPError
 from sim2gp.runs import DiskError, Progress, load_run, new_run
 from sim2gp.runs.plain import to_json
-from sim2gp.runs.progress import time_left
+from sim2gp.runs.progress import Task, time_left
 from sim2gp.runs.sealed import seal, unseal
 
 
@@ -292,6 +292,19 @@ def test_time_left_is_at_the_same_pace() -> None:
     assert time_left(2, 4, 600.0) == "10 min left"
     assert [time_left(n, 4, 1.0) for n in (0, 4)] == ["", ""]
     assert time_left(9, 10, 1.0) == ""
+
+
+def test_time_left_falls_while_a_part_is_under_way() -> None:
+    """A part that says more than once how far it is does not seem to take longer."""
+    shown: list[str] = []
+    task = Task("fit", 3, lambda task, note: shown.append(task.left()))
+    task.started -= 10.0
+    task.advance()
+    for _ in range(2):
+        task.moved -= 5.0
+        task.started -= 5.0
+        task.advance("a step", 0)
+    assert shown == ["20 s left", "15 s left", "10 s left"]
 
 
 def test_a_notebook_has_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,15 +26,18 @@ class Task:
     show: Callable[["Task", str], None]
     done: int = 0
     started: float = field(default_factory=time.monotonic)
+    moved: float = field(default_factory=time.monotonic)  # when `done` last changed
 
     def advance(self, note: str = "", count: int = 1) -> None:
         """``count`` more parts are finished; ``note`` is shown beside them."""
-        self.done += count
+        if count:
+            self.done, self.moved = self.done + count, time.monotonic()
         self.show(self, note)
 
     def left(self) -> str:
-        """How long the rest takes at the same pace."""
-        return time_left(self.done, self.total, time.monotonic() - self.started)
+        """How long the rest takes at the pace of what is done."""
+        since = time.monotonic() - self.moved
+        return time_left(self.done, self.total, self.moved - self.started, since)
 
 
 def _silent(task: Task, note: str) -> None:
@@ -91,11 +94,14 @@ class Progress:
                 task.advance()
 
 
-def time_left(done: int, total: int, seconds: float) -> str:
-    """How long the rest takes at the same pace; nothing below a second, or unknown."""
+def time_left(done: int, total: int, seconds: float, since: float = 0.0) -> str:
+    """How long the rest takes at the same pace; nothing below a second, or unknown.
+
+    ``done`` parts took so many ``seconds``, and the last was done ``since`` seconds ago.
+    """
     if not 0 < done < total:
         return ""
-    left = seconds * (total - done) / done
+    left = seconds * (total - done) / done - since
     if left < 1.0:
         return ""
     return f"{left:.0f} s left" if left < 90.0 else f"{left / 60.0:.0f} min left"
