@@ -156,7 +156,7 @@ def entry(mean: float, sd: float, left: float, times: float = 1.0) -> dict[str, 
             {"m": entry(2.0, 0.02, 0.5), "I": entry(1.0, 0.5, 1.0)},
             1.0,
             False,
-            "next to nothing of I",
+            "next to nothing about I",
         ),
         # What the model's errors add is no reason to run it, and is not hidden.
         (

@@ -77,14 +77,14 @@ def verdict(
     )
     poor = [n for n in told if share[n] > asked.within]
     untold = [n for n in names if n not in told]
-    rest = f" It tells next to nothing of {listed(untold)}." if untold else ""
+    rest = f" It says next to nothing about {listed(untold)}." if untold else ""
     wider = [n for n in told if wide[n] > max(asked.within, share[n])]
     if not poor and wider:
         worst = max(wider, key=lambda n: wide[n])
         return False, (
-            f"Not worth running: more data would narrow {listed(told)} within "
-            f"{asked.within:g} %, but the model's errors keep {worst} at "
-            f"{digits(wide[worst], 2)} %, and data do not reduce these.{rest}"
+            f"Not worth running: the logs alone determine {listed(told)} within "
+            f"{asked.within:g} % already; the model's errors keep {worst} at "
+            f"{digits(wide[worst], 2)} %, which more data do not reduce.{rest}"
         )
     if not poor:
         return False, (

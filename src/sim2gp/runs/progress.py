@@ -97,7 +97,7 @@ class Progress:
 def time_left(done: int, total: int, seconds: float, since: float = 0.0) -> str:
     """How long the rest takes at the same pace; nothing below a second, or unknown.
 
-    ``done`` parts took so many ``seconds``, and the last was done ``since`` seconds ago.
+    ``done`` parts took so many ``seconds``; the last was done ``since`` s ago.
     """
     if not 0 < done < total:
         return ""
