@@ -247,10 +247,11 @@ def _allowed(found: Corrected) -> str:
             "springs, drag and the like), and constants lie where they would with "
             "them. sim2gp explain tries the effects one by one."
         )
+    count = len(found.effects)
+    effects = "an effect" if count == 1 else f"{count} effects"
     return (
-        f"Intervals allow for {len(found.effects)} effects that the model may be "
-        f"missing, which has a probability of {_sure(found)}; they do not allow for "
-        "other physics."
+        f"Intervals allow for {effects} that the model may be missing, which has a "
+        f"probability of {_sure(found)}; they do not allow for other physics."
     )
 
 
