@@ -3,7 +3,7 @@
     python docs/site/tables.py
 
 Keys of project files come from their specification (`sim2gp.project.schema`), codes
-from the catalogue of errors. Whatever else stands on these pages is left alone.
+from the catalogue of errors. The rest of these pages is left alone.
 """
 
 import ast

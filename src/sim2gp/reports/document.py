@@ -14,7 +14,6 @@ from sim2gp.reports.glance import glance, unique
 from sim2gp.reports.numbers import duration, is_number, number
 from sim2gp.reports.parameters import Arrays, Section, Summary
 from sim2gp.reports.returns import returns
-from sim2gp.reports.tables import Table
 from sim2gp.reports.template import asset, render
 from sim2gp.reports.traces import traces
 
@@ -164,21 +163,21 @@ def _figure(summary: Summary, arrays: Arrays) -> Section:
 
 def _sections(summary: Summary, arrays: Arrays) -> list[dict[str, Any]]:
     """What there is to show, in the order in which a reader asks for it."""
-    figure, flown = _figure(summary, arrays), returns(summary, arrays)
+    figure, scored = _figure(summary, arrays), returns(summary, arrays)
     machine = ("machine", "The machine", _machine(summary, arrays))
     title = figure["title"] if figure else ""
     found: list[tuple[str, str, Any]] = [
         ("claims", "Claims", data.claims(summary)),
         ("figure", title, figure),
-        *([machine] if flown else []),
-        ("returns", "Returns", flown),
+        *([machine] if scored else []),
+        ("returns", "Returns", scored),
         ("experiment", "The experiment", experiment(summary, arrays)),
         ("parameters", "Parameters", parameters.parameter_table(summary)),
         ("directions", "Combinations", parameters.directions(summary)),
         ("misfit", "Noise and misfit", data.noise_and_misfit(summary)),
         ("heldout", "Prediction of held-out data", data.held_out(summary, arrays)),
         ("calibration", "Calibration", data.calibration(summary, arrays)),
-        *([] if flown else [machine]),
+        *([] if scored else [machine]),
         ("traces", "Measured against simulated", traces(summary, arrays)),
         (
             "densities",
@@ -213,24 +212,15 @@ def write_report(summary: Summary, arrays: Arrays) -> str:
     sections = _sections(summary, arrays)
     name = f"sim2gp {summary.get('command') or 'run'}"
     answers = glance(summary)
-    scripts = [asset("player.js")] * any(x["kind"] == "machine" for x in sections)
-    scripts += [asset("tables.js")] * any(_has_table(x["about"]) for x in sections)
     return render(
         "page.html",
         name=name,
         title=summary.get("title") or name,
         style=Markup(asset("page.css")),
-        script=Markup("".join(scripts)),
+        player=Markup(asset("player.js")),
+        tables_script=Markup(asset("tables.js")),
         status=_status(summary),
         headline="" if answers else _headline(summary),
         glance=answers,
         sections=sections,
     )
-
-
-def _has_table(about: Any) -> bool:
-    """Whether a section shows a table."""
-    if isinstance(about, Table):
-        return bool(about.rows)
-    parts = about.values() if isinstance(about, dict) else about
-    return isinstance(about, dict | list) and any(map(_has_table, parts))

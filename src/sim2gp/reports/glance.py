@@ -66,7 +66,7 @@ def _missing(summary: Summary) -> str:
     """What the residuals say of the model."""
     misfit = summary.get("misfit") or {}
     if misfit.get("alarm"):
-        return "Something: the residuals contradict the model, as said above."
+        return "Something: the residuals contradict the model."
     return str(misfit.get("verdict") or "")
 
 

@@ -160,11 +160,13 @@ class Cells:
     def _listed(self, digest: str) -> Source | None:
         """What a digest stands for; None where its list is gone or damaged."""
         content = self._content(f"sources/{digest}.json")
+        if content is None:
+            return None
         try:
-            found = parse(content or b"")
+            found = parse(content)
         except ValueError:
             return None
-        if digest_of((content or b"").decode("utf-8")) != digest:
+        if digest_of(content.decode("utf-8")) != digest:
             return None
         return Source(found["modules"], found["versions"])
 
