@@ -12,6 +12,7 @@ from sim2gp.cli import main
 from sim2gp.cli.commands import COMMANDS
 from sim2gp.commands.example import MODEL, TRUTH
 from sim2gp.errors import InputError
+from sim2gp.runs import DiskError
 from sim2gp.types import in_float64
 
 QUIET = sg.Progress(quiet=True)
@@ -71,3 +72,16 @@ def test_nothing_is_overwritten(folder: Path, tmp_path: Path) -> None:
     assert sorted(p.name for p in (tmp_path / "new").iterdir()) == sorted(
         ["README.md", "arm.toml", "arm.xml", "first.csv", "second.csv"]
     )
+
+
+def test_what_fails_half_way_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path, *args: object, **more: object) -> None:
+        path.touch()
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(DiskError, match="E190"):
+        sg.example(tmp_path / "new")
+    assert list(tmp_path.iterdir()) == []

@@ -8,6 +8,7 @@ finds can be compared with `TRUTH`.
 import csv
 import io
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 
 import equinox as eqx
@@ -126,16 +127,23 @@ def example(folder: Path | str, *, progress: Progress | None = None) -> Path:
     }
     for number, name in enumerate(("first.csv", "second.csv")):
         texts[name] = _table(_recorded(number))
-    with cleanup.registered(lambda: shutil.rmtree(folder, ignore_errors=True)):
-        try:
-            folder.mkdir()
-            for name, text in texts.items():
-                (folder / name).write_text(text, encoding="utf-8")
-        except OSError as caught:
-            shutil.rmtree(folder, ignore_errors=True)
-            raise disk_error(folder, caught) from caught
+    try:
+        folder.mkdir()  # ours alone from here on: whatever fails, nothing of it is left
+        with cleanup.registered(lambda: shutil.rmtree(folder, ignore_errors=True)):
+            _write(folder, texts)
+    except OSError as caught:
+        raise disk_error(folder, caught) from caught
     (progress or Progress()).say(f"next: sim2gp identify {folder / 'arm.toml'}")
     return folder / "arm.toml"
+
+
+def _write(folder: Path, texts: Mapping[str, str]) -> None:
+    try:
+        for name, text in texts.items():
+            (folder / name).write_text(text, encoding="utf-8")
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
 
 
 @in_float64
