@@ -23,9 +23,8 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "benchmarks")]
-from arm_and_sysid import truth, write  # noqa: E402
-
 import servo_arm  # noqa: E402
+from arm_and_sysid import truth, write  # noqa: E402
 from sim2gp.data.split_log import cut  # noqa: E402
 from sim2gp.data.windows_likelihood import WindowsLikelihood, information_at  # noqa: E402
 from sim2gp.inference.arrowhead import Noise  # noqa: E402

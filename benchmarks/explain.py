@@ -3,7 +3,7 @@
     python benchmarks/explain.py [--truths N] [--strength X] [--seconds S] [--out DIR]
         [--refresh | --keep-old]
 
-Two machines; on each, every effect of `sim2gp.studies.explain_study` on N hidden
+Two machines; on each, every effect of `planted_effects` on N hidden
 machines, nothing on 2 N, and three effects that no library holds on N each. Prints what
 was answered to what was planted and the shares of right answers, and writes
 ``summary.json`` into DIR. Finished cells are kept beside DIR: after S seconds it stops,
@@ -16,11 +16,11 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+import planted_effects as study
 from sim2gp.planning.tasks import MACHINES
 from sim2gp.runs import Progress
 from sim2gp.runs.cells import Cells, add_options
 from sim2gp.runs.plain import to_json
-from sim2gp.studies import explain_study as study
 
 ROOT = Path(__file__).resolve().parents[1]
 

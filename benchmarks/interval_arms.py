@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from planted_effects import Cogging
 from sim2gp.data.logs import Log
-from sim2gp.studies.explain_study import Cogging
 from sim2gp.systems import (
     AbstractEffect,
     AbstractSystem,

@@ -11,8 +11,8 @@ import contextlib
 from typing import Any
 
 import numpy as np
-from interval_arms import LENGTHS, NAMES, PERIOD, Recordings
 
+from interval_arms import LENGTHS, NAMES, PERIOD, Recordings
 from sim2gp.inference.parameters import Parameters
 
 STEP = 2e-3  # s

@@ -23,9 +23,11 @@ import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import interval_candidates as candidates
 import jax
 import numpy as np
+from scipy.stats import beta, norm
+
+import interval_candidates as candidates
 from interval_arms import (
     CONDITIONS,
     NAMES,
@@ -35,8 +37,6 @@ from interval_arms import (
     with_what_is_missing,
 )
 from interval_sysid import intervals
-from scipy.stats import beta, norm
-
 from sim2gp.data.split_log import cut
 from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.identification.fit import fit_windows

@@ -14,8 +14,8 @@ from collections.abc import Mapping
 import equinox as eqx
 import jax
 import numpy as np
-from one_step import EPISODES, STEPS, random_episode
 
+from one_step import EPISODES, STEPS, random_episode
 from sim2gp.commands.compare import MODELS
 from sim2gp.data.transitions import Transitions
 from sim2gp.models import Sim2GP

@@ -34,7 +34,9 @@ from sim2gp.planning.episode import Purpose, key_for, oracle_world
 from sim2gp.planning.mpc import from_unit
 from sim2gp.planning.sac import Learner, made
 from sim2gp.planning.tasks import MACHINES, Task
-from sim2gp.studies.swingup import Cell, meeting, reference, run_cell
+from sim2gp.studies.learners import task_and_model
+from sim2gp.studies.study import run_cell
+from sim2gp.studies.swingup import Cell, reference
 
 NEAR = 0.9  # of the oracle's return
 EPISODES = 5
@@ -105,7 +107,7 @@ def met(machine: str, seed: int, out: Path) -> tuple[Task, float]:
     """A seed's hidden machine, and what sampling MPC in the true world returns."""
     cell = Cell(machine, "nominal", "SIM2GP", seed, 1)
     oracle = run_cell(reference(cell), out)
-    task, _, _ = meeting(cell, "SIM2GP", int(oracle["redrawn"]))
+    task, _ = task_and_model(cell, "SIM2GP", int(oracle["redrawn"]))
     return task, float(oracle["oracle_return"])
 
 

@@ -29,7 +29,7 @@ from sim2gp.planning.episode import Purpose, key_for
 from sim2gp.planning.tasks import MACHINES, Task, draw_truth
 from sim2gp.runs.workers import cores, spread
 from sim2gp.studies.exploring import forecast
-from sim2gp.studies.swingup import METHODS, WITH_TERM, reach_of
+from sim2gp.studies.learners import METHODS, WITH_TERM, reach_of
 from sim2gp.systems.effects.strengths import effect
 from sim2gp.types import in_float64
 

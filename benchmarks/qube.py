@@ -12,6 +12,7 @@ import math
 from pathlib import Path
 
 import numpy as np
+
 from real_arm import ROOT, column, plain, protocol, say, table, verdict
 
 ANGLES = ("theta", "alpha")

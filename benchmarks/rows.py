@@ -16,6 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import jax
+
 from real_arm import ROOT, say, verdict
 
 RATIO = 2.2

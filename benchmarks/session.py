@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
+
 from design import (
     LIMITS,
     NOISE,
@@ -35,7 +36,6 @@ from design import (
     setting,
     stored,
 )
-
 from sim2gp.commands.design import expectation
 from sim2gp.data.logs import Log
 from sim2gp.experiment_design import Everything, Free, Multisine, design

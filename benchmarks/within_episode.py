@@ -20,12 +20,13 @@ from sim2gp.runs import Progress
 from sim2gp.runs.cells import add_options
 from sim2gp.runs.workers import cores
 from sim2gp.studies.claims import interval
+from sim2gp.studies.study import run_cells
 from sim2gp.studies.swingup import (
     Cell,
     best_seen,
     first_at,
     median_episode,
-    study,
+    scores_of,
 )
 
 LEARNERS = ("SIM2GP", "NLM", "RES", "FS", "RES-FS", "SIM2GP with the term")
@@ -41,22 +42,23 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("results/within_episode"))
     add_options(parser)
     arguments = parser.parse_args()
-    groups = {
-        (condition, learner, every): Cell(
-            "furuta", condition, learner, 0, arguments.episodes, every
-        )
+    rows = {
+        (condition, learner, every): [
+            Cell("furuta", condition, learner, seed, arguments.episodes, every)
+            for seed in range(arguments.seeds)
+        ]
         for learner in LEARNERS
         for condition in CONDITIONS
         for every in (None, arguments.every)
     }
-    table, details = study(
-        groups,
-        range(arguments.seeds),
+    values, details = run_cells(
+        rows,
         arguments.out,
         workers=arguments.workers,
         progress=Progress(),
         old=arguments.old,
     )
+    table = scores_of(rows, values)
     text = "\n".join(_lines(table, arguments.every))
     print(text)
     arguments.out.mkdir(parents=True, exist_ok=True)

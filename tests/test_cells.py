@@ -15,6 +15,7 @@ from sim2gp.cli import main
 from sim2gp.errors import InputError
 from sim2gp.runs import Progress, packed_cells
 from sim2gp.studies import swingup
+from sim2gp.studies.study import run_cell, run_cells
 from sim2gp.studies.swingup import Cell
 
 ORACLE = {"hang_return": 50.0, "oracle_return": 150.0, "redrawn": 0, "returns": [150.0]}
@@ -42,10 +43,13 @@ def names(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 def draw(out: Path, *old: str) -> dict[str, Any]:
     """What a study of three learners and two seeds says of its cells."""
-    groups = {m: Cell("furuta", "nominal", m, 0, 2) for m in ("SIM2GP", "RES", "NLM")}
+    rows = {
+        (m,): [Cell("furuta", "nominal", m, seed, 2) for seed in (0, 1)]
+        for m in ("SIM2GP", "RES", "NLM")
+    }
     quiet = Progress(quiet=True)
     more = dict(zip(("old",), old, strict=False))
-    return swingup.study(groups, (0, 1), out, workers=1, progress=quiet, **more)[1]
+    return run_cells(rows, out, workers=1, progress=quiet, **more)[1]
 
 
 def flips(good: bytes, every: int = 1) -> Iterator[bytes]:
@@ -61,7 +65,7 @@ def test_no_flipped_bit_of_a_stored_cell_is_accepted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A bit of every byte, one after the other, and many an end cut off."""
-    swingup.run_cell(CELL, tmp_path / "fig2")
+    run_cell(CELL, tmp_path / "fig2")
     path = tmp_path / "fig2.cells" / f"{CELL.name}.json"
     good = path.read_bytes()
 
@@ -69,13 +73,13 @@ def test_no_flipped_bit_of_a_stored_cell_is_accepted(
         raise Computed
 
     monkeypatch.setattr(swingup, "learner_cell", again)
-    assert swingup.run_cell(CELL, tmp_path / "fig2")["returns"] == [60.0, 70.0]
+    assert run_cell(CELL, tmp_path / "fig2")["returns"] == [60.0, 70.0]
     bad = [good[:end] for end in range(0, len(good), 32)]
     accepted = 0
     for content in [*bad, *flips(good, 9)]:
         path.write_bytes(content)
         try:
-            swingup.run_cell(CELL, tmp_path / "fig2")
+            run_cell(CELL, tmp_path / "fig2")
             accepted += 1
         except (InputError, Computed):
             continue
@@ -83,9 +87,9 @@ def test_no_flipped_bit_of_a_stored_cell_is_accepted(
     # Nor is a damaged one used because older ones are; computed again it may be.
     path.write_bytes(bad[-1])
     with pytest.raises(InputError, match=r"E186 .* 1 damaged"):
-        swingup.run_cell(CELL, tmp_path / "fig2", "keep")
+        run_cell(CELL, tmp_path / "fig2", "keep")
     with pytest.raises(Computed):
-        swingup.run_cell(CELL, tmp_path / "fig2", "refresh")
+        run_cell(CELL, tmp_path / "fig2", "refresh")
 
 
 def unmarked(path: Path) -> None:

@@ -186,8 +186,7 @@ ARGUMENTS = {
     "report there": ("E130", "not a run"),
     "reproduce": ("E160", "missing FIGURE"),
     "reproduce fig11": ("E160", "did you mean fig1"),
-    "reproduce fig1 --workers 2": ("E160", "leave it out"),
-    "reproduce fig1 --keep-old": ("E160", "--keep-old with fig1"),
+    "reproduce fig1 --episodes 2": ("E160", "leave it out"),
     "reproduce fig2 --refresh --keep-old": ("E160", "leave one out"),
     "demo --json=maybe": ("E160", "got maybe"),
 }

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import planted_effects as study
 from descents import estimate_of
 from sim2gp import systems as sy
 from sim2gp.identification.missing_physics.data import OneStepData
@@ -23,7 +24,6 @@ from sim2gp.identification.missing_physics.search import Refitted, Search, searc
 from sim2gp.identification.missing_physics.words import candidate_rows, headline, table
 from sim2gp.inference.arrowhead import Noise
 from sim2gp.planning.tasks import MACHINES
-from sim2gp.studies import explain_study as study
 from sim2gp.types import in_float64
 
 

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 import pytest
 
+import planted_effects as study
 import stub_commands
 from sim2gp import systems as sy
 from sim2gp.cli import main
@@ -17,7 +18,6 @@ from sim2gp.errors import InputError
 from sim2gp.project import load_project
 from sim2gp.runs import Progress, load_run, new_run
 from sim2gp.runs.workers import spread
-from sim2gp.studies import explain_study as study
 from simulated_logs import simulated
 from test_identify import project_in, write
 

@@ -9,9 +9,10 @@ import pytest
 from sim2gp import reports as report
 from sim2gp.errors import NotConverged
 from sim2gp.runs import Progress, load_run
-from sim2gp.studies import figure1 as two_link
-from sim2gp.studies import two_link_study
-from sim2gp.studies.two_link_study import DT, NOISE, Study
+from sim2gp.studies import figure1, two_link
+from sim2gp.studies.figure1 import TwoLinkArm
+from sim2gp.studies.study import run_cells
+from sim2gp.studies.two_link import DT, NOISE, Learned
 from sim2gp.systems import UniformRodArm
 
 QUIET = Progress(quiet=True)
@@ -21,8 +22,8 @@ LOW, HIGH = np.array([0.32, 0.02]), np.array([1.6, 0.3])
 
 
 @pytest.fixture(scope="module")
-def study() -> Study:
-    return two_link_study.learn(two_link_study.nominal_truth(), key=jax.random.key(3))
+def study() -> Learned:
+    return two_link.learn(two_link.nominal_truth(), key=jax.random.key(3))
 
 
 def rod(tt, s, t):
@@ -96,7 +97,7 @@ def test_the_second_prior_is_the_first_posterior(study):
 
 
 def test_information_of_both_data_sets_is_what_the_posterior_gained(study):
-    A = np.asarray(two_link._information(study))
+    A = np.asarray(figure1.information_of(study))
     S0 = np.asarray(study.prior.prior.scale)
     W = np.linalg.solve(np.asarray(study.posterior2.posterior.scale), S0)
     gained = W.T @ W - np.eye(4)
@@ -104,7 +105,7 @@ def test_information_of_both_data_sets_is_what_the_posterior_gained(study):
 
 
 def test_truth_is_not_the_prior_mean():
-    truth = np.asarray(two_link_study.nominal_truth())
+    truth = np.asarray(two_link.nominal_truth())
     assert (np.abs(truth) > 0.3).all()
 
 
@@ -113,17 +114,17 @@ def test_truth_is_not_the_prior_mean():
     [(50, (0.385, 0.615)), (90, (0.825, 0.960)), (95, (0.895, 0.990))],
 )
 def test_bands_at_200_are_the_stated_ones(level, expected):
-    assert two_link_study.band(level, 200) == pytest.approx(expected, abs=1e-9)
+    assert two_link.band(level, 200) == pytest.approx(expected, abs=1e-9)
 
 
 def test_covered_counts_the_central_interval():
     z = np.array([[0.0, 0.7], [-0.6, 1.7], [1.6, -np.inf], [-1.9, 0.1]])
-    assert two_link_study.covered(z, 50).tolist() == [0.5, 0.25]
-    assert two_link_study.covered(z, 90).tolist() == [0.75, 0.5]
-    assert two_link_study.covered(z, 95).tolist() == [1.0, 0.75]
+    assert two_link.covered(z, 50).tolist() == [0.5, 0.25]
+    assert two_link.covered(z, 90).tolist() == [0.75, 0.5]
+    assert two_link.covered(z, 95).tolist() == [1.0, 0.75]
 
 
-def test_a_failed_fit_is_counted_and_covers_nothing(monkeypatch, study):
+def test_a_failed_fit_is_counted_and_covers_nothing(monkeypatch, study, tmp_path):
     calls = []
 
     def learn(truth, *, key):
@@ -132,15 +133,24 @@ def test_a_failed_fit_is_counted_and_covers_nothing(monkeypatch, study):
             raise NotConverged("E201", "the MAP did not converge")
         return study
 
-    monkeypatch.setattr(two_link_study, "learn", learn)
-    found, failed = two_link_study.coverage_study(
-        3, key=jax.random.key(0), progress=QUIET
-    )
-    assert failed == 1
-    assert np.isinf(found["z"]).all(axis=1).tolist() == [False, True, False]
-    assert len({tuple(row) for row in found["truth"]}) == 3
-    claim = two_link.coverage_claim(found["z"], failed)
+    monkeypatch.setattr(two_link, "learn", learn)
+    whole = TwoLinkArm("fig1", seeds=3)
+    whole.learned = study
+    values, about = run_cells(whole.rows(), tmp_path, workers=1, progress=QUIET)
+    assert len(about["fits_not_converged"]) == 1
+    found = whole.arrays(values)
+    assert np.isinf(found["coverage/z"]).all(axis=1).tolist() == [False, True, False]
+    assert len({tuple(row) for row in found["coverage/truth"]}) == 3
+    claim = whole.summary(found, values)["claims"]["intervals_cover"]
     assert "1 fits not converged" in claim["text"]
+
+
+def test_other_recordings_are_counted(study):
+    claims = figure1.arm_claims(study.sd, study.z)
+    wide = figure1.arm_claims(10.0 * study.sd, study.z)
+    found = figure1.with_others(claims, [claims, wide, wide])
+    assert found["link_2_is_learned_first"]["other_recordings"] == "1 of 3"
+    assert found["truth_is_near"]["other_recordings"] == "3 of 3"
 
 
 def test_claims_bite(study):
@@ -154,7 +164,7 @@ def test_claims_bite(study):
             return eqx.tree_at(where, study, where(study) * jnp.asarray(factors))
 
     def fallen(changed):
-        claims = two_link.arm_claims(changed)
+        claims = figure1.arm_claims(changed.sd, changed.z)
         return {name for name, claim in claims.items() if not claim["holds"]}
 
     sane = fallen(study)
@@ -171,13 +181,13 @@ def test_claims_bite(study):
 
 def test_coverage_claim_falls_with_an_sd_that_is_half_or_double():
     z = np.random.default_rng(0).standard_normal((200, 4))
-    assert two_link.coverage_claim(z, 0)["holds"]
-    assert not two_link.coverage_claim(2.0 * z, 0)["holds"]
-    assert not two_link.coverage_claim(0.5 * z, 0)["holds"]
+    assert figure1.coverage_claim(z, 0)["holds"]
+    assert not figure1.coverage_claim(2.0 * z, 0)["holds"]
+    assert not figure1.coverage_claim(0.5 * z, 0)["holds"]
 
 
 def test_draws_start_at_rest_and_respect_the_lock(study):
-    arrays = two_link.figure_arrays(study, key=jax.random.key(1))
+    arrays = figure1.figure_arrays(study, key=jax.random.key(1))
     assert {key for key in arrays if "draws" in key} == {
         "figure1/data1/draws/prior",
         "figure1/data1/draws/posterior1",
@@ -186,7 +196,7 @@ def test_draws_start_at_rest_and_respect_the_lock(study):
     }
     for key, value in arrays.items():
         if "draws" in key:
-            assert value.shape == (two_link.DRAWS, two_link_study.STEPS + 1, 4)
+            assert value.shape == (figure1.DRAWS, two_link.STEPS + 1, 4)
             assert np.isfinite(value).all()
             assert not value[:, 0].any()
     locked = arrays["figure1/data1/draws/prior"]
@@ -205,12 +215,9 @@ def test_draws_start_at_rest_and_respect_the_lock(study):
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     """A small run of the command's function."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(two_link, "QUICK_SEEDS", 2)
-        patch.setattr(two_link, "QUICK_REPEATS", 1)
-        out = tmp_path_factory.mktemp("runs") / "fig1"
-        summary = two_link.run(out=out, seed=1, quick=True, progress=QUIET)
-    return out, summary
+    out = tmp_path_factory.mktemp("runs") / "fig1"
+    small = TwoLinkArm("fig1", seed=1, seeds=2, quick=True)
+    return out, small.run(out, workers=1, progress=QUIET)
 
 
 def test_the_run_holds_what_the_command_promises(finished):
@@ -242,10 +249,10 @@ def test_the_picture_is_redrawn_from_the_store_alone(finished):
 
 
 def test_the_same_seed_gives_the_same_data():
-    truth, arm = two_link_study.nominal_truth(), UniformRodArm()
+    truth, arm = two_link.nominal_truth(), UniformRodArm()
     with jax.enable_x64(True):
         one, two, other = (
-            two_link_study.record(arm, truth, key=jax.random.key(k)) for k in (0, 0, 1)
+            two_link.record(arm, truth, key=jax.random.key(k)) for k in (0, 0, 1)
         )
     assert np.array_equal(one.state, two.state)
     assert not np.array_equal(one.action, other.action)

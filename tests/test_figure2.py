@@ -13,8 +13,11 @@ from sim2gp.planning.tasks import MACHINES
 from sim2gp.reports import figure2 as drawn
 from sim2gp.runs import Progress
 from sim2gp.runs.cells import Cells
-from sim2gp.studies import figure2, swingup
-from sim2gp.studies.swingup import CONDITIONS, METHODS, TRAINED, Cell
+from sim2gp.studies import figure2, learners, swingup
+from sim2gp.studies.figure2 import PosteriorSampling
+from sim2gp.studies.learners import CONDITIONS, METHODS, TRAINED
+from sim2gp.studies.study import run_cell
+from sim2gp.studies.swingup import Cell, Table
 
 ORACLE = {"hang_return": 50.0, "oracle_return": 150.0, "redrawn": 1, "returns": [150.0]}
 
@@ -30,7 +33,7 @@ def test_scores_and_the_best_seen_by_hand():
     np.testing.assert_array_equal(swingup.first_at(score, 0.95), [2.0, np.inf])
 
 
-def planted(fast: str = "", slow: str = "") -> figure2.Table:
+def planted(fast: str = "", slow: str = "") -> Table:
     """Everybody solves in episode 2, ``fast`` at once, ``slow`` never; NLM in 5."""
     rng = np.random.default_rng(0)
     table = {}
@@ -49,7 +52,7 @@ def planted(fast: str = "", slow: str = "") -> figure2.Table:
     return table
 
 
-def holds(table: figure2.Table, name: str) -> bool:
+def holds(table: Table, name: str) -> bool:
     return figure2.claims(table, np.random.default_rng(1))[name]["holds"]
 
 
@@ -72,7 +75,7 @@ def test_claims_see_what_was_planted():
 
 
 def test_off_policy_claims_see_what_was_planted():
-    def holds(table: figure2.Table, name: str) -> bool:
+    def holds(table: Table, name: str) -> bool:
         found = figure2.off_policy_claims(table, np.random.default_rng(1))
         json.dumps(found, allow_nan=False)
         return found[name]["holds"]
@@ -114,7 +117,7 @@ def test_a_policy_that_is_trained_has_cells_of_its_own():
 )
 def test_policies_are_trained_where_no_episode_changes_anything(method, monkeypatch):
     small = SAC(hidden=(8,), num_envs=4, steps=5, updates=1)
-    monkeypatch.setitem(swingup.PLANNERS, "sac", small)
+    monkeypatch.setitem(learners.PLANNERS, "sac", small)
     cell = Cell("cartpole", "mismatch", method, 0, 2, planning="sac")
     flown = swingup.learner_cell(cell, 0)
     assert flown["failure"] is None
@@ -128,18 +131,18 @@ def test_a_finished_cell_is_not_flown_again(tmp_path: Path, monkeypatch):
     assert cells.load(cell.name, cell.arguments) is None
     saved = cells.save(cell.name, cell.arguments, {"returns": (1.0, np.float64(2.0))})
     assert saved == {"returns": [1.0, 2.0]}
-    assert swingup.run_cell(cell, tmp_path / "fig2") == saved
+    assert run_cell(cell, tmp_path / "fig2") == saved
     assert not [f for f in cells.folder.iterdir() if f.name.startswith(".")]
     # Fewer episodes are there as well; more are not, nor those of another planner.
     fewer = dataclasses.replace(cell, episodes=1)
-    assert swingup.run_cell(fewer, tmp_path / "fig2") == saved
+    assert run_cell(fewer, tmp_path / "fig2") == saved
     monkeypatch.setattr(swingup, "learner_cell", lambda cell, redrawn: {"returns": []})
     monkeypatch.setattr(swingup, "oracle_cell", lambda cell: ORACLE)
     more = dataclasses.replace(cell, episodes=4)
-    flown = swingup.run_cell(more, tmp_path / "fig2")
+    flown = run_cell(more, tmp_path / "fig2")
     assert flown == {"returns": []}
     for other in (MPC(horizon=7), MPC(lengths=(0.5, 1.0))):
-        monkeypatch.setitem(swingup.PLANNERS, "mpc", other)
+        monkeypatch.setitem(learners.PLANNERS, "mpc", other)
         with pytest.raises(InputError, match=r"E186 .* 1 with other arguments"):
             cells.load(cell.name, cell.arguments)
 
@@ -150,7 +153,7 @@ def test_a_changed_default_of_the_planner_is_another_planner(monkeypatch):
     before = cell.arguments
     assert before["planner"]["update"]["type"] == "ICEM"
     assert before["planner"]["lengths"] == MPC().lengths
-    monkeypatch.setitem(swingup.PLANNERS, "mpc", MPC(lengths=(1.0,)))
+    monkeypatch.setitem(learners.PLANNERS, "mpc", MPC(lengths=(1.0,)))
     assert cell.arguments != before
 
 
@@ -182,12 +185,12 @@ def test_a_quick_look_has_a_planner_and_cells_of_its_own(monkeypatch):
     for cell in (quick, full):
         with pytest.raises(KeyboardInterrupt):
             swingup.oracle_cell(swingup.reference(cell))
-    assert used == 2 * [swingup.QUICK_PLANNERS["mpc"], swingup.PLANNERS["mpc"]]
+    assert used == 2 * [learners.QUICK_PLANNERS["mpc"], learners.PLANNERS["mpc"]]
 
 
 @pytest.mark.parametrize("number", ["2", "4"])
 def test_the_figure_goes_on_where_it_was(number, tmp_path: Path, monkeypatch):
-    """Interrupted after seven cells, the second run flies only what is missing."""
+    """Interrupted after seven cells, the second run computes only what is missing."""
     flown: list[str] = []
 
     def learner(cell: Cell, redrawn: int):
@@ -202,16 +205,8 @@ def test_the_figure_goes_on_where_it_was(number, tmp_path: Path, monkeypatch):
     monkeypatch.setattr(swingup, "oracle_cell", lambda cell: ORACLE)
 
     def draw():
-        return figure2.run(
-            out=tmp_path / "run",
-            figure=f"fig{number}",
-            seed=0,
-            seeds=None,
-            episodes=None,
-            quick=True,
-            workers=1,
-            progress=Progress(),
-        )
+        study = PosteriorSampling(f"fig{number}", quick=True)
+        return study.run(tmp_path / "run", workers=1, progress=Progress())
 
     with pytest.raises(KeyboardInterrupt):
         draw()

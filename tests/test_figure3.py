@@ -19,7 +19,9 @@ from sim2gp.runs import Progress
 from sim2gp.runs.cells import Cells
 from sim2gp.studies import exploring, figure3
 from sim2gp.studies.exploring import METHODS, Cell, HeldOut
-from sim2gp.studies.swingup import CONDITIONS, meeting
+from sim2gp.studies.figure3 import Exploration
+from sim2gp.studies.learners import CONDITIONS, task_and_model
+from sim2gp.studies.study import run_cell
 
 
 def test_transitions_needed_by_hand():
@@ -131,7 +133,7 @@ def test_scores_of_a_forecast_by_hand():
 def test_what_is_tested_is_the_swing_up_of_the_oracle():
     """Rows in their places, and the truth that made them."""
     cell = Cell("furuta", "mismatch", "SIM2GP", 0, 1)
-    task, _, _ = meeting(cell, "SIM2GP", 0)
+    task, _ = task_and_model(cell, "SIM2GP", 0)
     rng = np.random.default_rng(1)
     states, actions = rng.uniform(-1, 1, (2, 6, 4)), rng.uniform(-1, 1, (2, 5, 1))
     test = HeldOut.of(task, {"states": states, "actions": actions})
@@ -147,18 +149,18 @@ def test_a_finished_cell_is_not_flown_again(tmp_path: Path, monkeypatch):
     cell = Cell("furuta", "nominal", "SIM2GP", 3, 2)
     values = {"rmse": [1.0, 0.5], "failure": None, "early": []}
     saved = cells.save(cell.name, cell.arguments, values)
-    assert exploring.explore_cell(cell, tmp_path / "exploring") == saved
+    assert run_cell(cell, tmp_path / "exploring") == saved
     more = dataclasses.replace(cell, episodes=3)
     monkeypatch.setattr(exploring, "oracle_cell", lambda cell: {"redrawn": 0})
     monkeypatch.setattr(exploring, "learner_cell", lambda cell, oracle: dict(values))
-    assert exploring.explore_cell(more, tmp_path / "exploring") == values
+    assert run_cell(more, tmp_path / "exploring") == values
     monkeypatch.setattr(exploring, "EXPLORER", exploring.QUICK_EXPLORER)
     with pytest.raises(InputError, match=r"E186 .* 1 with other arguments"):
         cells.load(cell.name, cell.arguments)
     # A first fit that failed is not tried again either.
     lost = {"rmse": [], "failure": "E203", "early": []}
     saved = cells.save(more.name, more.arguments, lost)
-    assert exploring.explore_cell(more, tmp_path / "exploring") == saved
+    assert run_cell(more, tmp_path / "exploring") == saved
     # Random input is flown by no planner, whichever it is.
     random = dataclasses.replace(cell, method="SIM2GP, random")
     assert random.arguments["planner"]["type"] == "RandomInput"
@@ -182,16 +184,8 @@ def test_the_figure_is_written_whole(figure: str, tmp_path: Path, monkeypatch):
     monkeypatch.setattr(exploring, "oracle_cell", lambda cell: {"redrawn": 0})
 
     def draw(name: str, seeds: int | None = 2, quick: bool = False):
-        return figure3.run(
-            out=tmp_path / name,
-            seed=0,
-            seeds=seeds,
-            episodes=3,
-            quick=quick,
-            workers=1,
-            progress=Progress(quiet=True),
-            figure=name,
-        )
+        study = Exploration(name, seeds=seeds, episodes=3, quick=quick)
+        return study.run(tmp_path / name, workers=1, progress=Progress(quiet=True))
 
     summary = draw(figure)
     count = len(flown)

@@ -12,8 +12,10 @@ from sim2gp.errors import InputError
 from sim2gp.models import PointEstimate
 from sim2gp.planning.tasks import MACHINES, furuta_swingup
 from sim2gp.runs import Progress
-from sim2gp.studies import mismatch, swingup
-from sim2gp.studies.swingup import CONDITIONS, METHODS, WITH_TERM, Cell
+from sim2gp.studies import learners, mismatch, swingup
+from sim2gp.studies.learners import CONDITIONS, METHODS, WITH_TERM
+from sim2gp.studies.mismatch import MismatchMap
+from sim2gp.studies.swingup import Cell
 from sim2gp.systems import Delay, Furuta
 from sim2gp.systems.effects.strengths import effect
 from sim2gp.systems.machine import Machine
@@ -25,17 +27,17 @@ def test_the_map_is_the_registered_catalogue():
     assert mismatch.EFFECTS == ("coulomb", "dead_zone", "spring", "delay", "drag")
     for name in mismatch.EFFECTS:
         for strength in ("mild", "middle", "strong"):
-            (found,) = swingup.effects_of("furuta", f"{name} {strength}")
+            (found,) = learners.effects_of("furuta", f"{name} {strength}")
             assert found == effect("furuta", name, strength)
-    (none,) = swingup.effects_of("furuta", "nominal")
-    assert none == dataclasses.replace(swingup.MISSING["furuta"], magnitude=0.0)
+    (none,) = learners.effects_of("furuta", "nominal")
+    assert none == dataclasses.replace(learners.MISSING["furuta"], magnitude=0.0)
     with pytest.raises(InputError, match="did you mean spring"):
-        swingup.effects_of("furuta", "sprong mild")
+        learners.effects_of("furuta", "sprong mild")
 
 
 def test_conditions_of_a_figure_are_one_program():
     for machine, (_, preset) in MACHINES.items():
-        tasks = [preset(None, swingup.effects_of(machine, c)) for c in CONDITIONS]
+        tasks = [preset(None, learners.effects_of(machine, c)) for c in CONDITIONS]
         nominal, mismatched = map(jax.tree.structure, tasks)
         assert nominal == mismatched
         s, a = tasks[0].start + 0.3, tasks[0].actions.high
@@ -46,7 +48,7 @@ def test_conditions_of_a_figure_are_one_program():
 
 
 def test_the_right_term_is_there_for_delays_as_well():
-    lacking = swingup.missing("furuta", "delay strong")
+    lacking = learners.missing("furuta", "delay strong")
     assert isinstance(lacking, Delay)
     model = METHODS[WITH_TERM](Furuta(), lacking, {})
     assert isinstance(model.system, Machine)
@@ -62,12 +64,12 @@ def test_a_learner_that_wraps_another_keeps_its_past_actions(monkeypatch):
     monkeypatch.setitem(METHODS, "wrapped", lambda *x: PointEstimate(right(*x)))
     cell = Cell("furuta", "delay strong", "wrapped", 0, 2)
     for method, expected in (("wrapped", 2), (WITH_TERM, 2), ("SIM2GP", 0)):
-        _, model, history = swingup.meeting(cell, method, 0)
-        assert history == model.history == expected
+        _, model = learners.task_and_model(cell, method, 0)
+        assert model.history == expected
 
 
 def test_the_box_of_a_learner_is_the_tasks():
-    reach = swingup.reach_of(furuta_swingup(), Furuta())
+    reach = learners.reach_of(furuta_swingup(), Furuta())
     found = {name: pytest.approx(half) for name, half in reach.items()}
     assert found == {"theta": 2.0, "theta.velocity": 15.0, "alpha.velocity": 25.0}
 
@@ -126,19 +128,13 @@ def test_the_map_is_written_whole(tmp_path: Path, monkeypatch):
 
     monkeypatch.setattr(swingup, "learner_cell", learner)
     monkeypatch.setattr(swingup, "oracle_cell", lambda cell: ORACLE)
-    summary = mismatch.run(
-        out=tmp_path / "map",
-        seed=0,
-        seeds=2,
-        episodes=None,
-        quick=False,
-        workers=1,
-        progress=Progress(quiet=True),
-    )
+    study = MismatchMap("mismatch", seeds=2)
+    summary = study.run(tmp_path / "map", workers=1, progress=Progress(quiet=True))
     rows = summary["tables"][0]["rows"]
     assert len(rows) == 15
     assert all(row[1] == "0.30 (0/2)" for row in rows)
     assert len(summary["returns"]) == 15 * (2 * len(METHODS) + 2)
     stored = json.loads((tmp_path / "map" / "summary.json").read_text())
     assert stored["regret"]["RES"] == pytest.approx(15 * (2.40 + 2.37))
+    assert (tmp_path / "map" / "mismatch.png").stat().st_size > 10_000
     assert "Mismatch map" in (tmp_path / "map" / "report.html").read_text()

@@ -16,12 +16,14 @@ if __name__ == "__main__":
 
 from frozen.cases import VALUES
 from sim2gp.studies import exploring, swingup
+from sim2gp.studies.learners import METHODS
+from sim2gp.studies.study import run_cell
 
 RECORD = VALUES / "episodes.json"
 SEEDS = range(10)
 #: Machine, condition, learner, planner, episodes: figures 2, 4 (SAC) and 5 (Auto).
 ACTING = [
-    *(("furuta", "mismatch", name, "mpc", 2) for name in swingup.METHODS),
+    *(("furuta", "mismatch", name, "mpc", 2) for name in METHODS),
     ("cartpole", "nominal", "SIM2GP", "mpc", 2),
     ("furuta", "nominal", "SIM2GP", "sac", 2),
 ]
@@ -42,7 +44,7 @@ def rows(wanted: Callable[[str], bool]) -> Iterator[tuple[str, list[list[float]]
             if not wanted(label(machine, condition, method, planning)):
                 continue
             found = [
-                swingup.run_cell(
+                run_cell(
                     swingup.Cell(
                         machine, condition, method, seed, episodes, None, True, planning
                     ),
@@ -55,7 +57,7 @@ def rows(wanted: Callable[[str], bool]) -> Iterator[tuple[str, list[list[float]]
             if not wanted(label(machine, condition, method, "exploring")):
                 continue
             found = [
-                exploring.explore_cell(
+                run_cell(
                     exploring.Cell(machine, condition, method, seed, episodes, True),
                     out / "exploring",
                 )["rmse"]

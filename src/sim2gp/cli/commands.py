@@ -221,13 +221,13 @@ class Reproduce(Writes):
     seed: Seed = 0
     """Draws the data."""
     seeds: SomeCount = None
-    """How many seeds (not figure 1); default the paper's."""
+    """How many seeds (figure 1: arms); default the paper's."""
     episodes: SomeCount = None
     """Episodes of each seed (not figure 1); default the paper's."""
     quick: Flag = False
     """A look: fewer seeds or arms, fewer episodes (fig2: fewer plans, too)."""
     workers: SomeCount = None
-    """Processes (not figure 1); default one per core."""
+    """Processes; default one per core."""
     refresh: Flag = False
     """Compute stored cells again that other code or versions computed."""
     keep_old: Flag = False

@@ -1,25 +1,27 @@
 """A figure of the paper, or the mismatch map: its data, the picture, its claims."""
 
-from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from sim2gp.commands.load_run import StudyRun
-from sim2gp.errors import InputError, error
 from sim2gp.runs import Progress
 from sim2gp.runs.cells import Old
 from sim2gp.runs.store import load_run
 from sim2gp.runs.workers import cores
+from sim2gp.studies.figure1 import TwoLinkArm
+from sim2gp.studies.figure2 import PosteriorSampling
+from sim2gp.studies.figure3 import Exploration
+from sim2gp.studies.mismatch import MismatchMap
+from sim2gp.studies.study import Study
 
 Figure = Literal["fig1", "fig2", "fig3", "fig4", "fig5", "mismatch"]
-#: Figure, and the module of `sim2gp.studies` that makes it.
-FIGURES = {
-    "fig1": "figure1",
-    "fig2": "figure2",
-    "fig3": "figure3",
-    "fig4": "figure2",
-    "fig5": "figure3",
-    "mismatch": "mismatch",
+STUDIES: dict[str, type[Study]] = {
+    "fig1": TwoLinkArm,
+    "fig2": PosteriorSampling,
+    "fig3": Exploration,
+    "fig4": PosteriorSampling,
+    "fig5": Exploration,
+    "mismatch": MismatchMap,
 }
 
 
@@ -38,33 +40,16 @@ def reproduce(
     """Compute what is missing of a study, check its claims, write the run.
 
     It is written at ``out`` (runs/NAME), with its cells in OUT.cells: a study that is
-    interrupted goes on where it was. ``seeds`` and ``episodes`` None are the paper's;
-    ``quick`` takes fewer; ``workers`` None are as many processes as there are cores.
-    ``old`` says what to do with cells of another source (E186). Figure 1 is one run
-    without cells (E160 for options that it has not).
+    interrupted goes on where it was. ``seeds`` (of figure 1: arms) and ``episodes``
+    None are the figure's own; ``quick`` takes fewer; ``workers`` None are as many
+    processes as there are cores. ``old`` says what to do with cells of another source
+    (E186). Raises `InputError` E160 for ``episodes`` of figure 1, which has none.
     """
+    study = STUDIES[figure](
+        figure, seed=seed, seeds=seeds, episodes=episodes, quick=quick
+    )
     out = Path("runs") / figure if out is None else Path(out)
-    more: dict[str, Any] = {}
-    if figure == "fig1":
-        given = {"seeds": seeds, "episodes": episodes, "workers": workers}
-        for name, value in given.items():
-            if value is not None:
-                raise _of_cells(name, value)
-        if old != "refuse":
-            raise _of_cells("keep-old" if old == "keep" else old, True)
-    else:
-        more = {"seeds": seeds, "episodes": episodes, "old": old}
-        more["workers"] = workers or cores()
-    module = FIGURES[figure]
-    if module in ("figure2", "figure3"):  # of two figures each
-        more["figure"] = figure
-    run = import_module(f"sim2gp.studies.{module}").run
     progress = progress or Progress()
-    run(out=out, seed=seed, quick=quick, progress=progress, **more)
+    study.run(out, workers=workers or cores(), progress=progress, old=old)
     found = load_run(out)
     return StudyRun(found.summary, found.arrays, {}, None, out)
-
-
-def _of_cells(name: str, value: object) -> InputError:
-    """E160: figure 1 has no cells."""
-    return error("no_cells", where="the command line", got=str(value), name=name)

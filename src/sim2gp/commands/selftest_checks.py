@@ -23,7 +23,7 @@ from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.least_squares import linear_posterior
 from sim2gp.models import Sim2GP
 from sim2gp.runs import load_run, new_run
-from sim2gp.studies.two_link_study import DT, LEVELS, covered, record
+from sim2gp.studies.two_link import DT, LEVELS, covered, record
 from sim2gp.systems import CartPole, Furuta, TwoLink, UniformRodArm
 from sim2gp.systems.mechanism import AbstractMechanism
 from sim2gp.types import in_float64

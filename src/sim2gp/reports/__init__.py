@@ -1,6 +1,6 @@
 """One self-contained HTML file per run, drawn from summary.json and arrays.npz alone.
 
-Nothing here is computed anew: a report shows what the run stored. Figures for papers
+Nothing here is computed again: a report shows what the run stored. Figures for papers
 and README files are drawn by the same rooms (`figure1`, `animation_gif`).
 """
 
@@ -9,6 +9,7 @@ from sim2gp.reports.document import write_report
 from sim2gp.reports.figure1 import arm_drawing, figure1, figure_bytes
 from sim2gp.reports.figure2 import figure2
 from sim2gp.reports.figure3 import figure3
+from sim2gp.reports.mismatch_map import mismatch_map
 from sim2gp.reports.notebook import show
 from sim2gp.reports.redraw import load_run, redraw
 
@@ -21,6 +22,7 @@ __all__ = [
     "figure3",
     "figure_bytes",
     "load_run",
+    "mismatch_map",
     "redraw",
     "show",
     "write_report",

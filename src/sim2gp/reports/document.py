@@ -130,6 +130,7 @@ def _figure(summary: Summary, arrays: Arrays) -> Section:
     from sim2gp.reports.figure1 import figure1, figure_bytes
     from sim2gp.reports.figure2 import figure2
     from sim2gp.reports.figure3 import LABELS, figure3
+    from sim2gp.reports.mismatch_map import mismatch_map
 
     if summary.get("figure1") and "figure1/prior/mean" in arrays:
         name, drawn = "Figure 1", figure1(arrays, summary)
@@ -154,6 +155,13 @@ def _figure(summary: Summary, arrays: Arrays) -> Section:
         more = (
             "On the swing-up of a planner that knows the truth, which no learner is "
             "shown. Lines are medians over seeds, shades quartiles."
+        )
+    elif summary.get("mismatch"):
+        name, drawn = "Mismatch map", mismatch_map(arrays, summary)
+        words = "score of the last episode, for every effect and learner"
+        more = (
+            "Medians over seeds; 1 is the oracle's score, 0 that of a pole left "
+            "hanging."
         )
     else:
         return None

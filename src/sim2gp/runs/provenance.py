@@ -12,15 +12,6 @@ PACKAGES = ("sim2gp", "jax", "jaxlib", "equinox", "numpy", "scipy")
 OPTIONAL = ("mujoco",)  # named where a run has used them
 
 
-def reproduce(
-    figure: str, seed: int, seeds: int, episodes: int, quick: bool, old: str
-) -> str:
-    """The command of a study; ``old`` as in `sim2gp.runs.cells`."""
-    numbers = f"--seed {seed} --seeds {seeds} --episodes {episodes}"
-    options = f"{' --quick' * quick}{' --keep-old' * (old == 'keep')}"
-    return f"sim2gp reproduce {figure} {numbers}{options}"
-
-
 def provenance(started: float, line: str | None = None) -> dict[str, Any]:
     """Keys of the summary; ``started`` is the `time.perf_counter` of the start.
 

@@ -61,7 +61,9 @@ def of_median(
     return float(np.median(each)), *central(medians, method="nearest")
 
 
-def told(difference: Float[np.ndarray, " seeds"], low: float, high: float) -> str:
+def difference_in_words(
+    difference: Float[np.ndarray, " seeds"], low: float, high: float
+) -> str:
     """A mean difference with its interval, in words."""
     return f"{difference.mean():+.3f} [{low:+.3f}, {high:+.3f}]"
 
@@ -87,7 +89,10 @@ def at_least_as_good(
             difference = scores[name][kept] - score[kept]
             low, high = interval(difference, rng)
             if high < worst:
-                worst, figure = high, f"{told(difference, low, high)} to {other}"
+                worst, figure = (
+                    high,
+                    f"{difference_in_words(difference, low, high)} to {other}",
+                )
     return claim(figure != "" and worst >= 0.0, figure, text)
 
 
@@ -109,5 +114,5 @@ def better_somewhere(
         difference = one - other
         low, high = interval(difference, rng, level)
         if low > best:
-            best, figure = low, f"{place}: {told(difference, low, high)}"
+            best, figure = low, f"{place}: {difference_in_words(difference, low, high)}"
     return claim(best > 0.0, figure, text)

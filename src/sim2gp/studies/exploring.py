@@ -7,9 +7,8 @@ the machine is from itself.
 """
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -33,9 +32,9 @@ from sim2gp.planning import (
 from sim2gp.planning.episode import Purpose, episode, key_for, oracle_world
 from sim2gp.planning.loop import Episode, drawn, expected, psal
 from sim2gp.planning.tasks import Task
-from sim2gp.runs.cells import Cells, Old
 from sim2gp.studies import swingup
-from sim2gp.studies.stages import described
+from sim2gp.studies.learners import QUICK_TRAINING, planner_of, task_and_model
+from sim2gp.studies.study import AbstractCell, Values, described
 from sim2gp.types import Dynamics, Key, in_float64
 
 #: Information hardly depends on the last digits of a plan: fewer sequences than a
@@ -54,7 +53,7 @@ BEGINNINGS = (25, 50, 100, 150, 200)
 class Explorer:
     """Who learns, and who chooses what is flown.
 
-    model: of `swingup.METHODS`.
+    model: of `learners.METHODS`.
     signal: flown instead of plans for information.
     together: `InformationGain`'s.
     world: what is planned in, draws or the mean.
@@ -82,7 +81,7 @@ METHODS: dict[str, Explorer] = {
 
 
 @dataclass(frozen=True)
-class Cell:
+class Cell(AbstractCell):
     """One explorer on one machine of one seed; ``oracle`` makes the test set."""
 
     machine: str
@@ -100,7 +99,7 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """Of its file."""
+        """The name of its file."""
         words = [self.machine, self.condition, self.method, str(self.seed)]
         return "_".join(words + ["quick"] * self.quick).replace(" ", "-")
 
@@ -108,12 +107,30 @@ class Cell:
     def arguments(self) -> dict[str, Any]:
         """All that its values depend on, but for how many episodes there are."""
         oracle = self.method == "oracle"
-        planner = swingup.planner_of(self.quick) if oracle else self.planner
-        told = asdict(self) | {"planner": described(planner)}
-        del told["episodes"]
-        if not told.pop("quick"):
-            return told
-        return told | {"training": swingup.QUICK_TRAINING}
+        planner = planner_of(self.quick) if oracle else self.planner
+        given = asdict(self) | {"planner": described(planner)}
+        del given["episodes"]
+        if not given.pop("quick"):
+            return given
+        return given | {"training": QUICK_TRAINING}
+
+    @property
+    def program(self) -> tuple[Hashable, ...]:
+        """A learner's forecasts and plans on one machine."""
+        return self.machine, self.method
+
+    @property
+    def needs(self) -> "Cell | None":
+        """The test set of the same machine."""
+        return None if self.method == "oracle" else reference(self)
+
+    def enough(self, values: Mapping[str, Any]) -> bool:
+        """Whether as many episodes were run."""
+        return self.method == "oracle" or len(values["rmse"]) >= self.episodes
+
+    def compute(self, needed: Values | None) -> Values:
+        """A test set, or how well a learner predicts it after each episode."""
+        return oracle_cell(self) if needed is None else learner_cell(self, needed)
 
 
 class HeldOut(eqx.Module):
@@ -176,18 +193,18 @@ def forecast(
 def oracle_cell(cell: Cell) -> dict[str, Any]:
     """The seed's truth, as figure 2 finds it, and swing-ups of a planner that knows."""
     found = swingup.oracle_cell(cell)
-    task, _, _ = swingup.meeting(cell, "SIM2GP", found["redrawn"])
-    planner, key = swingup.planner_of(cell.quick), jax.random.key(cell.seed)
+    task, _ = task_and_model(cell, "SIM2GP", found["redrawn"])
+    planner, key = planner_of(cell.quick), jax.random.key(cell.seed)
     world = oracle_world(task)
     ready = planner.init(world, key=key)
-    flown = [
+    episodes = [
         episode(task, planner, ready, world, key=key_for(key, e, Purpose.TEST))[0]
         for e in range(TESTS)
     ]
     return {
         "redrawn": found["redrawn"],
-        "states": [np.asarray(x.state).tolist() for x in flown],
-        "actions": [np.asarray(x.action).tolist() for x in flown],
+        "states": [np.asarray(x.state).tolist() for x in episodes],
+        "actions": [np.asarray(x.action).tolist() for x in episodes],
     }
 
 
@@ -195,7 +212,7 @@ def learner_cell(cell: Cell, oracle: Mapping[str, Any]) -> dict[str, Any]:
     """Explore, and test what was learned after each episode."""
     explorer, key = METHODS[cell.method], jax.random.key(cell.seed)
     redrawn = int(oracle["redrawn"])
-    task, model, history = swingup.meeting(cell, explorer.model, redrawn)
+    task, model = task_and_model(cell, explorer.model, redrawn)
     test, noise = HeldOut.of(task, oracle), np.asarray(task.noise, float)
     before = model.init(key_for(key, 0, Purpose.INIT))
     rows: list[dict[str, float]] = []
@@ -203,33 +220,33 @@ def learner_cell(cell: Cell, oracle: Mapping[str, Any]) -> dict[str, Any]:
 
     def note(done: Episode) -> None:
         nonlocal before
-        S, A, _ = done.trajectory.transitions(history)
+        S, A, _ = done.trajectory.transitions(model.history)
         about = before.untempered()
         gained = about.trajectory_information_gain(jnp.asarray(S), jnp.asarray(A))
         states = jnp.asarray(done.trajectory.state)
-        told = {
+        rest = {
             "nats": float(gained),
             "upright": float(jnp.mean(task.at_goal(states))),
             "swung_up": float(task.reached(states)),
         }
-        rows.append(tested(done.belief, test, noise) | told)
+        rows.append(tested(done.belief, test, noise) | rest)
         before = done.belief
 
     early: list[dict[str, float]] = []
     try:
-        flown = psal(
+        explored = psal(
             task,
             model,
             cell.planner,
             episodes=cell.episodes,
             key=key,
             together=explorer.together,
-            history=history,
+            history=model.history,
             on_episode=note,
             world=explorer.world,
         )
         if explorer.model == "SIM2GP":
-            early = beginnings(model, flown.data, test, noise, key=key)
+            early = beginnings(model, explored.data, test, noise, key=key)
     except (NotConverged, NotFinite) as error:
         failure = str(error)
     seconds = time.perf_counter() - started
@@ -253,22 +270,6 @@ def beginnings(
         belief = model.fit(model.init(key), some.extend(*rows), key=key)
         out.append({"transitions": float(count)} | tested(belief, test, noise))
     return out
-
-
-def explore_cell(cell: Cell, out: Path, old: Old = "refuse") -> dict[str, Any]:
-    """A cell's values, from the disk if it was run for as many episodes (E186)."""
-    cells = Cells(out, __file__, old)
-    stored = cells.load(cell.name, cell.arguments)
-    oracle = cell.method == "oracle"
-    if stored is not None and (
-        oracle or stored["failure"] or len(stored["rmse"]) >= cell.episodes
-    ):
-        return stored
-    if oracle:
-        values = oracle_cell(cell)
-    else:
-        values = learner_cell(cell, explore_cell(reference(cell), out, old))
-    return cells.save(cell.name, cell.arguments, values)
 
 
 def reference(cell: Cell) -> Cell:

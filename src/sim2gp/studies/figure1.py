@@ -1,13 +1,13 @@
 """Figure 1: a horizontal two-link arm, learned from two data sets in turn.
 
 What the first data set cannot know (link 1) it must leave at the prior, and the second
-must find. Beside the figure stand other recordings of the same arm, and many arms drawn
-from the prior: they tell whether the intervals are right.
+must find. Next to the figure are other recordings of the same arm, and many arms drawn
+from the prior: they show whether the intervals are right.
 """
 
-import time
-from pathlib import Path
-from typing import Any
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -17,91 +17,134 @@ from jaxtyping import Array, Float
 
 from sim2gp.identification import diagnose
 from sim2gp.models import Sim2GPBelief
-from sim2gp.runs import Progress, new_run
-from sim2gp.runs.provenance import provenance
-from sim2gp.studies.two_link_study import (
+from sim2gp.studies.study import AbstractCell, Arrays, Key, Study, Values
+from sim2gp.studies.two_link import (
     DT,
     LEVELS,
     LOCKED,
     NOISE,
     STEPS,
-    Study,
+    Cell,
+    Learned,
     band,
-    coverage_study,
     covered,
     learn,
     nominal_truth,
 )
-from sim2gp.types import Action, Dynamics, Key, State, in_float64
+from sim2gp.types import Action, Dynamics, State, in_float64
+from sim2gp.types import Key as RandomKey
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 DRAWS = 32
-SEEDS, QUICK_SEEDS = 200, 20  # arms drawn from the prior
-REPEATS, QUICK_REPEATS = 40, 5  # other recordings of the nominal arm
+#: Arms drawn from the prior, for each other recording of the nominal arm.
+ARMS_PER_RECORDING = 5
 
 
-@in_float64
-def repeat_study(
-    repeats: int, *, key: Key, progress: Progress
-) -> list[dict[str, dict[str, Any]]]:
-    """The claims about one arm, over other recordings of the nominal arm."""
-    truth = nominal_truth()
-    keys = jax.random.split(key, repeats)
-    return [
-        arm_claims(learn(truth, key=k))
-        for k in progress.track(keys, "other recordings")
-    ]
+class TwoLinkArm(Study):
+    """One arm that is drawn, and its claims over other arms and recordings.
 
+    ``seeds`` is the number of arms that are drawn from the prior.
+    """
 
-def run(*, out: Path, seed: int, quick: bool, progress: Progress) -> dict[str, Any]:
-    """Reproduce figure 1 and check its claims; returns the summary of the run."""
-    started = time.perf_counter()
-    key = jax.random.key(seed)
-    seeds = QUICK_SEEDS if quick else SEEDS
-    repeats = QUICK_REPEATS if quick else REPEATS
-    with new_run(out, "reproduce fig1") as writer:
-        progress.say("figure 1: two data sets of one arm")
-        study = learn(nominal_truth(), key=jax.random.fold_in(key, 0))
-        arrays = figure_arrays(study, key=jax.random.fold_in(key, 1))
-        over, failed = coverage_study(
-            seeds, key=jax.random.fold_in(key, 2), progress=progress
-        )
-        arrays |= {f"coverage/{name}": value for name, value in over.items()}
-        others = repeat_study(
-            repeats, key=jax.random.fold_in(key, 4), progress=progress
-        )
-        claims = arm_claims(study, others) | {
-            "intervals_cover": coverage_claim(over["z"], failed)
+    size = (200, None)
+    quick_size = (20, None)
+
+    def rows(self) -> dict[Key, list[Cell]]:
+        """Arms drawn from the prior, and other recordings of the nominal arm."""
+        recordings = max(self.count // ARMS_PER_RECORDING, 1)
+        return {
+            ("prior",): [Cell("prior", self.seed, i) for i in range(self.count)],
+            ("nominal",): [Cell("nominal", self.seed, i) for i in range(recordings)],
         }
-        summary = _summary(study, claims, over["z"], seed, quick)
-        summary["fits_not_converged"] = failed
-        table, posterior = study.prior.system.parameters, study.posterior2.posterior
-        prior = study.prior.posterior
-        arrays |= diagnose.arrays(
-            table, prior, posterior, key=jax.random.fold_in(key, 3), count=500
-        )
-        line = f"sim2gp reproduce fig1 --seed {seed}{' --quick' * quick}"
-        summary |= provenance(started, line)
-        from sim2gp.reports import figure1, figure_bytes, write_report
 
-        writer.write_summary(summary)
-        writer.write_arrays("arrays.npz", arrays)
-        writer.write_bytes("figure1.png", figure_bytes(figure1(arrays, summary), "png"))
-        writer.write_text("report.html", write_report(summary, arrays))
-    return summary
+    @cached_property
+    def learned(self) -> Learned:
+        """The arm that is drawn."""
+        key = jax.random.fold_in(jax.random.key(self.seed), 0)
+        return learn(nominal_truth(), key=key)
+
+    def arrays(self, values: Mapping[AbstractCell, Values]) -> Arrays:
+        """What figure 1 draws, errors of all arms, and draws of the posterior."""
+        key, rows = jax.random.key(self.seed), self.rows()
+        learned = self.learned
+        posterior, prior = learned.posterior2.posterior, learned.prior.posterior
+        table = learned.prior.system.parameters
+        arms = [values[cell] for cell in rows["prior",]]
+        others = [values[cell] for cell in rows["nominal",]]
+        # A fit that failed is an arm that no interval covers.
+        lost = np.full(len(table.names), np.inf).tolist()
+        return {
+            **figure_arrays(learned, key=jax.random.fold_in(key, 1)),
+            "coverage/truth": np.asarray([arm["truth"] for arm in arms]),
+            "coverage/z": np.asarray([arm["z"] or lost for arm in arms]),
+            "recordings/z": np.asarray([one["z"] for one in others if one["z"]]),
+            "recordings/sd": np.asarray([one["sd"] for one in others if one["sd"]]),
+            **diagnose.arrays(
+                table, prior, posterior, key=jax.random.fold_in(key, 3), count=500
+            ),
+        }
+
+    def summary(
+        self, arrays: Arrays, values: Mapping[AbstractCell, Values]
+    ) -> dict[str, Any]:
+        """Claims about the drawn arm, over its other recordings, and over all arms."""
+        del values
+        learned, z = self.learned, arrays["coverage/z"]
+        table = learned.prior.system.parameters
+        failed = int(np.sum(~np.isfinite(z).all(axis=1)))
+        pairs = zip(arrays["recordings/sd"], arrays["recordings/z"], strict=True)
+        others = [arm_claims(sd, errors) for sd, errors in pairs]
+        claims = with_others(arm_claims(learned.sd, learned.z), others)
+        claims["intervals_cover"] = coverage_claim(z, failed)
+        held = sum(claim["holds"] for claim in claims.values())
+        return {
+            "title": "Figure 1: a two-link arm learned from two data sets",
+            "figure": "fig1",
+            "quick": self.quick,
+            "headline": f"{held} of {len(claims)} claims hold. {_sentence(learned.sd)}",
+            "claims": claims,
+            "curves": {
+                "transitions": [0, STEPS, 2 * STEPS],
+                **{
+                    f"sd_{n}": learned.sd[:, i].tolist()
+                    for i, n in enumerate(table.names)
+                },
+            },
+            "coverage": _coverage(table.names, z),
+            "coverage_arms": len(z),
+            "n_transitions": 2 * STEPS,
+            "noise": _noise(learned),
+            "tables": [_table(learned), _coverage_table(table.names, z)],
+            "figure1": _figure(learned),
+            **_parameters(learned),
+        }
+
+    def pictures(
+        self, arrays: Mapping[str, np.ndarray], summary: Mapping[str, Any]
+    ) -> "dict[str, Figure]":
+        """The arm over both data sets, and the beliefs before and after each."""
+        from sim2gp.reports import figure1
+
+        return {"figure1": figure1(arrays, summary)}
 
 
-def figure_arrays(study: Study, *, key: Key) -> dict[str, np.ndarray]:
+def figure_arrays(learned: Learned, *, key: RandomKey) -> dict[str, np.ndarray]:
     """Everything that `sim2gp.reports.figure1` draws."""
-    arrays = {"figure1/truth": np.asarray(study.truth)}
+    arrays = {"figure1/truth": np.asarray(learned.truth)}
     for name in ("prior", "posterior1", "posterior2"):
-        belief = getattr(study, name).posterior
+        belief = getattr(learned, name).posterior
         arrays[f"figure1/{name}/mean"] = np.asarray(belief.mean)
         arrays[f"figure1/{name}/scale"] = np.asarray(belief.scale)
     pairs = {
-        "data1": (study.first, {"prior": study.prior, "posterior1": study.posterior1}),
+        "data1": (
+            learned.first,
+            {"prior": learned.prior, "posterior1": learned.posterior1},
+        ),
         "data2": (
-            study.second,
-            {"posterior1": study.middle, "posterior2": study.posterior2},
+            learned.second,
+            {"posterior1": learned.middle, "posterior2": learned.posterior2},
         ),
     }
     for data, (recording, beliefs) in pairs.items():
@@ -136,87 +179,64 @@ def _rollouts(draws: Dynamics, action: Float[Array, "T 2"]) -> np.ndarray:
     return np.round(np.asarray(paths), 3)
 
 
-def _summary(
-    study: Study,
-    claims: dict[str, dict[str, Any]],
-    z: np.ndarray,
-    seed: int,
-    quick: bool,
-) -> dict[str, Any]:
-    table = study.prior.system.parameters
-    names = list(table.names)
-    stages = [study.prior, study.posterior1, study.posterior2]
-    sd = np.stack([np.asarray(belief.parameters()[1]) for belief in stages])
-    held = sum(claim["holds"] for claim in claims.values())
-    found = diagnose.summary(
-        table, study.prior.prior, study.posterior2.posterior, _information(study)
-    )
-    values = np.asarray(study_values(study))
-    for name, value in zip(names, values, strict=True):
-        found["parameters"][name]["truth"] = float(value)
+def _coverage(names: Sequence[str], z: np.ndarray) -> dict[str, dict[str, float]]:
+    """Share of arms inside each interval, by parameter."""
+    shares = {f"{level} %": covered(z, level) for level in LEVELS}
     return {
-        "command": "reproduce",
-        "title": "Figure 1: a two-link arm learned from two data sets",
-        "figure": "fig1",
-        "seed": seed,
-        "quick": quick,
-        "headline": f"{held} of {len(claims)} claims hold. {_sentence(sd)}",
-        "claims": claims,
-        "curves": {
-            "transitions": [0, STEPS, 2 * STEPS],
-            **{f"sd_{name}": sd[:, i].tolist() for i, name in enumerate(names)},
-        },
-        "coverage": {
-            name: {f"{level} %": float(covered(z, level)[i]) for level in LEVELS}
-            for i, name in enumerate(names)
-        },
-        "coverage_arms": len(z),
-        "n_transitions": 2 * STEPS,
-        "noise": _noise(study),
-        "tables": [_table(names, sd, stages, study), _coverage_table(names, z)],
-        "figure1": {
-            "names": names,
-            "lengths": [dict(table.fixed)["l1"], dict(table.fixed)["l2"]],
-            "dt": DT,
-            "vertical": False,
-            "titles": [
-                "(a) data set 1: joint 1 locked",
-                "data set 2: both joints free",
-            ],
-        },
-        **found,
+        name: {level: float(share[i]) for level, share in shares.items()}
+        for i, name in enumerate(names)
+    }
+
+
+def _figure(learned: Learned) -> dict[str, Any]:
+    """What the figure's panels say."""
+    table = learned.prior.system.parameters
+    return {
+        "names": list(table.names),
+        "lengths": [dict(table.fixed)["l1"], dict(table.fixed)["l2"]],
+        "dt": DT,
+        "vertical": False,
+        "titles": ["(a) data set 1: joint 1 locked", "data set 2: both joints free"],
     }
 
 
 @in_float64
-def study_values(study: Study) -> Float[Array, " p"]:
-    """The true constants in physical units."""
-    return study.prior.system.parameters.constrain(study.truth)
+def _parameters(learned: Learned) -> dict[str, Any]:
+    """Posterior and truth of each parameter, in its unit."""
+    table = learned.prior.system.parameters
+    found = diagnose.summary(
+        table,
+        learned.prior.prior,
+        learned.posterior2.posterior,
+        information_of(learned),
+    )
+    values = np.asarray(table.constrain(learned.truth))
+    for name, value in zip(table.names, values, strict=True):
+        found["parameters"][name]["truth"] = float(value)
+    return found
 
 
 @in_float64
-def _information(study: Study) -> Float[Array, "r p"]:
+def information_of(learned: Learned) -> Float[Array, "r p"]:
     """Both data sets' square-root information, whitened by the first prior."""
-    middle = study.middle.prior
-    onto = jnp.linalg.solve(middle.scale, study.prior.prior.scale)
-    rows = [study.posterior1.information, study.posterior2.information @ onto]
+    onto = jnp.linalg.solve(learned.middle.prior.scale, learned.prior.prior.scale)
+    rows = [learned.posterior1.information, learned.posterior2.information @ onto]
     return jnp.concatenate(rows)
 
 
 def arm_claims(
-    study: Study, others: list[dict[str, dict[str, Any]]] | None = None
+    sd: Float[np.ndarray, "stages p"], z: Float[np.ndarray, " p"]
 ) -> dict[str, dict[str, Any]]:
     """The paper's claims about one arm, in the numbers this project set for them.
 
-    With ``others``, each claim also says in how many other recordings it holds.
+    sd: spreads before any data, after the first data set, and after both.
+    z: errors after both, in posterior sd.
     """
-    stages = [study.prior, study.posterior1, study.posterior2]
-    sd = np.stack([np.asarray(belief.parameters()[1]) for belief in stages])
     ratio = sd[1, :2] / sd[0, :2]
     furthest = ratio[np.argmax(np.abs(ratio - 1.0))]
     first, last = np.max(sd[1, 2:]), np.max(sd[2])
-    distance = np.max(np.abs(study.z))
-    claims: dict[str, tuple[bool, float, str]] = {
+    distance = np.max(np.abs(z))
+    found: dict[str, tuple[bool, float, str]] = {
         "link_1_stays_at_the_prior": (
             abs(furthest - 1.0) <= 0.10,
             furthest,
@@ -238,13 +258,21 @@ def arm_claims(
             "largest distance of the truth after data set 2, in sd; at most 2.5",
         ),
     }
-    found: dict[str, dict[str, Any]] = {}
-    for name, (holds, figure, text) in claims.items():
-        found[name] = {"holds": bool(holds), "figure": float(figure), "text": text}
-        if others:
-            count = sum(other[name]["holds"] for other in others)
-            found[name]["other_recordings"] = f"{count} of {len(others)}"
-            found[name]["text"] += f". Other recordings: {count} of {len(others)} hold."
+    return {
+        name: {"holds": bool(holds), "figure": float(figure), "text": text}
+        for name, (holds, figure, text) in found.items()
+    }
+
+
+def with_others(
+    claims: dict[str, dict[str, Any]], others: Sequence[Mapping[str, Any]]
+) -> dict[str, dict[str, Any]]:
+    """Each claim, with the number of other recordings in which it holds."""
+    found = {}
+    for name, one in claims.items():
+        count = f"{sum(other[name]['holds'] for other in others)} of {len(others)}"
+        text = f"{one['text']}. Other recordings: {count} hold."
+        found[name] = {**one, "other_recordings": count, "text": text}
     return found
 
 
@@ -274,10 +302,10 @@ def _sentence(sd: np.ndarray) -> str:
     )
 
 
-def _noise(study: Study) -> dict[str, dict[str, float]]:
+def _noise(learned: Learned) -> dict[str, dict[str, float]]:
     """What EM found on each data set; a locked joint has no noise to find."""
-    channels = [channel.name for channel in study.prior.system.physical_states]
-    first, second = study.posterior1.noise.tolist(), study.posterior2.noise.tolist()
+    channels = [channel.name for channel in learned.prior.system.physical_states]
+    first, second = learned.posterior1.noise.tolist(), learned.posterior2.noise.tolist()
     locked = [*LOCKED, *LOCKED]
     rows = {}
     for name, sd, one, two, still in zip(
@@ -288,15 +316,15 @@ def _noise(study: Study) -> dict[str, dict[str, float]]:
     return rows
 
 
-def _table(
-    names: list[str], sd: np.ndarray, stages: list[Sim2GPBelief], study: Study
-) -> dict[str, Any]:
+def _table(learned: Learned) -> dict[str, Any]:
     """The beliefs in virtual space, one row for each parameter."""
+    stages = learned.prior, learned.posterior1, learned.posterior2
     mean = [np.asarray(belief.parameters()[0]) for belief in stages]
     rows = []
-    for i, name in enumerate(names):
-        beliefs = [f"{m[i]:.3f} ± {s[i]:.3f}" for m, s in zip(mean, sd, strict=True)]
-        rows.append([name, f"{float(study.truth[i]):.3f}", *beliefs])
+    for i, name in enumerate(learned.prior.system.parameters.names):
+        pairs = zip(mean, learned.sd, strict=True)
+        beliefs = [f"{m[i]:.3f} ± {s[i]:.3f}" for m, s in pairs]
+        rows.append([name, f"{float(learned.truth[i]):.3f}", *beliefs])
     return {
         "title": "Virtual parameters, mean ± sd",
         "columns": ["parameter", "truth", "prior", "after data set 1", "after both"],
@@ -304,7 +332,7 @@ def _table(
     }
 
 
-def _coverage_table(names: list[str], z: np.ndarray) -> dict[str, Any]:
+def _coverage_table(names: Sequence[str], z: np.ndarray) -> dict[str, Any]:
     shares = {level: covered(z, level) for level in LEVELS}
     rows: list[list[Any]] = [
         [name, *(f"{shares[level][i]:.3f}" for level in LEVELS)]

@@ -1,44 +1,40 @@
 """Figures 2 and 4: posterior sampling, with and without model mismatch.
 
 Best-seen score against episode, for every learner on both machines: with sampling MPC,
-and with policies that are trained off-policy in the sampled world. The cells are on
-the disk as soon as they are flown: an interrupted figure goes on where it was, and a
-finished one is redrawn from them.
+and with policies that are trained off-policy in the sampled world.
 """
 
-import time
-from pathlib import Path
-from typing import Any
+from collections.abc import Mapping
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 
 from sim2gp.planning.tasks import MACHINES, SOLVED
-from sim2gp.runs import Progress, new_run
-from sim2gp.runs.cells import Old
-from sim2gp.runs.provenance import provenance, reproduce
 from sim2gp.studies.claims import (
     SAMPLING_PAYS,
     at_least_as_good,
     better_somewhere,
     claim,
+    difference_in_words,
     interval,
-    told,
 )
+from sim2gp.studies.learners import CONDITIONS, METHODS, TRAINED, WITH_TERM
+from sim2gp.studies.study import AbstractCell, Arrays, Key, Study, Values
 from sim2gp.studies.swingup import (
-    CONDITIONS,
-    METHODS,
-    TRAINED,
-    WITH_TERM,
     Cell,
+    Table,
     best_seen,
     first_at,
     median_episode,
-    study,
+    returns_of,
+    scores_of,
 )
 
-SEEDS, EPISODES = 5, 10
-QUICK_SEEDS, QUICK_EPISODES = 2, 4
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 CLAIM_EPISODES = 5  # claims compare means of the best-seen score over these
 #: Each figure's number, its title, how it plans, and the lines it draws.
 FIGURES = {
@@ -55,69 +51,62 @@ CLOSE = 0.9
 #: Learned models that are compared with each other.
 RIVALS = tuple(m for m in METHODS if m not in ("point estimate", "Auto", WITH_TERM))
 
-Table = dict[tuple[str, str, str], Float[np.ndarray, "seeds E"]]
 
+class PosteriorSampling(Study):
+    """Every learner on every machine, without and with mismatch.
 
-def run(
-    *,
-    out: Path,
-    figure: str,
-    seed: int,
-    seeds: int | None,
-    episodes: int | None,
-    quick: bool,
-    workers: int,
-    progress: Progress,
-    old: Old = "refuse",
-) -> dict[str, Any]:
-    """Compute missing cells, check the claims, write the run; returns its summary.
-
-    ``seeds`` and ``episodes`` None are the figure's own numbers. Cells of an earlier
-    run with this ``out`` are used again, also for fewer episodes (E186: of another
-    source, see ``old``). A ``quick`` look has fewer plans and cells of its own.
+    A quick look has fewer plans and less training, in cells of its own.
     """
-    started = time.perf_counter()
-    seeds = seeds or (QUICK_SEEDS if quick else SEEDS)
-    episodes = episodes or (QUICK_EPISODES if quick else EPISODES)
-    number, title, planning, methods = FIGURES[figure]  # fig2 or fig4
-    groups = {
-        (m, c, w): Cell(m, c, w, seed, episodes, quick=quick, planning=planning)
-        for m in MACHINES
-        for c in CONDITIONS
-        for w in methods
-    }
-    numbers = range(seed, seed + seeds)
-    with new_run(out, f"reproduce {figure}") as writer:
-        table, details = study(
-            groups, numbers, out, workers=workers, progress=progress, old=old
+
+    size = (5, 10)
+    quick_size = (2, 4)
+
+    def rows(self) -> dict[Key, list[Cell]]:
+        """A row for each machine, condition and learner of the figure."""
+        _, _, planning, methods = FIGURES[self.name]
+        cell = partial(
+            Cell, episodes=self.episodes, quick=self.quick, planning=planning
         )
-        check = claims if figure == "fig2" else off_policy_claims
-        summary: dict[str, Any] = {
-            "command": f"reproduce {figure}",
+        return {
+            (m, c, w): [cell(m, c, w, seed) for seed in self.seeds]
+            for m in MACHINES
+            for c in CONDITIONS
+            for w in methods
+        }
+
+    def arrays(self, values: Mapping[AbstractCell, Values]) -> Arrays:
+        """Scores ``figure2/MACHINE/CONDITION/LEARNER``."""
+        table = scores_of(self.rows(), values)
+        return {f"figure2/{'/'.join(key)}": score for key, score in table.items()}
+
+    def summary(
+        self, arrays: Arrays, values: Mapping[AbstractCell, Values]
+    ) -> dict[str, Any]:
+        """The claims of figure 2 or of figure 4."""
+        number, title, _, methods = FIGURES[self.name]
+        table = {key: arrays[f"figure2/{'/'.join(key)}"] for key in self.rows()}
+        check = claims if self.name == "fig2" else off_policy_claims
+        return {
             "title": f"Figure {number}: {title}",
             "figure2": {
                 "number": number,
                 "machines": list(MACHINES),
                 "conditions": list(CONDITIONS),
                 "methods": list(methods),
-                "episodes": episodes,
+                "episodes": self.episodes,
             },
-            "seed": seed,
-            "seeds": seeds,
-            "claims": check(table, np.random.default_rng(seed)),
-            **details,
+            "claims": check(table, self.rng),
+            **returns_of(values),
             "tables": [_table(table, methods)],
-            **provenance(started, reproduce(figure, seed, seeds, episodes, quick, old)),
         }
-        arrays = {f"figure2/{'/'.join(k)}": v for k, v in table.items()}
-        from sim2gp.reports import figure2, figure_bytes, write_report
 
-        writer.write_summary(summary)
-        writer.write_arrays("arrays.npz", arrays)
-        drawn = figure_bytes(figure2(arrays, summary), "png")
-        writer.write_bytes(f"figure{number}.png", drawn)
-        writer.write_text("report.html", write_report(summary, arrays))
-    return summary
+    def pictures(
+        self, arrays: Mapping[str, np.ndarray], summary: Mapping[str, Any]
+    ) -> "dict[str, Figure]":
+        """Best-seen score against episode."""
+        from sim2gp.reports import figure2
+
+        return {f"figure{summary['figure2']['number']}": figure2(arrays, summary)}
 
 
 def claims(table: Table, rng: np.random.Generator) -> dict[str, dict[str, Any]]:
@@ -187,14 +176,14 @@ def off_policy_claims(
         low, high = interval(gain, rng)
         out[f"{machine}_the_posterior_beats_domain_randomisation"] = claim(
             low > 0.0,
-            told(gain, low, high),
+            difference_in_words(gain, low, high),
             "without mismatch policies trained in posterior draws are better than one "
             "trained in draws of the prior (mean best-seen score, episodes 1-5)",
         )
     return out | _sampling_pays(early, rng)
 
 
-def _early(table: Table) -> dict[tuple[str, str, str], Float[np.ndarray, " seeds"]]:
+def _early(table: Table) -> dict[Key, Float[np.ndarray, " seeds"]]:
     """What learners are compared by."""
     return {
         key: best_seen(score)[:, :CLAIM_EPISODES].mean(axis=1)
@@ -203,7 +192,7 @@ def _early(table: Table) -> dict[tuple[str, str, str], Float[np.ndarray, " seeds
 
 
 def _sampling_pays(
-    early: dict[tuple[str, str, str], Float[np.ndarray, " seeds"]],
+    early: dict[Key, Float[np.ndarray, " seeds"]],
     rng: np.random.Generator,
 ) -> dict[str, dict[str, Any]]:
     pairs = {

@@ -5,34 +5,22 @@ for every model with posterior sampling, and for the signals that identification
 always used. One study has the cells of both figures; they differ in what is drawn.
 """
 
-import time
-from collections.abc import Mapping
-from functools import partial
-from itertools import chain
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 
 from sim2gp.planning.tasks import MACHINES
-from sim2gp.runs import Progress, new_run
-from sim2gp.runs.cells import Cells, Old
-from sim2gp.runs.provenance import provenance, reproduce
-from sim2gp.studies import exploring
 from sim2gp.studies.claims import at_least_as_good, claim, of_median
-from sim2gp.studies.exploring import (
-    METHODS,
-    QUANTITIES,
-    Cell,
-    explore_cell,
-    reference,
-)
-from sim2gp.studies.stages import in_stages
-from sim2gp.studies.swingup import CONDITIONS
+from sim2gp.studies.exploring import METHODS, QUANTITIES, Cell
+from sim2gp.studies.learners import CONDITIONS
+from sim2gp.studies.study import AbstractCell, Arrays, Key, Study, Values
 
-SEEDS, EPISODES = 5, 10
-QUICK_SEEDS, QUICK_EPISODES = 1, 2
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 #: Variants that a quick look does without: what is left fits into six minutes.
 NOT_QUICK = ("FS literal", "SIM2GP, step by step", "RES-FS, random")
 STEPS = 250  # transitions of an episode, on both machines
@@ -40,120 +28,93 @@ FIGURES = {"fig3": "rmse", "fig5": "nll"}
 #: Exploring is asked to need at most this share of the transitions of random input.
 SHARE = 0.5
 
-Key = tuple[str, str, str]
 #: Of each machine, condition and method: a row for each seed.
 Table = dict[Key, dict[str, Float[np.ndarray, "seeds E"]]]
 
 
-def run(
-    *,
-    out: Path,
-    seed: int,
-    seeds: int | None,
-    episodes: int | None,
-    quick: bool,
-    workers: int,
-    progress: Progress,
-    figure: str = "fig3",
-    old: Old = "refuse",
-) -> dict[str, Any]:
-    """Fly the missing cells, check the claims, write the run; returns its summary.
+class Exploration(Study):
+    """Every explorer on every machine; both figures use the same cells."""
 
-    ``figure`` is drawn first, the other one beside it. Other arguments as for figure 2.
-    """
-    started = time.perf_counter()
-    seeds = seeds or (QUICK_SEEDS if quick else SEEDS)
-    episodes = episodes or (QUICK_EPISODES if quick else EPISODES)
-    numbers = range(seed, seed + seeds)
-    methods = [m for m in METHODS if not (quick and m in NOT_QUICK)]
-    groups = {
-        (m, c, w): [Cell(m, c, w, n, episodes, quick) for n in numbers]
-        for m in MACHINES
-        for c in CONDITIONS
-        for w in methods
-    }
-    with new_run(out, f"reproduce {figure}") as writer:
-        flown, about = _flown(groups, out, workers=workers, progress=progress, old=old)
-        of_key = {k: [flown[cell] for cell in row] for k, row in groups.items()}
-        table = {key: _columns(values, episodes) for key, values in of_key.items()}
-        early = {key: _beginnings(values) for key, values in of_key.items()}
-        summary: dict[str, Any] = {
-            "command": f"reproduce {figure}",
+    size = (5, 10)
+    quick_size = (1, 2)
+
+    @property
+    def methods(self) -> list[str]:
+        """The explorers."""
+        return [m for m in METHODS if not (self.quick and m in NOT_QUICK)]
+
+    def rows(self) -> dict[Key, list[Cell]]:
+        """A row for each machine, condition and explorer."""
+        return {
+            (m, c, w): [Cell(m, c, w, n, self.episodes, self.quick) for n in self.seeds]
+            for m in MACHINES
+            for c in CONDITIONS
+            for w in self.methods
+        }
+
+    def cells_of(self, out: Path) -> Path:
+        """Of both figures."""
+        return out.parent / "exploring"
+
+    def arrays(self, values: Mapping[AbstractCell, Values]) -> Arrays:
+        """``figure3/MACHINE/CONDITION/METHOD/QUANTITY``, and ``.../early``."""
+        arrays: Arrays = {}
+        for key, row in self.rows().items():
+            found = [values[cell] for cell in row]
+            place = f"figure3/{'/'.join(key)}"
+            for name, column in _columns(found, self.episodes).items():
+                arrays[f"{place}/{name}"] = column
+            arrays[f"{place}/early"] = _beginnings(found)
+        return arrays
+
+    def summary(
+        self, arrays: Arrays, values: Mapping[AbstractCell, Values]
+    ) -> dict[str, Any]:
+        """The claims of both figures."""
+        del values
+        keys = list(self.rows())
+        table = {
+            key: {
+                name: arrays[f"figure3/{'/'.join(key)}/{name}"] for name in QUANTITIES
+            }
+            for key in keys
+        }
+        early = {key: arrays[f"figure3/{'/'.join(key)}/early"] for key in keys}
+        return {
             "title": "Figures 3 and 5: exploring for information",
             "figure3": {
                 "machines": list(MACHINES),
                 "conditions": list(CONDITIONS),
-                "methods": methods,
-                "episodes": episodes,
-                "shown": FIGURES[figure],
+                "methods": self.methods,
+                "episodes": self.episodes,
+                "shown": FIGURES[self.name],
             },
-            "seed": seed,
-            "seeds": seeds,
-            "claims": claims(table, early, np.random.default_rng(seed)),
-            **about,
-            "tables": _tables(table, methods),
-            **provenance(started, reproduce(figure, seed, seeds, episodes, quick, old)),
+            "claims": claims(table, early, self.rng),
+            "tables": _tables(table, self.methods),
         }
-        arrays = _arrays(table, early)
-        from sim2gp.reports import figure3, figure_bytes, write_report
 
-        writer.write_summary(summary)
-        writer.write_arrays("arrays.npz", arrays)
-        for name, shown in FIGURES.items():
-            drawn = figure3(arrays, summary, shown)
-            writer.write_bytes(f"{name}.png", figure_bytes(drawn, "png"))
-        writer.write_text("report.html", write_report(summary, arrays))
-    return summary
+    def pictures(
+        self, arrays: Mapping[str, np.ndarray], summary: Mapping[str, Any]
+    ) -> "dict[str, Figure]":
+        """Both figures."""
+        from sim2gp.reports import figure3
 
-
-def _arrays(table: Table, early: Mapping[Key, np.ndarray]) -> dict[str, np.ndarray]:
-    """As the figures are drawn from: figure3/MACHINE/CONDITION/METHOD/QUANTITY."""
-    arrays = {
-        f"figure3/{'/'.join(key)}/{name}": values
-        for key, columns in table.items()
-        for name, values in columns.items()
-    }
-    return arrays | {f"figure3/{'/'.join(k)}/early": v for k, v in early.items()}
-
-
-def _flown(
-    groups: Mapping[Key, list[Cell]],
-    out: Path,
-    *,
-    workers: int,
-    progress: Progress,
-    old: Old,
-) -> tuple[dict[Cell, dict[str, Any]], dict[str, Any]]:
-    """The values of every cell, and what a summary says of their source (E186)."""
-    every = list(chain.from_iterable(groups.values()))
-    stages = (list(dict.fromkeys(map(reference, every))), every)
-
-    def alike(cell: Cell) -> Any:
-        return cell.machine, cell.method
-
-    # Both figures are drawn from the same cells.
-    shared = out.parent / "exploring"
-    stored = Cells(shared, exploring.__file__, old)
-    named = [(cell.name, cell.arguments) for cell in dict.fromkeys(chain(*stages))]
-    stored.check(named)
-    work = partial(explore_cell, out=shared, old=old)
-    flown = in_stages(stages, work, alike, workers=workers, progress=progress)
-    return flown, _told(flown) | stored.summary(named)
+        return {name: figure3(arrays, summary, x) for name, x in FIGURES.items()}
 
 
 def _columns(
-    values: list[dict[str, Any]], episodes: int
+    values: Sequence[Values], episodes: int
 ) -> dict[str, Float[np.ndarray, "seeds E"]]:
-    """Each quantity of each seed and episode; NaN where nothing was flown."""
+    """Each quantity of each seed and episode; NaN where nothing was run."""
     out = {name: np.full((len(values), episodes), np.nan) for name in QUANTITIES}
     for i, value in enumerate(values):
         for name, column in out.items():
-            flown = value.get(name, [])[:episodes]
-            column[i, : len(flown)] = flown
+            found = value.get(name, [])[:episodes]
+            column[i, : len(found)] = found
     return out
 
 
-def _beginnings(values: list[dict[str, Any]]) -> Float[np.ndarray, "seeds looks two"]:
+def _beginnings(values: Sequence[Values]) -> Float[np.ndarray, "seeds looks two"]:
     """Transitions and error of the looks into the first episode."""
     looks = max((len(value["early"]) for value in values), default=0)
     out = np.full((len(values), looks, 2), np.nan)
@@ -256,22 +217,6 @@ def _last(values: Float[np.ndarray, "seeds E"]) -> Float[np.ndarray, " seeds"]:
     """The last number of each seed; infinite where there is none."""
     found = [row[np.isfinite(row)] for row in values]
     return np.asarray([row[-1] if row.size else np.inf for row in found])
-
-
-def _told(flown: Mapping[Cell, Mapping[str, Any]]) -> dict[str, Any]:
-    """What a summary says of its cells: failures and seconds."""
-    spent: dict[str, float] = {}
-    for cell, value in flown.items():
-        if cell.method != "oracle":
-            spent[cell.method] = spent.get(cell.method, 0.0) + value["seconds"]
-    return {
-        "fits_not_converged": [
-            f"{cell.name}: {value['failure']}"
-            for cell, value in flown.items()
-            if value.get("failure")
-        ],
-        "seconds_of_cells": spent,
-    }
 
 
 def _tables(table: Table, methods: list[str]) -> list[dict[str, Any]]:

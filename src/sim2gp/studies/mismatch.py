@@ -5,17 +5,13 @@ Registered before it is run: the effects and strengths of the catalogue
 regret of the model that chooses, against the best model that was fixed beforehand.
 """
 
-import time
-from pathlib import Path
-from typing import Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 
 from sim2gp.planning.tasks import SOLVED
-from sim2gp.runs import Progress, new_run
-from sim2gp.runs.cells import Old
-from sim2gp.runs.provenance import provenance, reproduce
 from sim2gp.studies.claims import (
     SAMPLING_PAYS,
     better_somewhere,
@@ -23,85 +19,84 @@ from sim2gp.studies.claims import (
     claim,
     resampled,
 )
+from sim2gp.studies.learners import METHODS, WITH_TERM
+from sim2gp.studies.study import AbstractCell, Arrays, Key, Study, Values
 from sim2gp.studies.swingup import (
-    METHODS,
-    WITH_TERM,
     Cell,
+    Table,
     best_seen,
     first_at,
-    study,
+    returns_of,
+    scores_of,
 )
 from sim2gp.systems.effects.strengths import STRENGTHS, graded
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 MACHINE = "furuta"
 EFFECTS = graded(MACHINE)
-SEEDS, EPISODES = 5, 3
-QUICK_SEEDS, QUICK_EFFECTS = 1, ("spring",)
+QUICK_EFFECTS = ("spring",)
 #: Auto's regret is asked to be at most this many times that of the best fixed model.
 REGRET = 1.1
 #: Fixed models that know no more than Auto does.
 FIXED = tuple(m for m in METHODS if m not in ("Auto", WITH_TERM))
 
-Table = dict[tuple[str, str], Float[np.ndarray, "seeds E"]]
 
+class MismatchMap(Study):
+    """Every learner under every effect; a quick look has one effect and one seed."""
 
-def run(
-    *,
-    out: Path,
-    seed: int,
-    seeds: int | None,
-    episodes: int | None,
-    quick: bool,
-    workers: int,
-    progress: Progress,
-    old: Old = "refuse",
-) -> dict[str, Any]:
-    """Fly the missing cells and write the map; returns its summary.
+    size = (5, 3)
+    quick_size = (1, 3)
 
-    ``quick`` is one effect and one seed.
-    """
-    started = time.perf_counter()
-    seeds = seeds or (QUICK_SEEDS if quick else SEEDS)
-    episodes = episodes or EPISODES
-    conditions = [
-        f"{effect} {strength}"
-        for effect in (QUICK_EFFECTS if quick else EFFECTS)
-        for strength in STRENGTHS
-    ]
-    numbers = range(seed, seed + seeds)
-    groups = {
-        (c, m): Cell(MACHINE, c, m, seed, episodes) for c in conditions for m in METHODS
-    }
-    with new_run(out, "reproduce mismatch") as writer:
-        table, details = study(
-            groups, numbers, out, workers=workers, progress=progress, old=old
-        )
-        words = reproduce("mismatch", seed, seeds, episodes, quick, old)
-        summary: dict[str, Any] = {
-            "command": "reproduce mismatch",
-            "title": "Mismatch map: every learner under what its simulator lacks",
-            "seed": seed,
-            "seeds": seeds,
-            "episodes": episodes,
-            "regret": regrets(table),
-            "claims": claims(table, np.random.default_rng(seed)),
-            **details,
-            "tables": tables(table),
-            **provenance(started, words),
+    def rows(self) -> dict[Key, list[Cell]]:
+        """A row for each effect with its strength, and each learner."""
+        return {
+            (condition, method): [
+                Cell(MACHINE, condition, method, seed, self.episodes)
+                for seed in self.seeds
+            ]
+            for effect in (QUICK_EFFECTS if self.quick else EFFECTS)
+            for condition in (f"{effect} {strength}" for strength in STRENGTHS)
+            for method in METHODS
         }
-        arrays = {f"mismatch/{'/'.join(k)}": v for k, v in table.items()}
-        from sim2gp.reports import write_report
 
-        writer.write_summary(summary)
-        writer.write_arrays("arrays.npz", arrays)
-        writer.write_text("report.html", write_report(summary, arrays))
-    return summary
+    def arrays(self, values: Mapping[AbstractCell, Values]) -> Arrays:
+        """Scores ``mismatch/EFFECT/LEARNER``."""
+        table = scores_of(self.rows(), values)
+        return {f"mismatch/{'/'.join(key)}": score for key, score in table.items()}
+
+    def summary(
+        self, arrays: Arrays, values: Mapping[AbstractCell, Values]
+    ) -> dict[str, Any]:
+        """Regrets and claims."""
+        table = {key: arrays[f"mismatch/{'/'.join(key)}"] for key in self.rows()}
+        return {
+            "title": "Mismatch map: every learner under what its simulator lacks",
+            "episodes": self.episodes,
+            "mismatch": {
+                "conditions": list(dict.fromkeys(c for c, _ in table)),
+                "methods": list(METHODS),
+            },
+            "regret": regrets(table),
+            "claims": claims(table, self.rng),
+            **returns_of(values),
+            "tables": tables(table),
+        }
+
+    def pictures(
+        self, arrays: Mapping[str, np.ndarray], summary: Mapping[str, Any]
+    ) -> "dict[str, Figure]":
+        """Scores of the last episode, by effect and learner."""
+        from sim2gp.reports import mismatch_map
+
+        return {"mismatch": mismatch_map(arrays, summary)}
 
 
 def lost(table: Table) -> dict[str, Float[np.ndarray, " seeds"]]:
     """Regret of each learner and seed: lost score, summed over the map's episodes.
 
-    An episode that was not flown lost all of it; better than the oracle is no gain.
+    An episode that was not run lost all of it; better than the oracle is no gain.
     """
     out: dict[str, Float[np.ndarray, " seeds"]] = {}
     for (_, method), score in table.items():
@@ -118,7 +113,7 @@ def regrets(table: Table) -> dict[str, float]:
 def claims(table: Table, rng: np.random.Generator) -> dict[str, dict[str, Any]]:
     """Whether choosing costs more than having known the best model in advance.
 
-    And whether sampling pays anywhere, by the mean score of the episodes flown.
+    And whether sampling pays anywhere, by the mean score of the episodes.
     """
     each, regret = lost(table), regrets(table)
     best = min(FIXED, key=lambda m: regret[m])

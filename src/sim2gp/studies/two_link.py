@@ -9,6 +9,10 @@ Torques are autocorrelated noise within the motors' limits; process noise acts o
 increments of the joints that move.
 """
 
+import time
+from collections.abc import Hashable
+from dataclasses import asdict, dataclass
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -19,7 +23,7 @@ from jaxtyping import Array, Float
 from sim2gp.data.transitions import Transitions
 from sim2gp.errors import NotConverged, NotFinite
 from sim2gp.models import Sim2GP, Sim2GPBelief
-from sim2gp.runs import Progress
+from sim2gp.studies.study import AbstractCell, Values
 from sim2gp.systems import UniformRodArm
 from sim2gp.types import Action, Key, State, in_float64
 
@@ -45,7 +49,7 @@ class Recording(eqx.Module):
         return Transitions.of(s[:-1], np.asarray(self.action), s[1:])
 
 
-class Study(eqx.Module):
+class Learned(eqx.Module):
     """Both data sets of one arm, and the belief that each stage starts and ends with.
 
     ``middle`` is posterior 1 as the prior of the free arm.
@@ -58,6 +62,12 @@ class Study(eqx.Module):
     posterior1: Sim2GPBelief
     middle: Sim2GPBelief
     posterior2: Sim2GPBelief
+
+    @property
+    def sd(self) -> Float[np.ndarray, "stages p"]:
+        """Posterior sd before any data, after the first data set, and after both."""
+        stages = self.prior, self.posterior1, self.posterior2
+        return np.stack([np.asarray(belief.parameters()[1]) for belief in stages])
 
     @property
     def z(self) -> Float[np.ndarray, " p"]:
@@ -100,7 +110,7 @@ def record(arm: UniformRodArm, truth: Float[Array, " p"], *, key: Key) -> Record
 
 
 @in_float64
-def learn(truth: Float[Array, " p"], *, key: Key) -> Study:
+def learn(truth: Float[Array, " p"], *, key: Key) -> Learned:
     """Record and learn both data sets in turn; raises what `Sim2GP.fit` raises."""
     one, two, fit1, fit2 = jax.random.split(key, 4)
     locked, free = UniformRodArm(locked=LOCKED), UniformRodArm()
@@ -111,36 +121,59 @@ def learn(truth: Float[Array, " p"], *, key: Key) -> Study:
     model = Sim2GP(free, dt=DT).with_prior(posterior1.posterior)
     middle = model.init(fit2)
     posterior2 = model.fit(middle, second.transitions(), key=fit2)
-    return Study(truth, first, second, prior, posterior1, middle, posterior2)
+    return Learned(truth, first, second, prior, posterior1, middle, posterior2)
 
 
-@in_float64
-def coverage_study(
-    seeds: int, *, key: Key, progress: Progress
-) -> tuple[dict[str, np.ndarray], int]:
-    """Errors in posterior sd over arms drawn from the prior, and failed fits.
+@dataclass(frozen=True)
+class Cell(AbstractCell):
+    """One arm, recorded and learned; ``index`` counts the arms of a seed.
 
-    Returns arrays ``truth``, ``z`` and ``sd`` (seeds, p). A failed fit counts as an arm
-    that no interval covers: its ``z`` is infinite.
+    method: ``prior``, an arm drawn from the prior, or ``nominal``, another recording of
+        the nominal arm.
     """
-    prior = UniformRodArm().parameters.prior()
-    truth, z, sd, failed = [], [], [], 0
-    with progress.task("coverage", seeds) as task:
-        for seed in range(seeds):
-            draw, run = jax.random.split(jax.random.fold_in(key, seed))
-            truth.append(np.asarray(prior.sample(draw)))
-            try:
-                study = learn(jnp.asarray(truth[-1]), key=run)
-            except (NotConverged, NotFinite) as error:
-                failed += 1
-                z.append(np.full(truth[-1].size, np.inf))
-                sd.append(np.asarray(prior.sd()))
-                task.advance(f"arm {seed}: {error.code}")
-                continue
-            z.append(study.z)
-            sd.append(np.asarray(study.posterior2.parameters()[1]))
-            task.advance()
-    return {"truth": np.stack(truth), "z": np.stack(z), "sd": np.stack(sd)}, failed
+
+    method: str
+    seed: int
+    index: int
+
+    @property
+    def name(self) -> str:
+        """The name of its file."""
+        return f"{self.method}_{self.seed}_{self.index}"
+
+    @property
+    def arguments(self) -> Values:
+        """All of them."""
+        return asdict(self)
+
+    @property
+    def program(self) -> tuple[Hashable, ...]:
+        """All arms are one program; both kinds have a process of their own."""
+        return (self.method,)
+
+    @in_float64
+    def compute(self, needed: Values | None) -> Values:
+        """Errors and spreads of the two data sets; none for a fit that failed."""
+        del needed
+        kind = ("prior", "nominal").index(self.method)
+        key = jax.random.fold_in(jax.random.key(self.seed), 2 + 2 * kind)
+        draw, run = jax.random.split(jax.random.fold_in(key, self.index))
+        truth = nominal_truth()
+        if self.method == "prior":
+            truth = UniformRodArm().parameters.prior().sample(draw)
+        given = {
+            "truth": np.asarray(truth).tolist(),
+            "z": [],
+            "sd": [],
+            "failure": None,
+        }
+        started = time.perf_counter()
+        try:
+            learned = learn(jnp.asarray(truth), key=run)
+        except (NotConverged, NotFinite) as error:
+            return given | {"failure": str(error)}
+        found = {"z": learned.z.tolist(), "sd": learned.sd.tolist()}
+        return given | found | {"seconds": time.perf_counter() - started}
 
 
 def band(level: int, count: int) -> tuple[float, float]:
