@@ -72,6 +72,11 @@ def refusal(key: str, make: Callable[[], object], *words: str) -> Input:
     return Input(key, words, called)
 
 
+def refusals(key: str, *calls: tuple[str, Callable[[], object]]) -> list[Input]:
+    """Several calls of one error, each with the name of what is refused."""
+    return [refusal(key, make, what) for what, make in calls]
+
+
 def table(time: np.ndarray | None = None) -> np.ndarray:
     """Rows of a cart that swings, of a pole that has its own will, and a chirp."""
     t = PERIOD * np.arange(ROWS) if time is None else time
