@@ -2,6 +2,8 @@
 
 from bad_functions import FUNCTIONS
 from bad_inputs import Case
+from bad_models import MODELS
 from bad_settings import SETTINGS
+from bad_sysid import SYSID
 
-CALLS: tuple[Case, ...] = (*SETTINGS, *FUNCTIONS)
+CALLS: tuple[Case, ...] = (*SETTINGS, *FUNCTIONS, *MODELS, *SYSID)
