@@ -37,7 +37,7 @@ def crashing(folder: Path, patch: Patch) -> Sequence[str]:
     child = folder / "child.py"
     child.write_text("import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
     patch.setattr(mjcf_load, "_CHILD", str(child))
-    found = model(MODEL, "E171").make(folder, patch)
+    found = model(MODEL, "parser_died").make(folder, patch)
     assert found is not None
     return found
 
@@ -79,7 +79,7 @@ TENSORS = (8).to_bytes(8, "little") + b'{"a":{}}'
 # Runs
 
 
-def policy(changes: Mapping[str, Any], code: str, *said: str) -> Input:
+def policy(changes: Mapping[str, Any], key: str, *said: str) -> Input:
     """What `export_policy` writes, of one layer, with some arrays changed."""
 
     def make(folder: Path, patch: Patch) -> None:
@@ -93,13 +93,13 @@ def policy(changes: Mapping[str, Any], code: str, *said: str) -> Input:
             writer.write_summary({"policy": about})
         load_policy(folder / "policy")
 
-    return Input(code, said, make)
+    return Input(key, said, make)
 
 
 NAN = np.full((1, 2), np.nan, np.float32)
 
 
-def run(spoil: Callable[[Path], object], code: str, *said: str) -> Input:
+def run(spoil: Callable[[Path], object], key: str, *said: str) -> Input:
     """An identification that something happened to since; `evaluate` reads it."""
 
     def make(folder: Path, patch: Patch) -> Sequence[str]:
@@ -122,7 +122,7 @@ def run(spoil: Callable[[Path], object], code: str, *said: str) -> Input:
         spoil(folder / "run")
         return "evaluate", "run", "--logs", "a.csv"
 
-    return Input(code, ("run", *said), make)
+    return Input(key, ("run", *said), make)
 
 
 def flipped(folder: Path) -> None:
@@ -142,7 +142,7 @@ def odd(*manifests: str) -> Sequence[Input]:
     def spoiling(text: str) -> Callable[[Path], object]:
         return lambda folder: (folder / "manifest.json").write_text(text)
 
-    return [run(spoiling(m), "E183", "manifest.json") for m in manifests]
+    return [run(spoiling(m), "damaged_run", "manifest.json") for m in manifests]
 
 
 def fixed_since(folder: Path) -> None:
@@ -156,14 +156,14 @@ THIRD: tuple[Case, ...] = (
         "MJCF: no such joint, actuator",
         model(
             MODEL,
-            "E170",
+            "unknown_model_constant",
             "project.toml:line 9",
             "did you mean joint/hip/damping",
             more='[parameters]\n"joint/hop/damping" = 1.0',
         ),
         model(
             MODEL,
-            "E160",
+            "unknown_name",
             "project.toml:line 8",
             "one of push",
             more="[actuators.pusj]\ngain = 1.0",
@@ -172,12 +172,12 @@ THIRD: tuple[Case, ...] = (
     case(
         68,
         "MJCF: syntax, mesh",
-        model("<mujoco>\n<worldbody>\n</mujoco>", "E170", "arm.xml"),
+        model("<mujoco>\n<worldbody>\n</mujoco>", "not_plain_xml", "arm.xml"),
         model(
             MODEL.replace(
                 "<worldbody>", '<asset><mesh file="no.stl"/></asset><worldbody>'
             ),
-            "E170",
+            "missing_model_part",
             "arm.xml",
             "no.stl",
         ),
@@ -185,9 +185,11 @@ THIRD: tuple[Case, ...] = (
     case(
         69,
         "MJCF: crash, foreign file",
-        Input("E171", ("arm.xml", "exit -11"), crashing),
+        Input("parser_died", ("arm.xml", "exit -11"), crashing),
         model(
-            '<mujoco><include file="/etc/passwd"/></mujoco>', "E171", "got /etc/passwd"
+            '<mujoco><include file="/etc/passwd"/></mujoco>',
+            "file_outside_model_folder",
+            "got /etc/passwd",
         ),
     ),
     # No project chooses MJX; what that lacks is refused in test_mujoco_mjx.py.
@@ -198,7 +200,7 @@ THIRD: tuple[Case, ...] = (
             MODEL.replace(
                 '<joint name="hip" damping=".1"/>', '<freejoint name="hip"/>'
             ).replace('<actuator><motor name="push" joint="hip"/></actuator>', ""),
-            "E172",
+            "joint_with_quaternion",
             "quaternion",
             "hip",
         ),
@@ -206,19 +208,24 @@ THIRD: tuple[Case, ...] = (
     case(
         71,
         "pickle by another name",
-        stored("a.npz", raw(PICKLE), "E180", "pickle refused"),
-        stored("a.csv", raw(PICKLE), "E180", "pickle refused"),
-        stored("a.safetensors", raw(PICKLE), "E180", "pickle refused"),
-        stored("a.pt", raw(b"never read"), "E180", "pickle refused"),
-        stored("a.joblib", raw(b"never read"), "E180", "pickle refused"),
-        stored("a.PICKLE", raw(b"never read"), "E180", "pickle refused"),
-        stored("a.npz", TORCH, "E180", "data.pkl"),
-        stored("a.safetensors", TORCH, "E180", "pickle refused"),
+        stored("a.npz", raw(PICKLE), "pickle_refused", "pickle refused"),
+        stored("a.csv", raw(PICKLE), "pickle_refused", "pickle refused"),
+        stored("a.safetensors", raw(PICKLE), "pickle_refused", "pickle refused"),
+        stored("a.pt", raw(b"never read"), "pickle_refused", "pickle refused"),
+        stored("a.joblib", raw(b"never read"), "pickle_refused", "pickle refused"),
+        stored("a.PICKLE", raw(b"never read"), "pickle_refused", "pickle refused"),
+        stored("a.npz", TORCH, "pickle_refused", "data.pkl"),
+        stored("a.safetensors", TORCH, "pickle_refused", "pickle refused"),
     ),
     case(
         72,
         "objects in an npz",
-        stored("a.npz", npz(pos=np.array([Touch()] * ROWS)), "E180", "column pos"),
+        stored(
+            "a.npz",
+            npz(pos=np.array([Touch()] * ROWS)),
+            "array_of_objects",
+            "column pos",
+        ),
     ),
     case(
         73,
@@ -226,7 +233,7 @@ THIRD: tuple[Case, ...] = (
         stored(
             "a.npz",
             archive(("pos.npy", header(65536, 65536))),
-            "E126",
+            "array_header_and_size_differ",
             "(65536, 65536)",
         ),
     ),
@@ -234,27 +241,42 @@ THIRD: tuple[Case, ...] = (
     case(
         74,
         "tensors",
-        stored("a.safetensors", raw(TENSORS), "E181", "numpy.savez"),
-        policy({"weights/0": NAN}, "E181", "weights/0", "2 of 2"),
-        policy({"weights/0": np.ones((1, 2))}, "E133", "float64"),
+        stored("a.safetensors", raw(TENSORS), "safetensors_refused", "numpy.savez"),
+        policy({"weights/0": NAN}, "policy_not_finite", "weights/0", "2 of 2"),
+        policy({"weights/0": np.ones((1, 2))}, "not_a_policy", "float64"),
         stored(
             "a.npz",
             archive(("pos.npy", b"\x93NUMPY\x02\x00" + b"\xff" * 3 + b"\x7f")),
-            "E126",
+            "beyond_the_budget",
         ),
     ),
     case(
         75,
         "archive entry outside",
-        stored("a.npz", archive(("../../evil.npy", header(0))), "E182", "../../evil"),
-        stored("a.npz", archive(("/etc/evil.npy", header(0))), "E182", "/etc/evil"),
-        stored("a.npz", archive(("C:\\evil.npy", header(0))), "E182", "evil"),
+        stored(
+            "a.npz",
+            archive(("../../evil.npy", header(0))),
+            "entry_outside_archive",
+            "../../evil",
+        ),
+        stored(
+            "a.npz",
+            archive(("/etc/evil.npy", header(0))),
+            "entry_outside_archive",
+            "/etc/evil",
+        ),
+        stored(
+            "a.npz",
+            archive(("C:\\evil.npy", header(0))),
+            "entry_outside_archive",
+            "evil",
+        ),
     ),
     case(
         76,
         "run that was changed",
-        run(flipped, "E183", "arrays.npz", "another checksum"),
-        run(newer, "E185", "got 99", "at most 2"),
+        run(flipped, "damaged_run", "arrays.npz", "another checksum"),
+        run(newer, "newer_run", "got 99", "at most 2"),
         *odd(
             '{"format": "1", "files": {}}',
             '{"format": null, "files": {}}',
@@ -265,6 +287,11 @@ THIRD: tuple[Case, ...] = (
             "[" * 100_000,
             "[1]",
         ),
-        run(fixed_since, "E184", "project.toml", "expected cart_mass"),
+        run(
+            fixed_since,
+            "other_parameters_than_fitted",
+            "project.toml",
+            "expected cart_mass",
+        ),
     ),
 )

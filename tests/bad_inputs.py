@@ -1,7 +1,8 @@
 """The table of bad inputs: what an input is, and how logs are spoilt.
 
-A case is a number, a title, and inputs; an input is made in a folder, and what its door
-must say is a code and some words. Here stands what the files of cases share.
+A case is a number, a title, and inputs. An input is made in a folder. What must be
+said of it is a key of the catalogue of errors, and the places and names that the line
+has to have. The files of cases share what is here.
 """
 
 import os
@@ -38,10 +39,12 @@ PERIOD, ROWS = 0.01, 300
 class Input:
     """``make`` writes the input and returns a command's words; None: it raises.
 
-    A code that begins with W is a note of a command that goes on, "" says nothing.
+    ``key`` is its error's in the catalogue. A code stands for an error that is not
+    there (of the command line, of a value in a project file), and a code that begins
+    with W for a note of a command that goes on; "" is no error.
     """
 
-    code: str
+    key: str
     words: tuple[str, ...]
     make: Make
     summary: dict[str, Any] = field(default_factory=dict)
@@ -58,6 +61,20 @@ class Case:
 
 def case(number: int, title: str, *inputs: Input) -> Case:
     return Case(number, title, inputs)
+
+
+def refusal(key: str, make: Callable[[], object], *words: str) -> Input:
+    """An error of a call from Python, which needs no folder."""
+
+    def called(folder: Path, patch: Patch) -> None:
+        make()
+
+    return Input(key, words, called)
+
+
+def refusals(key: str, *calls: tuple[str, Callable[[], object]]) -> list[Input]:
+    """Several calls of one error, each with the name of what is refused."""
+    return [refusal(key, make, what) for what, make in calls]
 
 
 def table(time: np.ndarray | None = None) -> np.ndarray:
@@ -118,7 +135,7 @@ def episodes(ids: np.ndarray) -> str:
 
 def log(
     content: str | bytes,
-    code: str,
+    key: str,
     *words: str,
     project: str = PROJECT,
     command: Sequence[str] = IDENTIFY,
@@ -132,11 +149,11 @@ def log(
         (folder / "a.csv").write_bytes(raw)
         return command
 
-    named = ("a.csv", *words) if code else words
-    return Input(code, named, make, summary)
+    named = ("a.csv", *words) if key else words
+    return Input(key, named, make, summary)
 
 
-def stored(name: str, write: Callable[[Path], object], code: str, *words: str) -> Input:
+def stored(name: str, write: Callable[[Path], object], key: str, *words: str) -> Input:
     """A file of any format that a project names, and that a function writes."""
 
     def make(folder: Path, patch: Patch) -> Sequence[str]:
@@ -144,7 +161,7 @@ def stored(name: str, write: Callable[[Path], object], code: str, *words: str) -
         write(folder / name)
         return IDENTIFY
 
-    return Input(code, (name, *words), make)
+    return Input(key, (name, *words), make)
 
 
 def renamed(old: str, new: str) -> str:
@@ -232,14 +249,14 @@ def locked(path: Path) -> None:
         path.symlink_to(path.name)
 
 
-def named(files: str, code: str, *words: str) -> Input:
+def named(files: str, key: str, *words: str) -> Input:
     """A project that names files which are not there."""
 
     def make(folder: Path, patch: Patch) -> Sequence[str]:
         (folder / "project.toml").write_text(PROJECT.replace("*.csv", files))
         return IDENTIFY
 
-    return Input(code, words, make)
+    return Input(key, words, make)
 
 
 def growing(folder: Path, patch: Patch) -> Sequence[str]:
@@ -283,7 +300,7 @@ push = "cmd"
 """
 
 
-def model(text: str, code: str, *said: str, more: str = "") -> Input:
+def model(text: str, key: str, *said: str, more: str = "") -> Input:
     """A project about a model's file."""
 
     def make(folder: Path, patch: Patch) -> Sequence[str]:
@@ -293,4 +310,4 @@ def model(text: str, code: str, *said: str, more: str = "") -> Input:
         (folder / "project.toml").write_text(f'system = "arm.xml"\n{LOGS}{more}')
         return IDENTIFY
 
-    return Input(code, said, make)
+    return Input(key, said, make)

@@ -1,8 +1,8 @@
-"""The list of bad inputs, whole: each gets one line with its code and leaves nothing.
+"""The list of bad inputs: each gets one line, of its entry in the catalogue of errors.
 
-Driven through the command that takes the input, in this process; through Python where
-no command does. The inputs stand in `bad_logs`, `bad_projects` and
-`bad_files`, what they share in `bad_inputs`.
+An input goes through the command that takes it, in this process, and leaves nothing;
+through Python where no command does. The files `bad_*` have the inputs, `bad_inputs`
+what they share.
 """
 
 import json
@@ -14,15 +14,19 @@ from pathlib import Path
 import pytest
 
 import stub_commands
+from bad_calls import CALLS
 from bad_files import THIRD
-from bad_inputs import TEXTS, Case, Input, changed, log
+from bad_inputs import TEXTS, Input, changed, log
 from bad_logs import FIRST
 from bad_projects import SECOND
+from sim2gp import cli
 from sim2gp.cli import main
 from sim2gp.errors import Sim2GPError
 
-CASES = (*FIRST, *SECOND, *THIRD)
+CASES = (*FIRST, *SECOND, *THIRD, *CALLS)
+ROWS = [(bad, i, given) for bad in CASES for i, given in enumerate(bad.inputs)]
 LINE = re.compile(r"[EW]1\d\d \S.*(in|:) .*got .*expected .*\. Fix: .*\.")
+CODE = re.compile(r"[EW]\d{3}")
 
 
 def contents(folder: Path) -> dict[str, bytes | str]:
@@ -41,16 +45,25 @@ def compiled(*args: object) -> None:
 
 def refused(
     words: list[str], capsys: pytest.CaptureFixture[str], patch: pytest.MonkeyPatch
-) -> str:
-    """The line that a command says which stops at its input, and compiles nothing."""
+) -> Sim2GPError:
+    """The error of a command that stops at its input, and compiles nothing."""
     patch.setattr("sim2gp.commands.identify.fit_windows", compiled)
+    met: list[Sim2GPError] = []
+    printed = cli._told
+
+    def told(error: Sim2GPError, code: int, debug: bool) -> int:
+        met.append(error)
+        return printed(error, code, debug)
+
+    patch.setattr(cli, "_told", told)
     before = contents(Path.cwd())
     assert main(words) == 2
     said = capsys.readouterr()
     assert said.out == ""
-    assert said.err.count("\n") == 1
+    assert said.err == f"{met[0]}\n"
+    assert LINE.fullmatch(str(met[0])), met[0]
     assert contents(Path.cwd()) == before
-    return said.err.rstrip("\n")
+    return met[0]
 
 
 def stated(
@@ -68,44 +81,48 @@ def stated(
     counted = summary | {"warnings": len(summary["warnings"])}
     assert {name: counted[name] for name in given.summary} == given.summary
     notes = [line for line in err.splitlines() if line.startswith("W1")]
-    if given.code == "":
+    if given.key == "":
         return ""
-    return next(line for line in notes if line.startswith(given.code))
+    return next(line for line in notes if line.startswith(given.key))
 
 
-@pytest.mark.parametrize("bad", CASES, ids=lambda bad: f"{bad.number} {bad.title}")
+@pytest.mark.parametrize(
+    "given",
+    [row[-1] for row in ROWS],
+    ids=[f"{bad.number} {bad.title} {i} {given.key}" for bad, i, given in ROWS],
+)
 def test_bad_input(
-    bad: Case,
+    given: Input,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    for i, given in enumerate(bad.inputs):
-        folder = tmp_path / str(i)
-        folder.mkdir()
-        with monkeypatch.context() as patch:
-            patch.chdir(folder)
-            try:
-                words = given.make(folder, patch)
-            except Sim2GPError as error:
-                line = str(error)
-            else:
-                assert words is not None, "neither a command nor an error"
-                if given.code[:1] == "E":
-                    line = refused(list(words), capsys, patch)
-                else:
-                    line = stated(given, list(words), capsys, patch)
-        assert line.startswith(given.code)
-        assert "\n" not in line
-        assert len(line) < 600
-        for word in given.words:
-            assert word in line
-        if given.code[:1] == "E":
-            assert LINE.fullmatch(line), line
+    monkeypatch.chdir(tmp_path)
+    error: Sim2GPError | None = None
+    try:
+        words = given.make(tmp_path, monkeypatch)
+    except Sim2GPError as caught:
+        error = caught
+    else:
+        assert words is not None, "neither a command nor an error"
+        if given.key == "" or given.key.startswith("W1"):
+            line = stated(given, list(words), capsys, monkeypatch)
+        else:
+            error = refused(list(words), capsys, monkeypatch)
+    if error is not None:
+        assert given.key in (error.key, error.code), error
+        assert bool(error.key) != bool(CODE.fullmatch(given.key)), error.key
+        line = str(error)
+    code = given.key if error is None else error.code
+    assert line.startswith(code)
+    assert "\n" not in line
+    assert len(line) < 600
+    for word in given.words:
+        assert word in line
 
 
 def test_the_list_is_whole() -> None:
-    assert [bad.number for bad in CASES] == [*range(1, 77)]
+    assert [bad.number for bad in CASES] == [*range(1, 1 + len(CASES))]
     assert all(bad.inputs for bad in CASES)
 
 
@@ -121,7 +138,7 @@ def test_the_good_case_is_good(
 
 def test_the_installed_command(tmp_path: Path) -> None:
     """In a process of its own, as a user meets it."""
-    words = log(changed(7, 1, float("nan")), "E101").make(
+    words = log(changed(7, 1, float("nan")), "value_not_finite").make(
         tmp_path, pytest.MonkeyPatch()
     )
     before = contents(tmp_path)

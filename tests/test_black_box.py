@@ -216,33 +216,6 @@ def raises(*_: Any) -> Any:
     raise ZeroDivisionError("no\nway")
 
 
-class Noisy:
-    def __init__(self) -> None:
-        self.rng = np.random.default_rng(0)
-
-    def __call__(self, params: Any, s: Any, a: Any, h: float) -> Any:
-        return s + self.rng.standard_normal(2)
-
-
-@pytest.mark.parametrize(
-    ("f", "code", "said"),
-    [
-        (raises, "E173", "ZeroDivisionError: no way"),
-        (Noisy(), "E173", r"differently each time in Noisy"),
-        (lambda p, s, a, h: np.zeros(3), "E140", r"got shape \(3,\).*shape \(2,\)"),
-        (lambda p, s, a, h: None, "E123", "NoneType"),
-        (lambda p, s, a, h: [0.0, [1.0]], "E173", "ValueError"),
-        (lambda p, s, a, h: s + 1j, "E123", "complex128"),
-        (lambda p, s, a, h: p["gravty"], "E173", "KeyError: 'gravty'"),
-    ],
-)
-def test_a_fault_is_told_when_the_system_is_made(f: Any, code: str, said: str) -> None:
-    with pytest.raises(InputError, match=said) as caught:
-        black_box(f)
-    assert caught.value.code == code
-    assert "\n" not in str(caught.value)
-
-
 def late(params: Any, s: Any, a: Any, h: float) -> Any:
     """Well at rest, as long as nobody looks."""
     return step(params, s, a, h) if not s.any() else raises()
@@ -288,12 +261,6 @@ def test_a_fault_amid_an_episode_is_one_line_too() -> None:
         psrl(task, model, ours, episodes=1, key=KEY)
     with pytest.raises(RuntimeError, match="InputError: nothing"):
         episode(task, Broken("InputError: nothing"), (), world, key=KEY)
-
-
-def test_names_are_given_once() -> None:
-    for make, f in ((BlackBox, step), (ODE, ode)):
-        with pytest.raises(InputError, match=r"E145.*got q\.velocity"):
-            make(f, TABLE, STATES, (*ACTIONS, STATES[1]))
 
 
 def test_long_steps_are_divided() -> None:

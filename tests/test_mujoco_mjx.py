@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from sim2gp import systems as sy
-from sim2gp.errors import InputError
 from sim2gp.inference.parameters import Parameter
 from sim2gp.types import in_float64
 
@@ -158,37 +157,6 @@ def test_constants_and_what_follows_from_them_are_c_mujocos() -> None:
         np.testing.assert_allclose(
             np.asarray(value).reshape(wanted.shape), wanted, rtol=1e-9, atol=1e-12
         )
-
-
-@pytest.mark.parametrize(
-    ("parts", "constant", "got"),
-    [
-        (
-            {"option": '<option integrator="implicit"/>'},
-            "joint/x/damping",
-            "IMPLICIT",
-        ),
-        ({"option": '<option solver="PGS"/>'}, "joint/x/damping", "PGS"),
-        (
-            {"joint": '<joint axis="0 1 0"/><geom size=".2"/>'},
-            "body/c/inertia",
-            "inertia",
-        ),
-        (
-            {
-                "more": '<tendon><fixed name="t"><joint joint="x" coef="1"/></fixed>'
-                "</tendon>"
-            },
-            "body/c/mass",
-            "tendons",
-        ),
-    ],
-)
-def test_what_mjx_does_not_support_is_refused(parts, constant, got) -> None:
-    text = CART.format(**(EMPTY | parts)).replace("<body ", '<body simple="false" ')
-    model = mujoco.MjModel.from_xml_string(text)
-    with pytest.raises(InputError, match=f"E172 a model that MJX .*{got}.*engine"):
-        sy.MuJoCo(model, [constant], engine="mjx")
 
 
 @pytest.mark.nightly

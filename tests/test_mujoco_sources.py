@@ -8,13 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from crawler import CRAWLER, USUAL, written
 from hostile_models import tetrahedron
 from sim2gp.errors import InputError
 from sim2gp.systems.mujoco import load as mjcf_load
 
 mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is not installed")
-
-from test_mujoco_system import CRAWLER, USUAL, written  # noqa: E402
 
 MESH = """<mujoco><compiler {compiler}/><asset><mesh name="m" {mesh}/></asset>
 <worldbody><body><joint/><geom type="mesh" mesh="m"/></body></worldbody></mujoco>"""
@@ -153,30 +152,6 @@ def test_a_file_has_every_name_that_mujoco_may_ask_for(tmp_path: Path) -> None:
     assert set(found.assets) == {"d/x.stl", "sub/x.stl", "d/sub/x.stl"}
     assert set(found.assets.values()) == {tetrahedron(0.1)}
     assert found.texts == {"one.xml": part.encode()}
-
-
-def test_files_that_mujoco_could_confuse_are_refused(tmp_path: Path) -> None:
-    """Two parts with a mesh of one name, each in its own folder."""
-    for name, size in (("one", 0.1), ("two", 0.2)):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "x.stl").write_bytes(tetrahedron(size))
-        text = f'<mujoco><asset><mesh name="{name}" file="x.stl"/></asset></mujoco>'
-        (tmp_path / name / f"{name}.xml").write_text(text)
-    text = '<include file="one/one.xml"/><include file="two/two.xml"/>'
-    path = written(tmp_path, f"<mujoco>{text}</mujoco>")
-    with pytest.raises(
-        InputError, match=r"E172 two files of one name.*two\.xml:line 1"
-    ):
-        mjcf_load.compiled(path)
-
-
-def test_a_path_with_an_empty_part_is_refused(tmp_path: Path) -> None:
-    """Before version 4 MuJoCo takes any mesh of that name."""
-    (tmp_path / "p").mkdir()
-    (tmp_path / "p" / "x.stl").write_bytes(tetrahedron(0.1))
-    path = written(tmp_path, MESH.format(compiler="", mesh='file="p//x.stl"'))
-    with pytest.raises(InputError, match=r"E170 no model.*empty part in p//x\.stl"):
-        mjcf_load.compiled(path)
 
 
 def test_forms_that_mujoco_reads_though_they_are_not_xml(tmp_path: Path) -> None:

@@ -6,13 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from crawler import CRAWLER, USUAL
 from sim2gp.errors import InputError
 from sim2gp.systems.mujoco.load import compiled, compiled_all
 from sim2gp.systems.mujoco.model_file import ModelFile
 
 mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is not installed")
-
-from test_mujoco_system import CRAWLER, USUAL  # noqa: E402
 
 #: Comments, both quotes, defaults of classes, an include, a frame, names that lack.
 ARM = """<?xml version="1.0"?>

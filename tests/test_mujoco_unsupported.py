@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from sim2gp import systems as sy
-from sim2gp.errors import InputError
 from sim2gp.types import in_float64
 
 mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is not installed")
@@ -32,68 +31,6 @@ def model(
 
 def actuator(text: str) -> dict[str, str]:
     return {"more": f"<actuator>{text}</actuator>"}
-
-
-REFUSED = {
-    "free": (
-        {"one": '<freejoint name="base"/><geom size=".1"/>'},
-        r"got base \(free\)",
-    ),
-    "ball": (
-        {"one": '<joint type="ball" name="hip"/><geom size=".1"/>'},
-        r"got hip \(ball\)",
-    ),
-    "fixed": ({"one": "", "two": ""}, "without joints: got model pair"),
-    "mocap": ({"body": '<body name="hand" mocap="true"/>'}, "mocap body: got hand"),
-    "flex": (
-        {
-            "body": '<flexcomp type="grid" count="3 3 1" spacing=".1 .1 .1" '
-            'name="cloth" dim="2" radius=".01"><edge equality="true"/></flexcomp>'
-        },
-        "got flex cloth",
-    ),
-    "dcmotor": (
-        actuator('<dcmotor name="m" joint="q" motorconst=".1" resistance="1"/>'),
-        "dyntype dcmotor: got m,",
-    ),
-    "pid": (actuator('<pid name="m" joint="q" kp="1"/>'), "gaintype pid: got m,"),
-    "user": (
-        actuator('<general name="m" joint="q" dyntype="user" actdim="2"/>'),
-        "dyntype user: got m,",
-    ),
-    "sleep": (
-        {"option": '<option><flag sleep="enable"/></option>'},
-        'option flag sleep="enable"',
-    ),
-    "plugin": (
-        {
-            "more": '<extension><plugin plugin="mujoco.pid"><instance name="g"/>'
-            '</plugin></extension><actuator><plugin plugin="mujoco.pid" '
-            'instance="g" joint="q"/></actuator>'
-        },
-        "plugin: got plugin g",
-    ),
-    "yields": (
-        {"one": '<joint name="q" stiffness="3" springyield="1"/><geom size=".1"/>'},
-        "springyield of q",
-    ),
-}
-
-
-@pytest.mark.parametrize("name", REFUSED)
-def test_what_is_not_supported_is_refused_by_name(name: str) -> None:
-    parts, said = REFUSED[name]
-    with pytest.raises(InputError, match=f"^E172 .*{said}") as caught:
-        sy.MuJoCo(model(**parts))
-    assert "\n" not in str(caught.value)
-
-
-def test_a_state_that_no_check_knows_is_refused(monkeypatch) -> None:
-    """Of a MuJoCo that is newer than these checks."""
-    found, size = model(), mujoco.mj_stateSize
-    monkeypatch.setattr(mujoco, "mj_stateSize", lambda *x: size(*x) + 3)
-    with pytest.raises(InputError, match=r"^E172 a state beyond .*3 more numbers"):
-        sy.MuJoCo(found)
 
 
 TENDON = (

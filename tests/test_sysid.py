@@ -2,10 +2,10 @@
 
 import math
 from pathlib import Path
-from typing import Any
 
 import pytest
 
+from bad_sysid import GOOD
 from sim2gp.errors import InputError
 from sim2gp.inference.parameters import Parameter, Parameters
 from sim2gp.systems import MuJoCo, read_sysid, write_sysid
@@ -184,52 +184,3 @@ def test_a_model_takes_them_with_its_units(tmp_path: Path) -> None:
         assert (mine.unit, mine.meaning) == (own.unit, own.meaning)
         assert (mine.map, mine.low, mine.high) == ("bounded", own.low, own.high)
         assert mine.nominal == own.nominal
-
-
-GOOD = "a:\n  frozen: false\n" + "".join(
-    f"  {name}:\n  - {x}\n"
-    for name, x in [("max_value", 2), ("min_value", 1), ("nominal", 1.5), ("value", 1)]
-)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "code", "said"),
-    [
-        ("- 1.5", "- &x 1.5", "E160", "line 8.*&x"),
-        ("- 1.5", "- 1e5x", "E160", "line 8"),
-        ("a:\n", "!!python/object:os.system\na:\n", "E160", "line 1"),
-        ("a:\n", "a: {b: 1}\n", "E160", "line 1"),
-        ("false", "maybe", "E160", "line 2"),
-        ("  frozen: false\n", "", "E160", "entry a"),
-        ("  - 1.5\n", "  - 1.5\n  - 2.5\n", "E160", "entry a"),
-        ("nominal", "nominel", "E160", "line 7"),
-        ("- 1.5", "- 3", "E142", r"within \[1, 2\]"),
-        ("- 2\n", "- 1\n", "E141", "low = 1, high = 1"),
-        ("- 2\n", "- .nan\n", "E141", "nan"),
-        (GOOD, GOOD + GOOD, "E145", "line 11"),
-    ],
-)
-def test_what_is_not_theirs_is_said(
-    old: str, new: str, code: str, said: str, tmp_path: Path
-) -> None:
-    path = tmp_path / "a.yaml"
-    assert old in GOOD
-    path.write_text(GOOD.replace(old, new))
-    with pytest.raises(InputError, match=said) as caught:
-        read_sysid(path)
-    assert caught.value.code == code
-
-
-def test_names_that_are_not_there(theirs: Path, tmp_path: Path) -> None:
-    def refused(code: str, said: str, f: Any, *x: Any) -> None:
-        with pytest.raises(InputError, match=rf"{code}.*{said}"):
-            f(*x)
-
-    refused("E145", r"did you mean inertia\[", read_sysid, theirs, {"inertia": "a"})
-    both = {"inertia[0]": "a", "it's mass": "a"}
-    refused("E145", "named twice", read_sysid, theirs, both)
-    refused("E145", "did you mean gain", write_sysid, theirs, TABLE, {"gian": 1.0})
-    refused("E145", "got gian", write_sysid, theirs, TABLE, {}, {"x": "gian"})
-    refused("E101", "gain", write_sysid, theirs, TABLE, {"gain": math.nan})
-    refused("E130", "nothing", read_sysid, tmp_path / "nothing")
-    refused("E130", "", write_sysid, tmp_path / "no" / "where", TABLE)

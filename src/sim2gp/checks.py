@@ -29,51 +29,59 @@ _MOST_KNOWN = 64
 def positive(where: str, /, **settings: Any) -> None:
     """E148 for what is not a positive, finite number (of an array: each)."""
     expected = "a positive, finite number"
-    _each(where, settings, "E148", expected, lambda x: (x > 0.0) & np.isfinite(x))
+    _each(
+        where, settings, _out_of_range, expected, lambda x: (x > 0.0) & np.isfinite(x)
+    )
 
 
 def positive_or_infinite(where: str, /, **settings: Any) -> None:
     """E148 for what is not a positive number; it may be infinite."""
-    _each(where, settings, "E148", "a positive number", lambda x: x > 0.0)
+    _each(where, settings, _out_of_range, "a positive number", lambda x: x > 0.0)
 
 
 def not_negative(where: str, /, **settings: Any) -> None:
     """E148 for what is negative or not finite."""
     expected = "a finite number, zero or more"
-    _each(where, settings, "E148", expected, lambda x: (x >= 0.0) & np.isfinite(x))
+    _each(
+        where, settings, _out_of_range, expected, lambda x: (x >= 0.0) & np.isfinite(x)
+    )
 
 
 def finite(where: str, /, **settings: Any) -> None:
     """E148 for what is not finite."""
-    _each(where, settings, "E148", "a finite number", np.isfinite)
+    _each(where, settings, _out_of_range, "a finite number", np.isfinite)
 
 
 def share(where: str, /, **settings: Any) -> None:
     """E148 for what is not between 0 and 1."""
     expected = "a number from 0 to 1"
-    _each(where, settings, "E148", expected, lambda x: (x >= 0.0) & (x <= 1.0))
+    _each(where, settings, _out_of_range, expected, lambda x: (x >= 0.0) & (x <= 1.0))
 
 
 def positive_share(where: str, /, **settings: Any) -> None:
     """E148 for what is not above 0 and up to 1."""
     expected = "a number above 0, at most 1"
-    _each(where, settings, "E148", expected, lambda x: (x > 0.0) & (x <= 1.0))
+    _each(where, settings, _out_of_range, expected, lambda x: (x > 0.0) & (x <= 1.0))
 
 
 def count(where: str, /, **settings: Any) -> None:
     """E148 for what is not a whole number from 1."""
-    _each(where, settings, "E148", "a whole number from 1", lambda x: _whole(x, 1))
+    _each(
+        where, settings, _out_of_range, "a whole number from 1", lambda x: _whole(x, 1)
+    )
 
 
 def whole(where: str, /, **settings: Any) -> None:
     """E148 for what is not a whole number from 0."""
-    _each(where, settings, "E148", "a whole number from 0", lambda x: _whole(x, 0))
+    _each(
+        where, settings, _out_of_range, "a whole number from 0", lambda x: _whole(x, 0)
+    )
 
 
 def index(where: str, size: int, /, **settings: Any) -> None:
     """E148 for what is not a whole number from 0 to below ``size``."""
     expected = f"a whole number from 0 to {size - 1}"
-    _each(where, settings, "E148", expected, lambda x: _whole(x, 0) & (x < size))
+    _each(where, settings, _out_of_range, expected, lambda x: _whole(x, 0) & (x < size))
 
 
 def at_most(where: str, /, most: str, **settings: Any) -> None:
@@ -81,19 +89,23 @@ def at_most(where: str, /, most: str, **settings: Any) -> None:
     highest = _numbers(settings.pop(most))
     if highest is not None:
         expected = f"{most} ({highest:g}) at most"
-        _each(where, settings, "E148", expected, lambda x: x <= highest)
+        _each(where, settings, _out_of_range, expected, lambda x: x <= highest)
 
 
 def deviation(where: str, /, **settings: Any) -> None:
     """E144 for a standard deviation that is not positive and finite."""
     expected = "a positive, finite standard deviation"
-    _each(where, settings, "E144", expected, lambda x: (x > 0.0) & np.isfinite(x))
+    _each(
+        where, settings, _no_deviation, expected, lambda x: (x > 0.0) & np.isfinite(x)
+    )
 
 
 def deviation_or_zero(where: str, /, **settings: Any) -> None:
     """E144 for a standard deviation that is negative or not finite."""
     expected = "a finite standard deviation, zero or more"
-    _each(where, settings, "E144", expected, lambda x: (x >= 0.0) & np.isfinite(x))
+    _each(
+        where, settings, _no_deviation, expected, lambda x: (x >= 0.0) & np.isfinite(x)
+    )
 
 
 def moments(where: str, mean: Any, sd: Any) -> None:
@@ -146,15 +158,24 @@ def same_shape(where: str, shape: tuple[int, ...], /, **settings: Any) -> None:
 def _each(
     where: str,
     settings: dict[str, Any],
-    code: str,
+    refusal: Callable[[str, str, str, str], InputError],
     expected: str,
     good: Callable[[np.ndarray], Any],
 ) -> None:
     for name, value in settings.items():
         found = _numbers(value)
         if found is not None and not np.all(good(found)):
-            got = _shown(value)
-            raise InputError(code, name, where=where, got=got, expected=expected)
+            raise refusal(name, where, _shown(value), expected)
+
+
+def _out_of_range(name: str, where: str, got: str, expected: str) -> InputError:
+    return error(
+        "number_out_of_range", where=where, got=got, expected=expected, name=name
+    )
+
+
+def _no_deviation(name: str, where: str, got: str, expected: str) -> InputError:
+    return error("wrong_deviation", where=where, got=got, expected=expected, name=name)
 
 
 def _numbers(value: Any) -> np.ndarray | None:

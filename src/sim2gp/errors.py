@@ -24,7 +24,10 @@ _OF_CALLBACK = re.compile(r"^(?:\S+\.)?InputError: (E\d{3}) (.*)$", re.MULTILINE
 
 
 class Sim2GPError(Exception):
-    """Root of every error that sim2gp raises on purpose; ``code`` is stable."""
+    """Root of every error that sim2gp raises on purpose; ``code`` is stable.
+
+    ``key`` names its entry in the catalogue: finer than the code, and not stable.
+    """
 
     def __init__(
         self,
@@ -35,9 +38,11 @@ class Sim2GPError(Exception):
         got: object = None,
         expected: str = "",
         fix: str = "",
+        key: str = "",
     ) -> None:
         self.code, self.what, self.where = code, what, where
         self.got, self.expected, self.fix = got, expected, fix
+        self.key = key
         super().__init__(str(self))
 
     def __str__(self) -> str:
@@ -134,13 +139,19 @@ def error(
         got=got,
         expected=filled(entry.expected) if expected is None else expected,
         fix=filled(entry.fix) if fix is None else fix,
+        key=key,
     )
 
 
-def missing_extra(what: str, error: ImportError, extra: str) -> InputError:
+def missing_extra(what: str, caught: ImportError, extra: str) -> InputError:
     """E135: something needs a package that an extra of ours installs."""
-    fix = f"pip install 'sim2gp[{extra}]'"
-    return InputError("E135", what, got=str(error), expected=error.name or "", fix=fix)
+    return error(
+        "missing_extra",
+        got=str(caught),
+        expected=caught.name or "",
+        what=what,
+        extra=extra,
+    )
 
 
 @contextmanager

@@ -27,6 +27,7 @@ def located(error: InputError, where: str) -> InputError:
         got=error.got,
         expected=error.expected,
         fix=error.fix.rstrip("?") or "correct the value",
+        key=error.key,
     )
 
 

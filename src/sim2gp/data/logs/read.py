@@ -247,7 +247,8 @@ def _or_constant(error: InputError, plan: _Plan) -> InputError:
         column = spec.column if isinstance(spec, Column) else None
         if error.code == "E103" and error.what == f"missing column {column}":
             fix = f"{error.fix}; if it was held at zero, write {action.name} = 0.0"
-            rest = {key: getattr(error, key) for key in ("where", "got", "expected")}
+            kept = ("where", "got", "expected", "key")
+            rest = {name: getattr(error, name) for name in kept}
             return InputError(error.code, error.what, fix=fix, **rest)
     return error
 
