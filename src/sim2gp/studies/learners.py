@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import numpy as np
@@ -108,6 +108,7 @@ def reach_of(task: Task, system: AbstractPlant) -> dict[str, float]:
     return {channel.name: half for channel, half in pairs if np.isfinite(half)}
 
 
+@runtime_checkable
 class HiddenMachine(Protocol):
     """What a cell says of the machine that its learner meets."""
 
