@@ -5,6 +5,7 @@ tests must see what a user sees. Shapes and types are checked by jaxtyping and b
 (pyproject.toml).
 """
 
+import ctypes
 import gc
 import itertools
 import multiprocessing.queues
@@ -55,10 +56,11 @@ hypothesis.settings.register_profile("nightly", deadline=None, max_examples=2000
 hypothesis.settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "unit"))
 
 
-#: Linux gives a process 65,530 memory maps by default, and compiled code takes several
-#: each: XLA crashes inside a compilation when they run out.
-MAPS = Path("/proc/self/maps")
-MANY_MAPS = 30_000
+#: Resident bytes above which a file of tests leaves no compiled code to the next one.
+#: One file adds up to 1.1 GB; all of them together came to 5 GB in each process.
+MUCH = 800 * 2**20
+#: Linux: pages of this process, in all and resident.
+PAGES = Path("/proc/self/statm")
 
 
 #: Files of few and long tests: at the end of a run they leave one process alone.
@@ -72,12 +74,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def few_memory_maps() -> Iterator[None]:
+def bounded_memory() -> Iterator[None]:
     """Forget compiled code between files, once there is much of it."""
     yield
-    if MAPS.exists() and MAPS.read_bytes().count(b"\n") > MANY_MAPS:
-        jax.clear_caches()
-        gc.collect()
+    if PAGES.exists():
+        resident = int(PAGES.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        if resident > MUCH:
+            jax.clear_caches()
+            gc.collect()
+            ctypes.CDLL(None).malloc_trim(0)
 
 
 @pytest.fixture
