@@ -267,8 +267,8 @@ def test_a_corrected_posterior_changes_spreads_and_not_the_structure() -> None:
     with jax.enable_x64(True):
         other = Gaussian(belief[2].mean, belief[2].scale.at[2].multiply(16.0))
     open_now = json.dumps(study(*belief, corrected=other)["directions"])
-    assert "The data fix c" in json.dumps(plain["directions"])
-    assert "The data hardly tell c: 80 % of the prior" in open_now
+    assert "The data determine c" in json.dumps(plain["directions"])
+    assert "The data hardly determine c: 80 % of the prior" in open_now
 
 
 def test_the_words_say_which_intervals_these_are() -> None:
