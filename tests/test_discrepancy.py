@@ -255,7 +255,7 @@ def test_the_words_say_whether_physics_is_missing() -> None:
     assert "sim2gp explain" in text
     sound = Corrected(posterior, 9.0, 1, 30.0, True, 0.04, ("q1.coulomb",))
     text = intervals.words(sound, [3.0], 40)
-    assert "coloured and pull the constants 3 times" in text
+    assert "coloured and pull the parameters 3 times" in text
     assert "missing, which has a probability of 4 %" in text
     none = Corrected(posterior, 9.0, 1, 30.0, True)
     assert "not physics that the model lacks" in intervals.words(none, [3.0], 40)

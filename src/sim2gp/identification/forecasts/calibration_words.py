@@ -96,9 +96,9 @@ def words(
         which, wide = by[PASSED], max(half[c, middle] for c in by[PASSED])
         low, high = max(0.5 - wide, 0.0), min(0.5 + wide, 1.0)
         texts.append(
-            f"{_listed([names[c] for c in which])}: {blocks} contradict no level from "
-            f"{_percent(levels[0])} to {_percent(levels[-1])} %; so few cannot tell a "
-            f"50 % band from one that holds {_percent(low)} or {_percent(high)} %."
+            f"{_listed([names[c] for c in which])}: {blocks} contradict no band from "
+            f"{_percent(levels[0])} to {_percent(levels[-1])} %; with so few, a 50 % "
+            f"band that holds {_percent(low)} or {_percent(high)} % would pass, too."
         )
     elif "failed" in by:
         texts.append(f"Judged by {blocks}.")

@@ -59,7 +59,7 @@ def _trade_off(
     others = [int(j) for j in np.flatnonzero(move) if j != pivot]
     sizes = np.asarray([abs(_in_prior_sd(spec, move, j)) for j in others])
     order = [pivot, *(others[n] for n in falling(sizes))]
-    text = f"{_told(spec, move, order)}: the data cannot tell."
+    text = f"{_told(spec, move, order)}: the data stay the same."
     return _direction(text, _ratio(spec, move, order), 0.0)
 
 
@@ -68,7 +68,7 @@ def _weakly_seen(spec: Spectrum, k: int) -> dict[str, Any]:
     size = np.abs(u)
     order = [j for j in falling(size) if size[j] > _MOSTLY * size.max()]
     move = np.sign(u[order[0]]) * u * spec.prior_sd * spec.slope
-    text = f"{_told(spec, move, order)}: the data hardly tell; {_left(spec, k)}."
+    text = f"{_told(spec, move, order)}: the data hardly change; {_left(spec, k)}."
     return _direction(text, _ratio(spec, move, order), l)
 
 
@@ -76,7 +76,7 @@ def _fixed(spec: Spectrum, k: int) -> dict[str, Any]:
     l = float(spec.eigenvalues[k])
     what = weighted_sum(combination(spec, k), spec.names)
     # With corrected spreads the data may inform and yet leave it open.
-    verb = "fix" if _spread(spec, k) <= _FLAT else "hardly tell"
+    verb = "determine" if _spread(spec, k) <= _FLAT else "hardly determine"
     return _direction(f"The data {verb} {what}: {_left(spec, k)}.", what, l)
 
 

@@ -66,7 +66,7 @@ def _verdict(s: Scored, refit: Refitted | None, found: Explanation) -> str:
     if refit is best:
         return "missing" if found.effect else "best, but not enough"
     if refit in found.search.tied:
-        return "not told apart from the best"
+        return "not separable from the best"
     if refit.gain > found.search.threshold:
         return "behind the best" if refit.physical else "impossible sign"
     return "no evidence"
@@ -85,7 +85,7 @@ def headline(found: Explanation) -> str:
         return text + ", and what the fit leaves over looks like noise."
     if best is None:
         return (
-            "None of these: no effect of the library is worth its constant, and yet "
+            "None of these: no effect of the library is worth its parameter, and yet "
             f"the simulator does not fit. {reasons}"
         )
     said = _said(best)
@@ -97,7 +97,7 @@ def headline(found: Explanation) -> str:
     text = f"Missing: {said}. With it what is left over looks like noise."
     if found.search.tied:
         names = listed([r.scored.candidate.name for r in found.search.tied])
-        text += f" These data do not tell it from {names}."
+        text += f" These data cannot separate it from {names}."
     return text
 
 
@@ -137,10 +137,12 @@ def table(found: Explanation, rows: Sequence[Mapping[str, Any]]) -> dict[str, An
     ]
     return {
         "title": "Candidates, by evidence gained over the machine as it is",
-        "columns": ["constant", "what it is", "nats", "value", "verdict"],
+        "columns": ["parameter", "what it is", "nats", "value", "verdict"],
         "rows": cells,
-        "note": "Fitted candidates first, then those that a linearisation ranked "
-        f"behind; {found.search.threshold:.1f} nats make 'nothing' improbable.",
+        "note": "Nats: the gain in log-likelihood, minus a price for one more "
+        "parameter; 3 nats are 20 times more probable than without the effect. To be "
+        f"named, an effect needs {found.search.threshold:.1f}. Fitted candidates "
+        "first, then those that a linearisation ranked behind.",
     }
 
 
