@@ -127,11 +127,11 @@ SETTINGS: tuple[Case, ...] = (
                 lambda: sg.bounded(0.0, 1.0, "kg", "", nominal=NAN),
             ),
             (
-                "mass in the constants held fixed",
+                "mass in the parameters held fixed",
                 lambda: Parameters((), (("mass", NAN),)),
             ),
             (
-                "mass in the constants held fixed",
+                "mass in the parameters held fixed",
                 lambda: Parameters((MASS,)).replace(mass=INF),
             ),
         ),

@@ -214,7 +214,7 @@ class Parameters(eqx.Module):
     measurements: tuple[LinearMeasurement, ...] = eqx.field(static=True, default=())
 
     def __check_init__(self) -> None:
-        checks.finite("the constants held fixed", **dict(self.fixed))
+        checks.finite("the parameters held fixed", **dict(self.fixed))
 
     def __len__(self) -> int:
         return len(self.free)

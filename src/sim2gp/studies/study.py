@@ -94,7 +94,8 @@ class Study(ABC):
         self.name, self.seed, self.quick = name, seed, quick
         count, most = self.quick_size if quick else self.size
         if most is None and episodes is not None:
-            raise error("no_episodes", where="the command line", got=str(episodes))
+            got = str(episodes)
+            raise error("figure_without_episodes", where="the command line", got=got)
         self.count = seeds or count
         self.episodes = episodes or most or 0
         self.seeds = range(seed, seed + self.count)
