@@ -13,7 +13,7 @@ from sim2gp.identification.forecasts.baselines import (
     loss_sentence,
     regression_errors,
 )
-from sim2gp.identification.forecasts.prediction import Judged, scores
+from sim2gp.identification.forecasts.prediction import Judged, forecast_scores
 from sim2gp.systems import CartPole
 
 UNITS = {"q1": "rad", "q2": "rad"}
@@ -65,7 +65,7 @@ def judged(errors: dict[str, tuple[float, float]], regression: float) -> Judged:
 
 def said(found: Judged) -> str:
     logs = [swinging(1.0, 0.0), swinging(1.0, 1.0)]
-    summary, _ = scores(found, ["q1", "q2"], logs, 0.5)
+    summary, _ = forecast_scores(found, ["q1", "q2"], logs, 0.5)
     error, against = summary["open_loop_rmse"], summary["trivial"]
     return forecast_sentence("Error", error, against, UNITS)
 
@@ -95,7 +95,7 @@ def test_both_predictors_are_in_both_tables() -> None:
     found = judged(errors, 0.5)
     found.regression[:, 1] = 0.25  # at 0.1 s
     logs = [swinging(1.0, 0.0), swinging(1.0, 1.0)]
-    summary, _ = scores(found, ["q1", "q2"], logs, 0.5)
+    summary, _ = forecast_scores(found, ["q1", "q2"], logs, 0.5)
     by_horizon, by_log = summary["tables"]
     for table, rows in ((by_horizon, ("0.25", "0.5")), (by_log, ("0.5",) * 3)):
         for name, (_, hold) in errors.items():
@@ -107,13 +107,13 @@ def test_both_predictors_are_in_both_tables() -> None:
     assert summary["losses"] is None  # q2 loses over all, and the sentence says so
     found.error[:5, :, 1] = 1e-4
     found.hold[:5, :, 1] = 0.1
-    summary, _ = scores(found, ["q1", "q2"], logs, 0.5)
+    summary, _ = forecast_scores(found, ["q1", "q2"], logs, 0.5)
     assert summary["losses"] == (
         "Logs in which holding still or a linear regression predicts better: q2 in 1 "
         "of 2 (log1.0)."
     )
     unknown = judged(errors, math.nan)
-    summary, _ = scores(unknown, ["q1", "q2"], logs, 0.5)
+    summary, _ = forecast_scores(unknown, ["q1", "q2"], logs, 0.5)
     assert "regression_rmse" not in summary
     assert "not enough windows" in summary["tables"][0]["rows"][0]
     assert summary["trivial"]["q1"]["better"] == "holding still"

@@ -22,7 +22,7 @@ def seeds(z: float, count: int = 20) -> np.ndarray:
 def test_a_bootstrap_interval_covers_the_mean(level: float, z: float):
     """Of normal samples: mean -+ z sd / sqrt(n), nearly."""
     sample = np.random.default_rng(1).standard_normal(200)
-    low, high = claims.interval(sample, rng(), level)
+    low, high = claims.bootstrap_interval(sample, rng(), level)
     half = z * sample.std() / np.sqrt(200)
     assert low == pytest.approx(sample.mean() - half, abs=0.02)
     assert high == pytest.approx(sample.mean() + half, abs=0.02)

@@ -69,7 +69,7 @@ def test_it_tells_what_the_log_of_it_would(system) -> None:
     theirs = np.asarray(information_at(likelihood, fitted)(e.belief.mean))
     ours = np.asarray(INFORMATION(e, nowhere, U, states))
     np.testing.assert_allclose(ours.T @ ours, theirs.T @ theirs, rtol=1e-6)
-    scale = np.asarray(d.after(e.belief, jnp.asarray(ours)))
+    scale = np.asarray(d.posterior_scale(e.belief, jnp.asarray(ours)))
     precision = np.linalg.inv(np.asarray(e.belief.covariance()))
     S0 = np.linalg.inv(np.asarray(e.belief.scale))
     precision = precision + S0.T @ (theirs.T @ theirs) @ S0
@@ -146,7 +146,7 @@ def test_a_prediction_depends_on_what_moves_it() -> None:
 def test_commands_keep_their_limits_exactly(seed: int, size: float, rate: float):
     """Of value and rate, from the first step on, both families."""
     box = limits(pendulum(), {"voltage": (-2.0, 3.0)}, {"voltage": rate})
-    for family in (d.Multisine, d.Free):
+    for family in (d.MultisineCommands, d.FreeCommands):
         signal = family(PERIOD, STEPS)
         shape = (signal.coefficients, 1)
         C = np.random.default_rng(seed).uniform(-size, size, shape)
@@ -160,7 +160,7 @@ def test_commands_keep_their_limits_exactly(seed: int, size: float, rate: float)
 
 def test_a_multisine_is_scaled_not_cut() -> None:
     box = limits(pendulum(), {"voltage": (-2.0, 3.0)})
-    signal = d.Multisine(PERIOD, STEPS)
+    signal = d.MultisineCommands(PERIOD, STEPS)
     C = np.random.default_rng(0).uniform(-1.0, 1.0, (signal.coefficients, 1))
     U, V = (np.asarray(signal.commands(jnp.asarray(x), box)) for x in (C, 0.7 * C))
     assert np.abs(U).max() == pytest.approx(2.0, rel=1e-9)
@@ -186,7 +186,7 @@ def test_every_turn_beyond_the_limits_counts() -> None:
 
 
 def test_random_motions_have_sd_one() -> None:
-    for family in (d.Multisine, d.Free):
+    for family in (d.MultisineCommands, d.FreeCommands):
         signal = family(PERIOD, STEPS)
         keys = jax.random.split(jax.random.key(0), 300)
         C = np.asarray(jax.vmap(lambda k, s=signal: s.random(k, 2))(keys))

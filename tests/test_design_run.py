@@ -12,7 +12,7 @@ from sim2gp.cli import main
 from sim2gp.commands.design import goal_of, setting
 from sim2gp.commands.identify import identify
 from sim2gp.experiment_design import Everything, LimitBox, Named, by_gradients
-from sim2gp.experiment_design.verdict import Asked, foretold, verdict
+from sim2gp.experiment_design.verdict import DesignOptions, experiment_verdict, foretold
 from sim2gp.project import load_project
 from sim2gp.runs import Progress, load_run
 from test_identify import folder, project_in
@@ -20,7 +20,7 @@ from test_identify import folder, project_in
 assert folder  # a fixture
 
 SHORT = ["--seconds", "1", "--period", "0.01"]
-ASKED = Asked(kind="multisine")
+ASKED = DesignOptions(kind="multisine")
 LIMITS = ["--limit", "theta=-1:1", "theta.velocity=-15:15", "--rate", "voltage=200"]
 
 
@@ -174,7 +174,7 @@ def entry(mean: float, sd: float, left: float, times: float = 1.0) -> dict[str, 
     ],
 )
 def test_when_to_stop(expected, nats, worth, words) -> None:
-    found, text = verdict(ASKED, expected, nats)
+    found, text = experiment_verdict(ASKED, expected, nats)
     assert found is worth
     assert words in text
 

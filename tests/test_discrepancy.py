@@ -248,17 +248,19 @@ def test_a_belief_keeps_its_constants_among_effects() -> None:
 def test_the_words_say_whether_physics_is_missing() -> None:
     posterior = gaussian(np.zeros(1), np.eye(1))
     found = Corrected(posterior, 1.0, 1, 30.0, True, 0.97, ("q1.coulomb", "q1.drag"))
-    text = intervals.words(found, [1.0, 4.0], 40)
+    text = intervals.describe_intervals(found, [1.0, 4.0], 40)
     assert text.startswith("Intervals are 1 to 4 times as wide as if every sample were")
     assert "coloured" not in text
     assert "lacks physics with a probability of 97 %: intervals allow for 2" in text
     assert "sim2gp explain" in text
     sound = Corrected(posterior, 9.0, 1, 30.0, True, 0.04, ("q1.coulomb",))
-    text = intervals.words(sound, [3.0], 40)
+    text = intervals.describe_intervals(sound, [3.0], 40)
     assert "coloured and pull the constants 3 times" in text
     assert "missing, which has a probability of 4 %" in text
     none = Corrected(posterior, 9.0, 1, 30.0, True)
-    assert "not physics that the model lacks" in intervals.words(none, [3.0], 40)
+    assert "not physics that the model lacks" in intervals.describe_intervals(
+        none, [3.0], 40
+    )
 
 
 def test_a_wide_interval_says_why_in_one_sentence() -> None:

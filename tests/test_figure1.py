@@ -114,7 +114,7 @@ def test_truth_is_not_the_prior_mean():
     [(50, (0.385, 0.615)), (90, (0.825, 0.960)), (95, (0.895, 0.990))],
 )
 def test_bands_at_200_are_the_stated_ones(level, expected):
-    assert two_link.band(level, 200) == pytest.approx(expected, abs=1e-9)
+    assert two_link.coverage_band(level, 200) == pytest.approx(expected, abs=1e-9)
 
 
 def test_covered_counts_the_central_interval():

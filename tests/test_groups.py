@@ -15,8 +15,8 @@ from sim2gp.commands.identification import restored
 from sim2gp.commands.identify import identify
 from sim2gp.data.logs import Log
 from sim2gp.errors import InputError
-from sim2gp.experiment_design.verdict import Asked
-from sim2gp.identification.configurations import told
+from sim2gp.experiment_design.verdict import DesignOptions
+from sim2gp.identification.configurations import configuration_entries
 from sim2gp.project import load_project
 from sim2gp.runs import Progress, load_run
 from sim2gp.systems import Furuta, Variant
@@ -115,7 +115,7 @@ def test_a_table_says_what_each_configuration_has(tmp_path: Path) -> None:
         Log("x", source, t, none, none, none, group=group)
         for source, group in (("a", 0), ("a", 0), ("b", 1), ("c", 1))
     ]
-    found = told(system, logs, entries)
+    found = configuration_entries(system, logs, entries)
     assert found["configurations"] == {
         "bare": {"recordings": 1, "fixed": {"alpha.payload": 0.0}, "own": []},
         "loaded": {"recordings": 2, "fixed": {}, "own": ["alpha.payload"]},
@@ -125,7 +125,7 @@ def test_a_table_says_what_each_configuration_has(tmp_path: Path) -> None:
         ["recordings", "1", "2"],
         ["alpha.payload", "0 (known)", "0.0061 kg +- 0.0002"],
     ]
-    assert told(Furuta(), logs, entries) == {}
+    assert configuration_entries(Furuta(), logs, entries) == {}
 
 
 # A model of MuJoCo's: an arm whose hand weighs 0.1 kg, or some more.
@@ -255,7 +255,7 @@ def test_held_out_logs_are_of_one_configuration(
 @pytest.mark.nightly
 def test_an_experiment_is_for_the_machine_as_it_stands(run: Path) -> None:
     def setting(name: str | None) -> Any:
-        asked = Asked(seconds=1.0, configuration=name)
+        asked = DesignOptions(seconds=1.0, configuration=name)
         return setting_of(restored(run), asked)[1]
 
     x = load_run(run).arrays

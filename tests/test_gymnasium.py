@@ -18,7 +18,7 @@ from sim2gp.planning import AbstractPlanner, World
 from sim2gp.planning.episode import Purpose, key_for, oracle_world, run_episode
 from sim2gp.planning.mpc import from_unit
 from sim2gp.planning.tasks import MACHINES, Task, draw_truth, furuta_swingup
-from sim2gp.robot.gymnasium import NAMES, _kind, after, environment, register
+from sim2gp.robot.gymnasium import NAMES, _kind, make_environment, register, step_task
 from sim2gp.systems import Delay, Furuta
 from sim2gp.types import Key, State
 
@@ -192,7 +192,7 @@ def test_one_program_steps_every_machine_of_a_kind(
     """Other constants, seeds and times are other data."""
     env.reset(seed=1)
     env.step(shares[0])
-    before = after._cached._cache_size()
+    before = step_task._cached._cache_size()
     other = gymnasium.make(
         "sim2gp/Furuta-v0", params={"arm_mass": 0.1}, truth="2sd", **WRONG
     )
@@ -200,7 +200,7 @@ def test_one_program_steps_every_machine_of_a_kind(
         each.reset(seed=2)
         flown(each, shares[:3])
     assert before > 0
-    assert after._cached._cache_size() == before
+    assert step_task._cached._cache_size() == before
 
 
 def test_constants_can_be_set() -> None:
@@ -269,4 +269,4 @@ def test_without_gymnasium_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -
     _kind.cache_clear()
     monkeypatch.setitem(sys.modules, "gymnasium", None)
     with pytest.raises(InputError, match=r"E135.*sim2gp\[gym\]"):
-        environment("furuta")
+        make_environment("furuta")

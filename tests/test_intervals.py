@@ -273,15 +273,15 @@ def test_a_corrected_posterior_changes_spreads_and_not_the_structure() -> None:
 
 def test_the_words_say_which_intervals_these_are() -> None:
     found = intervals.Corrected(gaussian(np.zeros(1), np.eye(1)), 9.0, 2, 30.0, True)
-    text = intervals.words(found, [1.0, 2.96, 3.31], 40)
+    text = intervals.describe_intervals(found, [1.0, 2.96, 3.31], 40)
     assert text.startswith("Intervals are 1 to 3.3 times as wide")
     assert "40 windows are coloured and pull the constants 3 times" in text
-    assert "are 3 times as wide" in intervals.words(found, [3.0, 3.0], 40)
+    assert "are 3 times as wide" in intervals.describe_intervals(found, [3.0, 3.0], 40)
     white = dataclasses.replace(found, inflation=1.0)
-    text = intervals.words(white, [1.02, 1.1], 40)
+    text = intervals.describe_intervals(white, [1.02, 1.1], 40)
     assert "at most 1.1 times those of independent samples" in text
     few = dataclasses.replace(found, enough=False)
-    assert "3 windows are too few" in intervals.words(few, [1.0], 3)
+    assert "3 windows are too few" in intervals.describe_intervals(few, [1.0], 3)
 
 
 def recorded(system: Machine, rows: int, rate: list[float], error: np.ndarray) -> Log:

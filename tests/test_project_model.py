@@ -14,7 +14,7 @@ from sim2gp.commands import apply
 from sim2gp.commands.design import setting
 from sim2gp.commands.identification import restored
 from sim2gp.errors import InputError
-from sim2gp.experiment_design.verdict import Asked
+from sim2gp.experiment_design.verdict import DesignOptions
 from sim2gp.project import load_project
 from sim2gp.runs import load_run, new_run
 from sim2gp.systems.mujoco.load import compiled_all
@@ -341,7 +341,7 @@ def test_what_leaves_a_run_is_as_wide_as_its_report(
     # Of one seed they are the same standard normal numbers, each in its own posterior.
     np.testing.assert_allclose(eps[0], eps[1], atol=1e-6)
     assert 0.5 < eps[0].std() < 1.6
-    question = Asked(seconds=1.0)
+    question = DesignOptions(seconds=1.0)
     _, experiment, _ = setting(fit, question)
     np.testing.assert_array_equal(experiment.belief.scale, x["belief/scale"])
     np.testing.assert_array_equal(experiment.plausible.mean, x["intervals/mean"])

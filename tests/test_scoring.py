@@ -66,10 +66,10 @@ def test_spread_covers_the_known_errors() -> None:
     known = np.ones((W, 1, 2), bool)
     known[2000:] = False
     error[2000:] *= 100.0  # what was left out must not be looked at
-    sd = scoring.spread(error, draws, known, np.zeros(2), 1.0)
+    sd = scoring.predicted_spread(error, draws, known, np.zeros(2), 1.0)
     inside = np.abs(error[:2000]) <= 1.96 * sd[:2000]
     np.testing.assert_allclose(inside.mean(axis=(0, 1)), 0.95, atol=0.02)
-    wide = scoring.spread(error, draws, known, np.zeros(2), 4.0)
+    wide = scoring.predicted_spread(error, draws, known, np.zeros(2), 4.0)
     np.testing.assert_allclose(wide, 2.0 * sd, rtol=1e-12)
 
 
@@ -158,7 +158,7 @@ def test_the_verdict_in_words(
 
 def test_every_learner_that_is_compared_has_words() -> None:
     """A learner of one's own is one entry of the table; the verdict says it."""
-    own = compare.Learner(lambda sim, reach: sim, "a table of numbers")
+    own = compare.ModelFactory(lambda sim, reach: sim, "a table of numbers")
     known = {**compare.MODELS, "OWN": own}
     what = {name: learner.what for name, learner in known.items()}
     pairs = [SAME, *[Paired(-0.1, -0.2, -0.05, 5, 6)] * (len(what) - 1)]

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from sim2gp.cli.arguments import parsed
+from sim2gp.cli.arguments import parse_command
 from sim2gp.cli.commands import COMMANDS
 from sim2gp.cli.interrupts import DONE, interruptible, leave
 from sim2gp.cli.late import Call
@@ -82,7 +82,7 @@ def _run(args: list[str]) -> int:
 
         print(f"sim2gp {__version__}")
         return OK
-    command = parsed(args or ["--help"], COMMANDS)
+    command = parse_command(args or ["--help"], COMMANDS)
     if command is None:
         return OK if args else INPUT
     progress = Progress(quiet=command.quiet)

@@ -17,7 +17,9 @@ PROGRAM = "sim2gp"
 _NAMES = re.compile(r"--[a-z][\w-]*|(?<=')[\w.-]+(?=')")
 
 
-def parsed(args: Sequence[str], commands: dict[str, type[Common]]) -> Common | None:
+def parse_command(
+    args: Sequence[str], commands: dict[str, type[Common]]
+) -> Common | None:
     """The command that the words are; None where a help page was printed.
 
     Raises `InputError` E148 for a number out of range, E149 for a seed, E160 otherwise.
@@ -107,7 +109,7 @@ def usage_error(
     return InputError(code, what, where=where, got=got, expected=expected, fix=fix)
 
 
-def numbers(option: str, words: Iterable[str]) -> dict[str, float]:
+def parse_numbers(option: str, words: Iterable[str]) -> dict[str, float]:
     """``NAME=NUMBER`` words by name (E160 for another form, or a name twice)."""
     return {name: _number(option, word, v) for name, v, word in _named(option, words)}
 

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from sim2gp.data.logs import Log
 from sim2gp.identification.forecasts import scoring
 from sim2gp.identification.forecasts.baselines import compared, forecast_sentence
-from sim2gp.identification.forecasts.prediction import recordings
+from sim2gp.identification.forecasts.prediction import recording_names
 from sim2gp.identification.forecasts.scoring import Paired
 
 FEWEST = 4  # recordings that a bootstrap can draw from; of fewer, seconds are drawn
@@ -49,7 +49,7 @@ class Held:
 
 
 @dataclass(frozen=True)
-class Table:
+class PooledScores:
     """Pooled scores: of every model, at every step judged, of every channel."""
 
     rmse: Float[np.ndarray, "models R c"]
@@ -137,7 +137,7 @@ def _against_trivial(
 
 def units_of(held: Held, logs: Sequence[Log]) -> tuple[np.ndarray, str]:
     """What a bootstrap draws: recordings, or of few recordings their seconds."""
-    files = list(dict.fromkeys(recordings(logs)))
+    files = list(dict.fromkeys(recording_names(logs)))
     number = np.asarray([files.index(log.source) for log in logs])
     if len(np.unique(number[held.log])) >= FEWEST:
         return number[held.log], "logs"
@@ -146,11 +146,11 @@ def units_of(held: Held, logs: Sequence[Log]) -> tuple[np.ndarray, str]:
     return np.unique(pairs, axis=0, return_inverse=True)[1].ravel(), "seconds"
 
 
-def _table(held: Held, crps: np.ndarray) -> Table:
+def _table(held: Held, crps: np.ndarray) -> PooledScores:
     nll = scoring.nll(held.error, held.sd)
     inside = (np.abs(held.error) <= 1.6448536 * held.sd).astype(float)
     each = [_pooled(x, held.valid) for x in (held.error**2, nll, crps, inside)]
-    return Table(np.sqrt(each[0]), *each[1:])
+    return PooledScores(np.sqrt(each[0]), *each[1:])
 
 
 def _pooled(x: np.ndarray, valid: np.ndarray) -> np.ndarray:
@@ -160,7 +160,7 @@ def _pooled(x: np.ndarray, valid: np.ndarray) -> np.ndarray:
 
 
 def _entry(
-    table: Table,
+    table: PooledScores,
     k: int,
     at: Sequence[int],
     horizons: Sequence[float],
@@ -201,7 +201,7 @@ def _relative(found: Paired) -> dict[str, Any]:
 def _by_horizon(
     held: Held,
     crps: np.ndarray,
-    table: Table,
+    table: PooledScores,
     i: int,
     horizon: str,
     models: Sequence[str],
@@ -225,7 +225,7 @@ def _by_horizon(
             row.append(_figure(table.nll[k, i, c], ".2f"))
         row += [_figure(x, ".3f") for x in table.inside[k, i]]
         found = scoring.paired(sums[k], sums[0], rng)
-        row += [scoring.percent(found), f"{found.better} of {found.units}"]
+        row += [scoring.format_change(found), f"{found.better} of {found.units}"]
         rows.append(row if k else [*row[:-2], "", ""])
     for name, off in zip(("holding still", "regression"), held.trivial, strict=True):
         off, counts = off[None, :, [i]], held.valid[:, [i]]

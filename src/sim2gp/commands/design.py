@@ -20,28 +20,28 @@ from sim2gp.commands.identification import Identification, used
 from sim2gp.commands.result import AbstractResult
 from sim2gp.errors import error
 from sim2gp.experiment_design import (
+    AbstractCommandSignal,
     AbstractGoal,
-    AbstractSignal,
     Designed,
     Everything,
     Experiment,
-    Free,
+    FreeCommands,
     LimitBox,
-    Multisine,
+    MultisineCommands,
     Named,
     Prediction,
     prediction_rows,
 )
-from sim2gp.experiment_design import design as search
+from sim2gp.experiment_design import optimise_commands as search
 from sim2gp.experiment_design.limits import SLOW, servo_rates
 from sim2gp.experiment_design.verdict import (
-    Asked,
+    DesignOptions,
     Limits,
     expected_table,
+    experiment_verdict,
     foretold,
-    verdict,
 )
-from sim2gp.identification.forecasts.prediction import units
+from sim2gp.identification.forecasts.prediction import channel_units
 from sim2gp.identification.identifiability.table import physical_moments
 from sim2gp.inference.parameters import unknown_parameter
 from sim2gp.inference.prior import ParameterPrior
@@ -120,7 +120,7 @@ def design(
     where the limits admit no motion, E151 for a duration shorter than a step.
     """
     began = time.perf_counter()
-    asked = Asked(
+    asked = DesignOptions(
         seconds, kind, tuple(about), predict, within, limits or Limits(),
         start or {}, period, starts, configuration,
     )  # fmt: skip
@@ -170,7 +170,7 @@ def _box(
 
 @in_float64
 def setting(
-    source: Project | Identification, asked: Asked
+    source: Project | Identification, asked: DesignOptions
 ) -> tuple[Project, Experiment, list[str]]:
     """The machine and what is believed of it; what the user should know of both."""
     notes: list[str] = []
@@ -222,14 +222,14 @@ def widths(fit: Identification) -> dict[str, Any]:
     }
 
 
-def signal_of(kind: str, experiment: Experiment) -> AbstractSignal:
+def signal_of(kind: str, experiment: Experiment) -> AbstractCommandSignal:
     """The family that the commands are chosen from."""
-    family = {"multisine": Multisine, "free": Free}[kind]
+    family = {"multisine": MultisineCommands, "free": FreeCommands}[kind]
     return family(experiment.period, experiment.steps)
 
 
 def goal_of(
-    asked: Asked, experiment: Experiment, limits: LimitBox, key: jax.Array
+    asked: DesignOptions, experiment: Experiment, limits: LimitBox, key: jax.Array
 ) -> AbstractGoal:
     """What is asked about: all constants, some, or a prediction."""
     names = experiment.system.parameters.names
@@ -297,7 +297,7 @@ def expectation(experiment: Experiment, found: Designed) -> dict[str, dict[str, 
 @in_float64
 def _summarise(
     name: str,
-    asked: Asked,
+    asked: DesignOptions,
     experiment: Experiment,
     goal: AbstractGoal,
     found: Designed,
@@ -306,7 +306,7 @@ def _summarise(
     expected = expectation(experiment, found)
     ahead: dict[str, float] = {}
     if not isinstance(goal, Prediction):
-        worth, reason = verdict(asked, expected, found.nats)
+        worth, reason = experiment_verdict(asked, expected, found.nats)
     else:
         before, after = experiment.belief.scale, jnp.asarray(found.scale)
         ahead = {
@@ -329,7 +329,7 @@ def _summarise(
         "prediction_sd": ahead,
         "violations": found.violations,
         "draws_checked": found.checked,
-        "units": units(experiment.system),
+        "units": channel_units(experiment.system),
         "tables": [expected_table(expected)],
     }
 

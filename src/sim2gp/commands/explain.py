@@ -27,10 +27,16 @@ from sim2gp.identification.missing_physics.data import (
     OneStepData,
     WindowData,
 )
-from sim2gp.identification.missing_physics.explain import explain as search_missing
+from sim2gp.identification.missing_physics.explain import (
+    find_missing_physics as search_missing,
+)
 from sim2gp.identification.missing_physics.score import Scored
 from sim2gp.identification.missing_physics.search import REFITS, Refitted, refit
-from sim2gp.identification.missing_physics.words import candidate_rows, headline, table
+from sim2gp.identification.missing_physics.words import (
+    candidate_rows,
+    candidate_table,
+    missing_physics_headline,
+)
 from sim2gp.inference.estimate import Estimate
 from sim2gp.planning.tasks import MACHINES
 from sim2gp.project import Project, load_project
@@ -108,7 +114,7 @@ def explain(
     summary: dict[str, Any] = {
         "command": "explain",
         "title": f"{run.name}: what its simulator lacks",
-        "headline": headline(found),
+        "headline": missing_physics_headline(found),
         "answer": found.answer,
         "best": found.effect,
         "none_of_these": found.answer == "none of these",
@@ -119,7 +125,7 @@ def explain(
         "log_evidence": float(found.search.bare.log_evidence),
         "added": None,
         "warnings": [f"no fit with {name}" for name in found.search.failed],
-        "tables": [table(found, candidates)],
+        "tables": [candidate_table(found, candidates)],
     }
     return MissingPhysics(
         summary | provenance(started),

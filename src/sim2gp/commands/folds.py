@@ -21,10 +21,10 @@ from sim2gp.identification.forecasts.baselines import regression_errors
 from sim2gp.identification.forecasts.forecast import Band, Forecast, fit_band
 from sim2gp.identification.forecasts.prediction import (
     Judged,
-    judged,
     predicted,
-    recordings,
+    recording_names,
     rows_for,
+    score_forecasts,
     subset,
 )
 from sim2gp.inference.estimate import Estimate
@@ -69,14 +69,14 @@ def without(
     return Part(~np.isin(of, left), ~test, test, len(others), logs[left[0]].name)
 
 
-def held_out(
+def split_held_out(
     logs: Sequence[Log],
     windows: Windows,
     places: Sequence[tuple[int, int]],
     grid: Grid,
 ) -> Part | None:
     """The last recording, or the last quarter of the only one; None if too short."""
-    files = recordings(logs)
+    files = recording_names(logs)
     if len(set(files)) > 1:
         last = [k for k, source in enumerate(files) if source == files[-1]]
         found = without(last, logs, np.asarray([k for k, _ in places]), grid)
@@ -93,7 +93,7 @@ def held_out(
     return found if seen and found.known.any() and judged_by else None
 
 
-def fold(
+def fit_fold(
     project: Project,
     windows: Windows,
     grid: Grid,
@@ -129,5 +129,5 @@ def fold(
     band = fit_band(seen, train, part.recordings)
     linear = regression_errors(train, tested, rows)
     result = result.of(part.test)
-    found = judged(rows, tested, result, band, linear)
+    found = score_forecasts(rows, tested, result, band, linear)
     return Fold(posterior, band, found, tested, result)

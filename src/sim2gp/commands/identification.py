@@ -33,7 +33,7 @@ _PREFIX = {"corrected": "intervals", "plain": "belief"}
 
 
 @dataclass(frozen=True)
-class Constant:
+class IdentifiedConstant:
     """What is known of one constant, in its physical unit.
 
     ``interval`` holds it with 95 % probability, allowing for errors of the model.
@@ -65,11 +65,11 @@ class Identification(AbstractResult):
         return self._project.system
 
     @property
-    def parameters(self) -> dict[str, Constant]:
+    def parameters(self) -> dict[str, IdentifiedConstant]:
         """Each constant by name, in physical units."""
         fields = ("unit", "mean", "sd", "prior_mean", "prior_sd", "verdict")
         return {
-            name: Constant(
+            name: IdentifiedConstant(
                 name=name,
                 interval=(entry["q025"], entry["q975"]),
                 meaning=entry.get("meaning") or "",
@@ -155,7 +155,7 @@ class Identification(AbstractResult):
 
 
 @in_float64
-def physical(table: Parameters, tt: AnyArray) -> np.ndarray:
+def physical_mode(table: Parameters, tt: AnyArray) -> np.ndarray:
     """The constants at the posterior's mode, in physical units."""
     return np.asarray(table.constrain(np.asarray(tt, float)))
 
@@ -177,7 +177,7 @@ def modes(x: Mapping[str, np.ndarray], table: Parameters, which: Width) -> np.nd
     prefix = _PREFIX[which]
     if f"{prefix}/theta" not in x:
         _check_fitted("the model's file", table, x)
-        return np.asarray(physical(table, jnp.asarray(x[f"{prefix}/mean"])))
+        return np.asarray(physical_mode(table, jnp.asarray(x[f"{prefix}/mean"])))
     return np.asarray(x[f"{prefix}/theta"])
 
 
@@ -254,7 +254,7 @@ def _check_constants(run: Path, project: Project, summary: dict[str, Any]) -> No
 
 def _check_fitted(where: str, table: Parameters, x: Mapping[str, np.ndarray]) -> None:
     """A model's file still has the numbers that its default priors are about (E170)."""
-    now = physical(table, jnp.asarray(x["belief/mean"]))
+    now = physical_mode(table, jnp.asarray(x["belief/mean"]))
     theta = x.get("belief/theta", now)
     for name, is_, was in zip(table.names, np.asarray(now), theta, strict=True):
         if not np.isclose(is_, was, rtol=1e-9, atol=1e-12):

@@ -97,7 +97,7 @@ class AbstractResult:
         return brief(self.summary)
 
 
-def numbers(table: Mapping[str, Any] | None) -> dict[str, float]:
+def numeric_entries(table: Mapping[str, Any] | None) -> dict[str, float]:
     """The entries of a table of the summary that are numbers."""
     return {k: float(v) for k, v in (table or {}).items() if v is not None}
 

@@ -122,7 +122,7 @@ def _log(x: Fraction) -> float:
 
 
 @in_float64
-def units(rng: Rng) -> float:
+def unit_invariance(rng: Rng) -> float:
     """Change of the posterior, in sd, when every unit changes by a power of two."""
     J, y, L, mean, S = _problems(rng, 8, 12, 2, 4, 1e8)
     rows, columns = 2.0 ** rng.integers(-40, 41, 2), 2.0 ** rng.integers(-40, 41, 4)
@@ -185,7 +185,7 @@ def _departure(problems: Problems) -> float:
 
 
 @in_float64
-def bounds(rng: Rng) -> float:
+def bounds_round_trip(rng: Rng) -> float:
     """Error of the round trip through the bounds; infinite if one is left."""
     worst = 0.0
     for system in (Furuta(), CartPole(), TwoLink()):
@@ -292,7 +292,7 @@ def energy(rng: Rng) -> float:
 
 
 @in_float64
-def calibration(rng: Rng) -> float:
+def posterior_calibration(rng: Rng) -> float:
     """-log10 p of the squared whitened errors of 1,000 linear problems."""
     count, p = 1000, 3
     J = rng.standard_normal((count, 8, 1, p))

@@ -20,7 +20,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from sim2gp.data.grid import PERIOD, SAMPLES, Grid, on_grid, parabola, states_from
+from sim2gp.data.grid import (
+    PERIOD,
+    SAMPLES,
+    Grid,
+    on_grid,
+    parabola_weights,
+    states_from,
+)
 from sim2gp.data.logs import Log
 from sim2gp.data.split_log import inputs_since, knots_of, measured_states
 from sim2gp.data.transitions import Transitions
@@ -172,7 +179,7 @@ def _parabolas(y: Float[np.ndarray, "N L c"]) -> Float[np.ndarray, "N 3 c"]:
     """Coefficients of the parabola through each window, time from its middle."""
     half = SAMPLES // 2
     age = PERIOD * np.arange(-half, half + 1)
-    return np.asarray(np.einsum("kl,nlc->nkc", parabola(age), y))
+    return np.asarray(np.einsum("kl,nlc->nkc", parabola_weights(age), y))
 
 
 def _state(

@@ -259,7 +259,7 @@ def _local_parabolas(
         )
         value, slope = np.zeros(len(measured)), np.zeros(len(measured))
         for c in range(len(measured)):
-            value[c], slope[c] = parabola(
+            value[c], slope[c] = fit_parabola(
                 t[near], values[near, c], mask[near, c], values[i, c]
             )
             if start == "causal" and mask[i, c]:
@@ -269,7 +269,7 @@ def _local_parabolas(
     return at
 
 
-def parabola(
+def fit_parabola(
     t: Float[np.ndarray, " N"],
     y: Float[np.ndarray, " N"],
     valid: Bool[np.ndarray, " N"],

@@ -2,29 +2,33 @@
 
 from sim2gp.experiment_design.experiment import (
     Experiment,
-    after,
     information,
+    posterior_scale,
     trajectory,
 )
 from sim2gp.experiment_design.goals import AbstractGoal, Everything, Named, Prediction
 from sim2gp.experiment_design.limits import LimitBox
-from sim2gp.experiment_design.search import Designed, design, prediction_rows
-from sim2gp.experiment_design.signals import AbstractSignal, Free, Multisine
+from sim2gp.experiment_design.search import Designed, optimise_commands, prediction_rows
+from sim2gp.experiment_design.signals import (
+    AbstractCommandSignal,
+    FreeCommands,
+    MultisineCommands,
+)
 
 __all__ = [
+    "AbstractCommandSignal",
     "AbstractGoal",
-    "AbstractSignal",
     "Designed",
     "Everything",
     "Experiment",
-    "Free",
+    "FreeCommands",
     "LimitBox",
-    "Multisine",
+    "MultisineCommands",
     "Named",
     "Prediction",
-    "after",
-    "design",
     "information",
+    "optimise_commands",
+    "posterior_scale",
     "prediction_rows",
     "trajectory",
 ]

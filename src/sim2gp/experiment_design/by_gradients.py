@@ -20,15 +20,15 @@ from jaxtyping import Array, Float
 from sim2gp.compilation import compile_async
 from sim2gp.experiment_design.experiment import (
     Experiment,
-    after,
     information,
+    posterior_scale,
     sensitivity_at,
     trajectory,
 )
 from sim2gp.experiment_design.goals import AbstractGoal
 from sim2gp.experiment_design.limits import LimitBox, all_excess, excess, narrowed
-from sim2gp.experiment_design.signals import AbstractSignal
-from sim2gp.experiment_design.ways import Ways
+from sim2gp.experiment_design.signals import AbstractCommandSignal
+from sim2gp.experiment_design.ways import SearchPrograms
 from sim2gp.models.training import adamw, descend
 from sim2gp.types import Key, single
 
@@ -44,22 +44,22 @@ CHEAP, COST = 2.0, 15.0  # at first and at last, for a half of the box, in nats 
 CHECKED = 1000  # draws that the result is held against
 
 
-def ways(
+def compiled_programs(
     experiment: Experiment,
-    signal: AbstractSignal,
+    signal: AbstractCommandSignal,
     goal: AbstractGoal,
     limits: LimitBox,
     informed: Float[Array, "D p"],
     trials: Float[Array, "N p"],
     held_out: Float[Array, "K p"],
-) -> Ways:
+) -> SearchPrograms:
     """Programs of JAX; they begin to be compiled here."""
     nothing = jnp.zeros((experiment.steps, limits.low.size))
     rough, coarse = _coarser(experiment, signal)
     improve = _climber(rough, coarse, goal, limits, informed, trials)
     _checked.compile_for(experiment, limits, nothing, held_out)
     _worth.compile_for(experiment, goal, informed, nothing)
-    return Ways(
+    return SearchPrograms(
         improve,
         lambda U: _checked(experiment, limits, U, held_out),
         lambda U: _worth(experiment, goal, informed, U),
@@ -67,8 +67,8 @@ def ways(
 
 
 def _coarser(
-    experiment: Experiment, signal: AbstractSignal
-) -> tuple[Experiment, AbstractSignal]:
+    experiment: Experiment, signal: AbstractCommandSignal
+) -> tuple[Experiment, AbstractCommandSignal]:
     """As long and as telling, with periods of `GRID`: for a search, long enough."""
     k = math.floor(GRID / experiment.period + 1e-9)
     k = max(1, min(k, experiment.steps // 2))
@@ -86,7 +86,7 @@ def _coarser(
 
 def _climber(
     experiment: Experiment,
-    signal: AbstractSignal,
+    signal: AbstractCommandSignal,
     goal: AbstractGoal,
     limits: LimitBox,
     draws: Float[Array, "D p"],
@@ -141,7 +141,7 @@ def _climber(
 
 @compile_async
 def _climb(
-    signal: AbstractSignal,
+    signal: AbstractCommandSignal,
     experiment: Experiment,
     goal: AbstractGoal,
     limits: LimitBox,
@@ -192,7 +192,7 @@ def _worth_at(
     experiment: Experiment, goal: AbstractGoal, z: Array, U: Array, states: Array
 ) -> tuple[Array, Array]:
     """Nats of the goal at one machine, and the scale of the belief after it."""
-    scale = after(experiment.belief, information(experiment, z, U, states))
+    scale = posterior_scale(experiment.belief, information(experiment, z, U, states))
     return goal.nats(experiment.belief.scale, scale), scale
 
 

@@ -13,18 +13,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sim2gp.data.window_slopes import Asked, HostRun, about
+from sim2gp.data.window_slopes import HostRun, SlopeInputs, about
 from sim2gp.data.windows import Pieces
 from sim2gp.experiment_design.experiment import (
     Experiment,
     about_constants,
-    after,
     piece,
+    posterior_scale,
 )
 from sim2gp.experiment_design.goals import AbstractGoal
 from sim2gp.experiment_design.limits import LimitBox, all_excess, narrowed
-from sim2gp.experiment_design.signals import AbstractSignal
-from sim2gp.experiment_design.ways import Ways
+from sim2gp.experiment_design.signals import AbstractCommandSignal
+from sim2gp.experiment_design.ways import SearchPrograms
 from sim2gp.systems.host import simulator_of
 from sim2gp.types import Key
 
@@ -38,20 +38,20 @@ CHEAP, COST = 10.0, 100.0  # of a half of the box, for each direction asked abou
 States = Float[np.ndarray, "K times n"]
 
 
-def ways(
+def host_programs(
     experiment: Experiment,
-    signal: AbstractSignal,
+    signal: AbstractCommandSignal,
     goal: AbstractGoal,
     limits: LimitBox,
     informed: Float[Array, "D p"],
     trials: Float[Array, "N p"],
     held_out: Float[Array, "K p"],
-) -> Ways:
+) -> SearchPrograms:
     """Loops of the host around its simulator."""
     draws, guards, others = map(np.asarray, (informed, trials, held_out))
-    return Ways(
-        sampled(experiment, signal, goal, limits, draws, guards),
-        lambda U: checked(experiment, limits, np.asarray(U), others),
+    return SearchPrograms(
+        sampling_search(experiment, signal, goal, limits, draws, guards),
+        lambda U: states_and_excess(experiment, limits, np.asarray(U), others),
         lambda U: worth(experiment, goal, draws, np.asarray(U)),
     )
 
@@ -74,12 +74,12 @@ def states_of(
 ) -> States:
     """Those at the beginning and after each period, of machines at virtual values."""
     first, start = np.zeros(len(machines), int), np.asarray(experiment.start)
-    asked = Asked.at(machines, np.tile(start, (len(machines), 1)))
+    asked = SlopeInputs.at(machines, np.tile(start, (len(machines), 1)))
     run = _run(experiment, asked, U, first, experiment.steps)
     return run.states[:, :: experiment.substeps]
 
 
-def checked(
+def states_and_excess(
     experiment: Experiment, limits: LimitBox, U: np.ndarray, draws: np.ndarray
 ) -> tuple[States, Float[np.ndarray, " K"]]:
     """Of plausible machines, and how far each leaves the limits; infinite when lost."""
@@ -102,7 +102,7 @@ def worth_at(
     asked = about(tt, states[first], scale, experiment.start_sd)
     J = _rows(experiment, asked, U, first, count - 1)
     A = _about(jnp.asarray(J.reshape(len(first), -1, n + p)), n)
-    scale = after(experiment.belief, A.reshape(-1, p))
+    scale = posterior_scale(experiment.belief, A.reshape(-1, p))
     return float(goal.nats(experiment.belief.scale, scale)), scale
 
 
@@ -115,9 +115,9 @@ def worth(
     return float(np.mean([nats for nats, _ in found])), found[0][1], middle
 
 
-def sampled(
+def sampling_search(
     experiment: Experiment,
-    signal: AbstractSignal,
+    signal: AbstractCommandSignal,
     goal: AbstractGoal,
     limits: LimitBox,
     draws: Float[np.ndarray, "D p"],
@@ -129,7 +129,7 @@ def sampled(
 
     def value(C: np.ndarray, z: np.ndarray, cost: float) -> float:
         U = np.asarray(commands(C))
-        over = np.maximum(checked(experiment, inner, U, guards)[1], 0.0)
+        over = np.maximum(states_and_excess(experiment, inner, U, guards)[1], 0.0)
         if not np.isfinite(over).all():
             return -np.inf
         return worth_at(experiment, goal, z, U)[0] - cost * float(np.mean(over))
@@ -160,7 +160,7 @@ def sampled(
 
 def _rows(
     experiment: Experiment,
-    asked: Asked,
+    asked: SlopeInputs,
     U: np.ndarray,
     first: Int[np.ndarray, " W"],
     periods: int,
@@ -173,7 +173,7 @@ def _rows(
 
 def _run(
     experiment: Experiment,
-    asked: Asked,
+    asked: SlopeInputs,
     U: np.ndarray,
     first: Int[np.ndarray, " W"],
     periods: int,

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from sim2gp.experiment_design import LimitBox, Multisine
+from sim2gp.experiment_design import LimitBox, MultisineCommands
 from sim2gp.experiment_design.limits import input_ranges, servo_rates
 from sim2gp.systems import MuJoCo
 from sim2gp.systems.base import AbstractSystem
@@ -67,7 +67,9 @@ def safe_excitation(system: AbstractSystem, *, key: Key, until: float) -> Excita
     slow = servo_rates(system)
     rate = np.asarray([slow.get(c.name, np.inf) for c in system.actions])
     box = LimitBox(low - home, high - home, rate, -none, none)
-    signal = Multisine(PERIOD, round(SECONDS / PERIOD), tones=TONES, highest=HIGHEST)
+    signal = MultisineCommands(
+        PERIOD, round(SECONDS / PERIOD), tones=TONES, highest=HIGHEST
+    )
     U = np.asarray(signal.commands(signal.random(key, len(low)), box))
     step, why = _step_of(system, key), ""
     for share in SHARES:

@@ -22,7 +22,7 @@ from sim2gp.experiment_design import by_gradients, by_samples
 from sim2gp.experiment_design.experiment import Experiment
 from sim2gp.experiment_design.goals import AbstractGoal
 from sim2gp.experiment_design.limits import LimitBox
-from sim2gp.experiment_design.signals import AbstractSignal, Multisine
+from sim2gp.experiment_design.signals import AbstractCommandSignal, MultisineCommands
 from sim2gp.systems.host import simulator_of
 from sim2gp.types import AnyArray, Key, in_float64
 
@@ -54,11 +54,11 @@ class Designed(eqx.Module):
 
 
 @in_float64
-def design(
+def optimise_commands(
     experiment: Experiment,
     goal: AbstractGoal,
     limits: LimitBox,
-    signal: AbstractSignal,
+    signal: AbstractCommandSignal,
     *,
     key: Key,
     draws: int = DRAWS,
@@ -148,7 +148,7 @@ def prediction_rows(
         longest = f"{experiment.period * experiment.steps:g}"
         raise error("prediction_too_long", got=f"{horizon:g} s", longest=longest)
     experiment, limits = jax.tree.map(jnp.asarray, (experiment, limits))
-    signal = Multisine(experiment.period, experiment.steps)
+    signal = MultisineCommands(experiment.period, experiment.steps)
     U = signal.commands(MILD * signal.random(key, limits.low.size), limits)
     rows: Array = _by(experiment).sensitivity(experiment, U, periods)
     return rows

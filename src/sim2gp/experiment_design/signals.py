@@ -22,7 +22,7 @@ FADE = 0.25  # s, in which a multisine comes and goes
 COLOUR = 1.0  # of free random motions: power falls as one over frequency
 
 
-class AbstractSignal(eqx.Module):
+class AbstractCommandSignal(eqx.Module):
     """A map from ``(k, m)`` coefficients in ``[-1, 1]`` to commands.
 
     Raises `InputError` E148 for a number that cannot be.
@@ -49,7 +49,7 @@ class AbstractSignal(eqx.Module):
         """Coefficients of a motion like any other, of sd 1: a search begins there."""
 
 
-class Multisine(AbstractSignal):
+class MultisineCommands(AbstractCommandSignal):
     """Sines of ``tones`` frequencies, from one cycle in all to ``highest`` (Hz)."""
 
     tones: int = eqx.field(static=True, default=12)
@@ -82,7 +82,7 @@ class Multisine(AbstractSignal):
         return jax.random.normal(key, (self.coefficients, inputs))
 
 
-class Free(AbstractSignal):
+class FreeCommands(AbstractCommandSignal):
     """Straight lines between knots ``spacing`` seconds apart."""
 
     spacing: float = eqx.field(static=True, default=0.1)

@@ -40,7 +40,7 @@ def _pair(name: str, limit: float | tuple[float, float]) -> tuple[float, float]:
 
 
 @dataclass(frozen=True)
-class Asked:
+class DesignOptions:
     """What is asked of an experiment: the options of `sim2gp.design`."""
 
     seconds: float = 10.0
@@ -55,8 +55,8 @@ class Asked:
     configuration: str | None = None
 
 
-def verdict(
-    asked: Asked, expected: Mapping[str, Mapping[str, Any]], nats: float
+def experiment_verdict(
+    asked: DesignOptions, expected: Mapping[str, Mapping[str, Any]], nats: float
 ) -> tuple[bool, str]:
     """Whether it is worth the robot's time, and why.
 
@@ -105,7 +105,9 @@ def verdict(
     return True, f"{text} {now} % now, should be within {after} % after.{rest}"
 
 
-def foretold(asked: Asked, ahead: Mapping[str, float], nats: float) -> tuple[bool, str]:
+def foretold(
+    asked: DesignOptions, ahead: Mapping[str, float], nats: float
+) -> tuple[bool, str]:
     """The same of a prediction, its sd in those of the sensors' noise.
 
     Nobody can see that it is better than the sensors.

@@ -4,13 +4,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from sim2gp.data.logs import Log
-from sim2gp.identification.forecasts.prediction import recordings
+from sim2gp.identification.forecasts.prediction import recording_names
 from sim2gp.identification.words import quantity
 from sim2gp.inference.parameters import Parameters
 from sim2gp.systems import AbstractSystem, Variant
 
 
-def told(
+def configuration_entries(
     system: AbstractSystem,
     logs: Sequence[Log],
     parameters: Mapping[str, Mapping[str, Any]],
@@ -22,7 +22,7 @@ def told(
     variants, table = system.variants, system.parameters
     if not variants:
         return {}
-    sources = list(zip(recordings(logs), (log.group for log in logs), strict=True))
+    sources = list(zip(recording_names(logs), (log.group for log in logs), strict=True))
     about = {
         c.name: {
             "recordings": len({source for source, group in sources if group == i}),

@@ -16,7 +16,7 @@ from sim2gp.errors import error
 from sim2gp.inference.parameters import Parameter
 from sim2gp.project.priors import prior
 from sim2gp.project.schema import ProjectSpec
-from sim2gp.project.source import Source
+from sim2gp.project.source import ProjectSource
 from sim2gp.project.validate import unknown
 from sim2gp.systems import AbstractSystem, with_parts
 from sim2gp.systems.actuators import neutral_actuators
@@ -24,7 +24,7 @@ from sim2gp.systems.machine import plant_of
 
 
 def with_actuators(
-    system: AbstractSystem, spec: ProjectSpec, source: Source
+    system: AbstractSystem, spec: ProjectSpec, source: ProjectSource
 ) -> AbstractSystem:
     """The machine with its actuators; what the file does not name is neutral.
 
@@ -60,7 +60,7 @@ def with_actuators(
 
 
 def _tables(
-    spec: ProjectSpec, source: Source, inputs: Sequence[str]
+    spec: ProjectSpec, source: ProjectSource, inputs: Sequence[str]
 ) -> dict[str, list[str]]:
     """The inputs of each table; no input has two (E145), one alone no tie (E160)."""
     tables: dict[str, list[str]] = {}

@@ -22,15 +22,15 @@ from sim2gp.project.schema import (
     ParameterSpec,
     ProjectSpec,
 )
-from sim2gp.project.source import Source
-from sim2gp.project.validate import unknown, words, wrong_value
+from sim2gp.project.source import ProjectSource
+from sim2gp.project.validate import describe_violation, unknown, wrong_value
 from sim2gp.systems import AbstractPlant, AbstractSystem
 from sim2gp.systems.machine import as_machine
 from sim2gp.systems.variants import AT
 
 
 def build_system(
-    spec: ProjectSpec, source: Source, kind: type[AbstractPlant]
+    spec: ProjectSpec, source: ProjectSource, kind: type[AbstractPlant]
 ) -> AbstractSystem:
     """The machine of the file, with effects and actuators (E141, E145, E160)."""
     options = _options(spec.options, source, kind)
@@ -51,7 +51,7 @@ def build_system(
 
 
 def build_own(
-    spec: ProjectSpec, source: Source, system: AbstractSystem
+    spec: ProjectSpec, source: ProjectSource, system: AbstractSystem
 ) -> AbstractSystem:
     """A user's system with the file's priors, effects and actuators.
 
@@ -66,7 +66,7 @@ def build_own(
 
 
 def _options(
-    options: Mapping[str, Any], source: Source, kind: type[AbstractPlant]
+    options: Mapping[str, Any], source: ProjectSource, kind: type[AbstractPlant]
 ) -> dict[str, Any]:
     """The options that the class takes, each of its declared type."""
     hints = get_type_hints(kind.__init__)
@@ -86,7 +86,7 @@ def _options(
         try:
             out[name] = adapter.validate_python(given)
         except ValidationError as error:
-            expected = words({**error.errors()[0]})
+            expected = describe_violation({**error.errors()[0]})
             fix = slips.of_value(("options", name), value, expected)
             raise wrong_value("E160", where, value, expected, fix) from error
     return out
@@ -95,7 +95,7 @@ def _options(
 def _table(
     table: Parameters,
     specs: Mapping[str, ParameterSpec | float],
-    source: Source,
+    source: ProjectSource,
     path: tuple[str, ...],
 ) -> Parameters:
     """The table with the file's priors and fixed values in place of its own."""
@@ -116,7 +116,9 @@ def _table(
     return table.replace(**changes)
 
 
-def check_names(spec: ProjectSpec, source: Source, system: AbstractSystem) -> None:
+def check_known_names(
+    spec: ProjectSpec, source: ProjectSource, system: AbstractSystem
+) -> None:
     """Every channel and parameter that the file names is the machine's."""
     states = [channel.name for channel in system.physical_states]
     inputs = [channel.name for channel in system.actions]
@@ -151,7 +153,9 @@ def check_names(spec: ProjectSpec, source: Source, system: AbstractSystem) -> No
     _check_likelihood(spec, source, states)
 
 
-def _check_likelihood(spec: ProjectSpec, source: Source, states: list[str]) -> None:
+def _check_likelihood(
+    spec: ProjectSpec, source: ProjectSource, states: list[str]
+) -> None:
     """What the file says of windows, of states, and of noise is what is fitted."""
     stated = spec.likelihood
     if stated.window == 0.0 and "start" in stated.model_fields_set:
@@ -171,7 +175,11 @@ def _check_likelihood(spec: ProjectSpec, source: Source, states: list[str]) -> N
 
 
 def _check_complete(
-    named: list[str], states: list[str], inputs: list[str], source: Source, i: int
+    named: list[str],
+    states: list[str],
+    inputs: list[str],
+    source: ProjectSource,
+    i: int,
 ) -> None:
     """Every input is known, and something is measured."""
     where = source.where("logs", i, "columns")
@@ -184,7 +192,7 @@ def _check_complete(
     raise error("no_column_for_channel", where=where, got=got, channel=lacking[0])
 
 
-def _check_clock(group: LogSpec, source: Source, i: int) -> None:
+def _check_clock(group: LogSpec, source: ProjectSource, i: int) -> None:
     """Time comes from a column or a period; rows from a period or from stamps."""
     if isinstance(group.time, ColumnSpec) and group.time.saturation is not None:
         where = source.where("logs", i, "time", "saturation")

@@ -15,7 +15,7 @@ from sim2gp.inference.linear_measurements import LinearMeasurement
 from sim2gp.inference.parameters import Parameter, unknown_parameter
 from sim2gp.project.priors import located, prior
 from sim2gp.project.schema import ParameterSpec, ProjectSpec
-from sim2gp.project.source import Source
+from sim2gp.project.source import ProjectSource
 from sim2gp.systems import AbstractSystem, Variant, with_variants
 from sim2gp.systems.assemble import with_measurements
 from sim2gp.systems.function_checks import names_of
@@ -23,7 +23,7 @@ from sim2gp.systems.variants import AT
 
 
 def in_configurations(
-    spec: ProjectSpec, source: Source, system: AbstractSystem
+    spec: ProjectSpec, source: ProjectSource, system: AbstractSystem
 ) -> AbstractSystem:
     """The machine in all configurations of the file; as it is, where there is one.
 
@@ -60,7 +60,7 @@ def in_configurations(
 
 
 def weighed(
-    spec: ProjectSpec, source: Source, system: AbstractSystem
+    spec: ProjectSpec, source: ProjectSource, system: AbstractSystem
 ) -> AbstractSystem:
     """The machine with the sums that the file says were measured (E142 to E160)."""
     for i, stated in enumerate(spec.weighed):
@@ -86,7 +86,7 @@ def own_columns(parameters: Mapping[str, object]) -> list[str]:
 
 def _priors(
     spec: ProjectSpec,
-    source: Source,
+    source: ProjectSource,
     system: AbstractSystem,
     variants: list[Variant],
 ) -> dict[str, Parameter]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from sim2gp.data.clock import clock_lines
 from sim2gp.data.logs import Budget, Column, Log, read_log
-from sim2gp.data.logs.formats import recordings
+from sim2gp.data.logs.formats import read_recordings
 from sim2gp.data.logs.units import UNITS
 from sim2gp.errors import InputError
 from sim2gp.identification.identifiability.selection import Selection
@@ -157,7 +157,7 @@ def _columns(
     """
     file, budget = asked.files[0], asked.budget
     period = asked.period
-    tables = recordings(file, None, period=period, budget=budget)[0].tables
+    tables = read_recordings(file, None, period=period, budget=budget)[0].tables
     main = max(tables, key=lambda t: len(t.rows.numbers) * len(t.columns))
     columns, clock, named = dict(main.columns), main.clock, None
     where = main.rows.source
@@ -330,7 +330,7 @@ def _asked(options: Sequence[Reading]) -> str:
     return " and ".join(differ)
 
 
-def told(draft: Draft, out: Path) -> dict[str, Any]:
+def draft_summary(draft: Draft, out: Path) -> dict[str, Any]:
     """The summary of a draft."""
     table = {
         name: {

@@ -13,7 +13,7 @@ from sim2gp.errors import InputError, error, nearest
 from sim2gp.inference.parameters import Parameter
 from sim2gp.project.priors import prior
 from sim2gp.project.schema import EFFECT_OPTIONS, EffectSpec
-from sim2gp.project.source import Source
+from sim2gp.project.source import ProjectSource
 from sim2gp.project.validate import unknown
 from sim2gp.systems import AbstractPart, AbstractPlant, AbstractSystem, with_parts
 from sim2gp.systems.effects.registry import (
@@ -30,7 +30,7 @@ from sim2gp.systems.machine import plant_of
 def with_effects(
     system: AbstractSystem,
     specs: Mapping[str, Mapping[str, EffectSpec | float]],
-    source: Source,
+    source: ProjectSource,
 ) -> AbstractSystem:
     """The machine with the effects of the file; magnitudes are constants by name."""
     plant, parts = plant_of(system), list[AbstractPart]()

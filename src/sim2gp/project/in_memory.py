@@ -11,7 +11,7 @@ import tomlkit
 from sim2gp.data.logs import Log, RawLog, none_unused
 from sim2gp.errors import error
 from sim2gp.project.project import IN_MEMORY, Project
-from sim2gp.project.source import parsed
+from sim2gp.project.source import parse_project
 from sim2gp.project.validate import validated, wrong_value
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.machine import as_machine
@@ -40,7 +40,7 @@ def project_of_machine(
     except (ValueError, TypeError) as caught:
         got, expected = repr(stated), "numbers, text, lists and tables of them"
         raise wrong_value("E160", where, got, expected, "") from caught
-    source = parsed(text, where)
+    source = parse_project(text, where)
     spec, path = validated(source), Path(f"{name}.toml")
     return Project(path, source, spec, as_machine(machine), own=True)
 

@@ -17,7 +17,7 @@ from sim2gp.project.actuators import with_actuators
 from sim2gp.project.effects import with_effects
 from sim2gp.project.priors import located, prior
 from sim2gp.project.schema import ParameterSpec, ProjectSpec
-from sim2gp.project.source import Source
+from sim2gp.project.source import ProjectSource
 from sim2gp.project.validate import unknown
 from sim2gp.systems import AbstractSystem, MuJoCo
 from sim2gp.systems.mujoco.constants import (
@@ -32,7 +32,7 @@ from sim2gp.systems.variants import AT
 
 
 def build_model(
-    spec: ProjectSpec, source: Source, folder: Path, other: Path | None = None
+    spec: ProjectSpec, source: ProjectSource, folder: Path, other: Path | None = None
 ) -> AbstractSystem:
     """The machine of a model's file, or of another one, behind its actuators.
 
@@ -70,7 +70,7 @@ def build_model(
     return with_actuators(with_effects(plant, spec.effects, source), spec, source)
 
 
-def _root(spec: ProjectSpec, source: Source, folder: Path) -> Path | None:
+def _root(spec: ProjectSpec, source: ProjectSource, folder: Path) -> Path | None:
     """The folder that the model's files must lie in, where the file names one."""
     options = dict(spec.options)
     root = options.pop("root", None)

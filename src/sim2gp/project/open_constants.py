@@ -14,7 +14,7 @@ from jaxtyping import Int
 
 from sim2gp.data.logs import Log
 from sim2gp.data.split_log import cut
-from sim2gp.data.windows import Windows, motion
+from sim2gp.data.windows import Windows, channel_motion
 from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.errors import NotFinite, error
 from sim2gp.identification.identifiability.selection import (
@@ -111,5 +111,5 @@ def _not_finite() -> NotFinite:
 
 def _liveliest(windows: Windows) -> Int[np.ndarray, " W"]:
     """Windows in order: those in which some channel moves most, channel by channel."""
-    place = np.argsort(np.argsort(-motion(windows), axis=0), axis=0)
+    place = np.argsort(np.argsort(-channel_motion(windows), axis=0), axis=0)
     return np.argsort(place.min(axis=1), kind="stable")

@@ -23,7 +23,7 @@ from sim2gp.data.logs import (
     none_unused,
     read_log,
 )
-from sim2gp.data.logs.file import shown
+from sim2gp.data.logs.file import display_path
 from sim2gp.errors import InputError, error, nearest
 from sim2gp.project.schema import (
     ColumnSpec,
@@ -31,7 +31,7 @@ from sim2gp.project.schema import (
     ProjectSpec,
     ResampleSpec,
 )
-from sim2gp.project.source import Source, read_source
+from sim2gp.project.source import ProjectSource, read_source
 from sim2gp.project.validate import validated
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ class Project:
     """
 
     path: Path
-    source: Source
+    source: ProjectSource
     spec: ProjectSpec
     system: "AbstractSystem"
     budget: Budget = field(default_factory=Budget)
@@ -104,7 +104,10 @@ class Project:
                     where = self.source.where("logs", group, "files")
                     other = seen[place] + 1
                     raise error(
-                        "file_listed_twice", where=where, got=shown(file), other=other
+                        "file_listed_twice",
+                        where=where,
+                        got=display_path(file),
+                        other=other,
                     )
                 seen[place] = group
                 logs += self._read(file, group, spec)
@@ -180,7 +183,7 @@ class Project:
                 continue
             matches = sorted(glob.glob(anchored, recursive=True))
             if not matches:
-                got, folder = repr(pattern), shown(self.path.parent)
+                got, folder = repr(pattern), display_path(self.path.parent)
                 raise error("no_file_matches", where=where, got=got, folder=folder)
             found.update(dict.fromkeys(Path(match) for match in matches))
         return list(found)
@@ -222,7 +225,7 @@ def load_project(
     path = Path(path)
     source, spec = read_spec(path, own=system is not None)
     # Imported late: a misspelt key is reported before the simulators are loaded.
-    from sim2gp.project.build import build_own, build_system, check_names
+    from sim2gp.project.build import build_own, build_system, check_known_names
     from sim2gp.project.configure import in_configurations, weighed
     from sim2gp.systems.machine import as_machine
 
@@ -239,12 +242,14 @@ def load_project(
         system = build_model(spec, source, folder, model)
     else:
         system = build_system(spec, source, system_class(spec.system))
-    check_names(spec, source, system)
+    check_known_names(spec, source, system)
     system = weighed(spec, source, in_configurations(spec, source, system))
     return Project(path, source, spec, system, own=own)
 
 
-def read_spec(path: Path | str, *, own: bool = False) -> tuple[Source, ProjectSpec]:
+def read_spec(
+    path: Path | str, *, own: bool = False
+) -> tuple[ProjectSource, ProjectSpec]:
     """The file's text and its validated values, without loading any simulator.
 
     The system of the file must be known, but for a user's ``own``.
@@ -313,7 +318,7 @@ def _resample(spec: ResampleSpec | None) -> Resample | None:
     return Resample(spec.method, spec.period, spec.stamps)
 
 
-def _no_group(source: Source) -> InputError:
+def _no_group(source: ProjectSource) -> InputError:
     where = source.where("logs")
     return error("no_group_of_logs", where=where, got="no [[logs]] table")
 

@@ -24,9 +24,9 @@ import numpy as np
 from jaxtyping import Float
 
 from sim2gp.data.logs import Column, Log
-from sim2gp.data.logs.units import factor
+from sim2gp.data.logs.units import unit_factor
 from sim2gp.data.split_log import cut
-from sim2gp.data.windows import motion
+from sim2gp.data.windows import channel_motion
 from sim2gp.systems import MuJoCo
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.simulate import inputs_of
@@ -187,7 +187,9 @@ class _Trial:
 
     def __init__(self, system: AbstractSystem, asked: Question, until: float) -> None:
         windows, _ = cut(_beginning(asked.logs), system, window=WINDOW)
-        most = np.argsort(-motion(windows).mean(axis=1), kind="stable")[:WINDOWS]
+        most = np.argsort(-channel_motion(windows).mean(axis=1), kind="stable")[
+            :WINDOWS
+        ]
         self.windows = windows.some(np.sort(most))
         now = np.zeros(self.windows.area.shape[-1])
         self.inputs = np.stack([inputs_of(x, now) for x in self.windows.held()])
@@ -233,7 +235,7 @@ class _Trial:
             away = s[:, seen].reshape(K, W, -1) - y[:, :, row]
             error += np.where(w.mask[:, row], away**2, 0.0)
         error /= np.maximum(w.mask[:, 1:].sum(axis=1), 1)
-        moved = motion(w).mean(axis=0) * scale[:, None, seen] ** 2
+        moved = channel_motion(w).mean(axis=0) * scale[:, None, seen] ** 2
         share = np.sqrt(error / np.maximum(moved, 1e-30))
         share = np.where(np.isfinite(share), np.clip(share, _FLOOR, _CAP), _CAP)
         return np.asarray(np.log(share))
@@ -249,7 +251,7 @@ class _Trial:
                 reading = each.get(whole, PLAIN)
                 unit = self.units.get(whole, "")
                 own, read = self.base.get(whole), reading.unit
-                ratio = factor(read, unit, name) / factor(own, unit, name)
+                ratio = unit_factor(read, unit, name) / unit_factor(own, unit, name)
                 scale[k, i] = reading.sign * ratio
                 zero[k, i] = reading.offset if name == whole else 0.0
         return scale, zero

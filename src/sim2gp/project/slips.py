@@ -47,7 +47,7 @@ def toml(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
-def elsewhere(key: str) -> str:
+def suggest_table(key: str) -> str:
     """Where a key of another table belongs."""
     if key in ProjectSpec.model_fields:
         kind = ProjectSpec.model_fields[key].annotation
@@ -67,7 +67,7 @@ def of_key(path: Path_, known: Collection[str]) -> str:
     if difflib.get_close_matches(key.lower(), known, n=1, cutoff=_ALIKE):
         return f"did you mean {nearest(key, known)}"
     close = nearest(key, known)
-    return elsewhere(key) or (f"did you mean {close}" if close else "")
+    return suggest_table(key) or (f"did you mean {close}" if close else "")
 
 
 def of_choice(value: Any, expected: str) -> str:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sim2gp.data.logs.file import read_bytes, shown
+from sim2gp.data.logs.file import display_path, read_bytes
 from sim2gp.data.logs.table import decode
 from sim2gp.errors import InputError, error
 from sim2gp.project.syntax import of_repeated, of_syntax
@@ -40,7 +40,7 @@ _HOSTILE = re.compile(r"\$\{|^\s*(eval|exec|import|env|file|python)\s*:|^\s*!!")
 
 
 @dataclass(frozen=True)
-class Source:
+class ProjectSource:
     """A parsed project file: its text, its values, and the line of each key."""
 
     name: str
@@ -58,13 +58,13 @@ class Source:
         return f"{self.name}:line {line}" + (f", key {key}" if key else "")
 
 
-def read_source(path: Path) -> Source:
+def read_source(path: Path) -> ProjectSource:
     """Read and parse a project file (E120, E130, E160, E161, E162)."""
-    name = shown(path)
-    return parsed(decode(read_bytes(path, limit=64 * MAX_BYTES), name), name)
+    name = display_path(path)
+    return parse_project(decode(read_bytes(path, limit=64 * MAX_BYTES), name), name)
 
 
-def parsed(text: str, name: str) -> Source:
+def parse_project(text: str, name: str) -> ProjectSource:
     """Parse the text of a project file that is called ``name`` (E160, E161, E162)."""
     if len(text) > MAX_BYTES:
         raise _refused(name, f"{len(text)} characters", f"at most {MAX_BYTES}")
@@ -80,7 +80,7 @@ def parsed(text: str, name: str) -> Source:
     lines: dict[Path_, int] = {}
     for key, line in _lines(text, bare):
         lines.setdefault(key, line)  # of a table in pieces, the first
-    source = Source(name, text, values, lines)
+    source = ProjectSource(name, text, values, lines)
     for key, value in _leaves(values, ()):
         if _is_hostile(key, value):
             where, got = source.where(*key), repr(value)[:40]

@@ -11,9 +11,9 @@ from sim2gp.reports import data, parameters
 from sim2gp.reports.animation import player
 from sim2gp.reports.experiment import experiment
 from sim2gp.reports.glance import glance, unique
-from sim2gp.reports.numbers import duration, is_number, number
+from sim2gp.reports.numbers import format_duration, format_number, is_number
 from sim2gp.reports.parameters import Arrays, Section, Summary
-from sim2gp.reports.returns import returns
+from sim2gp.reports.returns import returns_section
 from sim2gp.reports.template import asset, render
 from sim2gp.reports.traces import traces
 
@@ -99,15 +99,17 @@ def _made(summary: Summary) -> Section:
         line = shlex.join(map(str, line))
     for key, words in _FACTS.items():
         if is_number(summary.get(key)):
-            rows.append((words, number(summary[key], 4)))
+            rows.append((words, format_number(summary[key], 4)))
     latency = summary.get("latency_ms")
     if isinstance(latency, Mapping):
-        parts = [f"{name} {number(value)} ms" for name, value in latency.items()]
+        parts = [f"{name} {format_number(value)} ms" for name, value in latency.items()]
         rows.append(("latency", ", ".join(parts)))
     if is_number(summary.get("interaction_seconds")):
-        rows.append(("real interaction", duration(summary["interaction_seconds"])))
+        rows.append(
+            ("real interaction", format_duration(summary["interaction_seconds"]))
+        )
     if is_number(summary.get("wall_seconds")):
-        rows.append(("wall time", duration(summary["wall_seconds"])))
+        rows.append(("wall time", format_duration(summary["wall_seconds"])))
     if summary.get("seed") is not None:
         rows.append(("seed", summary["seed"]))
     if summary.get("device"):
@@ -171,20 +173,24 @@ def _figure(summary: Summary, arrays: Arrays) -> Section:
 
 def _sections(summary: Summary, arrays: Arrays) -> list[dict[str, Any]]:
     """What there is to show, in the order in which a reader asks for it."""
-    figure, scored = _figure(summary, arrays), returns(summary, arrays)
+    figure, scored = _figure(summary, arrays), returns_section(summary, arrays)
     machine = ("machine", "The machine", _machine(summary, arrays))
     title = figure["title"] if figure else ""
     found: list[tuple[str, str, Any]] = [
-        ("claims", "Claims", data.claims(summary)),
+        ("claims", "Claims", data.claims_section(summary)),
         ("figure", title, figure),
         *([machine] if scored else []),
         ("returns", "Returns", scored),
         ("experiment", "The experiment", experiment(summary, arrays)),
-        ("parameters", "Parameters", parameters.parameter_table(summary)),
-        ("directions", "Combinations", parameters.directions(summary)),
+        ("parameters", "Parameters", parameters.parameter_section(summary)),
+        ("directions", "Combinations", parameters.directions_section(summary)),
         ("misfit", "Noise and misfit", data.noise_and_misfit(summary)),
-        ("heldout", "Prediction of held-out data", data.held_out(summary, arrays)),
-        ("calibration", "Calibration", data.calibration(summary, arrays)),
+        (
+            "heldout",
+            "Prediction of held-out data",
+            data.held_out_section(summary, arrays),
+        ),
+        ("calibration", "Calibration", data.calibration_section(summary, arrays)),
         *([] if scored else [machine]),
         ("traces", "Measured against simulated", traces(summary, arrays)),
         (

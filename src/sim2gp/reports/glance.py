@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from statistics import median
 from typing import Any
 
-from sim2gp.reports.numbers import number
+from sim2gp.reports.numbers import format_number
 from sim2gp.reports.parameters import Summary
 
 MANY = 4  # names that a sentence lists
@@ -41,9 +41,10 @@ def _sure(summary: Summary) -> str:
     ]
     said = []
     if shares:
-        words = f"Standard deviations are {number(median(shares), 2)} % of the values"
+        middle = format_number(median(shares), 2)
+        words = f"Standard deviations are {middle} % of the values"
         if len(shares) > 1:
-            words += f" (median; at most {number(max(shares), 2)} %)"
+            words += f" (median; at most {format_number(max(shares), 2)} %)"
         said.append(f"{words}.")
     which = (summary.get("intervals") or {}).get("which")
     if which == "corrected":
@@ -95,7 +96,7 @@ def _next(summary: Summary) -> str:
 def _listed(names: Sequence[str]) -> str:
     shown = ", ".join(names[:MANY])
     rest = len(names) - MANY
-    return f"{shown} and {number(rest)} more" if rest > 0 else shown
+    return f"{shown} and {format_number(rest)} more" if rest > 0 else shown
 
 
 def unique(problems: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:

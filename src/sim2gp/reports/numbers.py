@@ -50,7 +50,7 @@ def _fixed(value: float, decimals: int) -> str:
     return text.replace("-", "−")
 
 
-def number(value: object, digits: int = 3) -> str:
+def format_number(value: object, digits: int = 3) -> str:
     """The number with so many significant digits, or a dash where there is none."""
     if not is_number(value):
         return MISSING
@@ -59,7 +59,7 @@ def number(value: object, digits: int = 3) -> str:
         return f"{int(value):,}".replace(",", "\u202f").replace("-", "−")
     exponent = _shared_exponent(x)
     if exponent == 0 and abs(x) >= 10_000:
-        return number(round(x))
+        return format_number(round(x))
     scaled = x / 10.0**exponent
     return _fixed(scaled, digits - 1 - _exponent(scaled)) + _power(exponent)
 
@@ -67,10 +67,10 @@ def number(value: object, digits: int = 3) -> str:
 def plus_minus(mean: object, sd: object) -> str:
     """Mean and standard deviation to the two leading digits of the latter."""
     if not (is_number(mean) and is_number(sd)):
-        return number(mean)
+        return format_number(mean)
     m, s = float(mean), float(sd)  # type: ignore[arg-type]
     if s <= 0:
-        return number(m)
+        return format_number(m)
     exponent = _shared_exponent(m, s)
     decimals = 1 - _exponent(s / 10.0**exponent)
     m, s = m / 10.0**exponent, s / 10.0**exponent
@@ -78,13 +78,13 @@ def plus_minus(mean: object, sd: object) -> str:
     return f"({text}){_power(exponent)}" if exponent else text
 
 
-def interval(low: object, high: object) -> str:
+def format_interval(low: object, high: object) -> str:
     """An interval with as many digits as its width deserves."""
     if not (is_number(low) and is_number(high)):
         return MISSING
     a, b = float(low), float(high)  # type: ignore[arg-type]
     if a > 0 and b > 20 * a:  # decades apart: each with its own digits
-        return f"{number(a, 2)} to {number(b, 2)}"
+        return f"{format_number(a, 2)} to {format_number(b, 2)}"
     exponent = _shared_exponent(a, b)
     a, b = a / 10.0**exponent, b / 10.0**exponent
     decimals = 1 - _exponent((b - a) / 4) if b > a else 3
@@ -92,7 +92,7 @@ def interval(low: object, high: object) -> str:
     return f"({text}){_power(exponent)}" if exponent else text
 
 
-def percent(share: object) -> str:
+def format_percent(share: object) -> str:
     """A share as a percentage."""
     if not is_number(share):
         return MISSING
@@ -100,13 +100,13 @@ def percent(share: object) -> str:
     return f"{value:.1f} %"
 
 
-def duration(seconds: object) -> str:
+def format_duration(seconds: object) -> str:
     """Seconds in words that fit their size."""
     if not is_number(seconds):
         return MISSING
     s = float(seconds)  # type: ignore[arg-type]
     if s < 100:
-        return f"{number(s)} s"
+        return f"{format_number(s)} s"
     minutes, rest = divmod(round(s), 60)
     if minutes < 100:
         return f"{minutes} min {rest:02d} s"

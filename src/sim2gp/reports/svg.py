@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from markupsafe import Markup, escape
 
-from sim2gp.reports.numbers import number, power_of_ten
+from sim2gp.reports.numbers import format_number, power_of_ten
 
 _TOP, _RIGHT = 26.0, 10.0
 _DIGIT_WIDTH = 6.6  # pixels of a digit of the tick labels
@@ -86,7 +86,9 @@ def extent(values: np.ndarray | float, unit: str = "") -> str:
     flat = flat[np.isfinite(flat)]
     if flat.size == 0:
         return "no values"
-    text = f"from {number(float(flat.min()))} to {number(float(flat.max()))}"
+    text = (
+        f"from {format_number(float(flat.min()))} to {format_number(float(flat.max()))}"
+    )
     return f"{text} {unit}".rstrip()
 
 

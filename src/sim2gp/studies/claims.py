@@ -28,7 +28,7 @@ def resampled(
     return rng.multinomial(seeds, share, size=RESAMPLES).astype(float)
 
 
-def interval(
+def bootstrap_interval(
     difference: Float[np.ndarray, " seeds"],
     rng: np.random.Generator,
     level: float = LEVEL,
@@ -87,7 +87,7 @@ def at_least_as_good(
             return claim(False, f"no score on {lost} seeds, {other} has one", text)
         if other != name and kept.any():
             difference = scores[name][kept] - score[kept]
-            low, high = interval(difference, rng)
+            low, high = bootstrap_interval(difference, rng)
             if high < worst:
                 worst, figure = (
                     high,
@@ -112,7 +112,7 @@ def better_somewhere(
     level = 1.0 - (1.0 - LEVEL) / len(pairs)
     for place, (one, other) in pairs.items():
         difference = one - other
-        low, high = interval(difference, rng, level)
+        low, high = bootstrap_interval(difference, rng, level)
         if low > best:
             best, figure = low, f"{place}: {difference_in_words(difference, low, high)}"
     return claim(best > 0.0, figure, text)

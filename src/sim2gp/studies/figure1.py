@@ -24,9 +24,9 @@ from sim2gp.studies.two_link import (
     LOCKED,
     NOISE,
     STEPS,
-    Cell,
+    ArmCell,
     Learned,
-    band,
+    coverage_band,
     covered,
     learn,
     nominal_truth,
@@ -51,12 +51,12 @@ class TwoLinkArm(Study):
     size = (200, None)
     quick_size = (20, None)
 
-    def rows(self) -> dict[Key, list[Cell]]:
+    def rows(self) -> dict[Key, list[ArmCell]]:
         """Arms drawn from the prior, and other recordings of the nominal arm."""
         recordings = max(self.count // ARMS_PER_RECORDING, 1)
         return {
-            ("prior",): [Cell("prior", self.seed, i) for i in range(self.count)],
-            ("nominal",): [Cell("nominal", self.seed, i) for i in range(recordings)],
+            ("prior",): [ArmCell("prior", self.seed, i) for i in range(self.count)],
+            ("nominal",): [ArmCell("nominal", self.seed, i) for i in range(recordings)],
         }
 
     @cached_property
@@ -280,7 +280,7 @@ def coverage_claim(z: Float[np.ndarray, "seeds p"], failed: int) -> dict[str, An
     """Whether the shares of all parameters lie in the bands, at all levels."""
     holds, shares = True, []
     for level in LEVELS:
-        inside, (low, high) = covered(z, level), band(level, len(z))
+        inside, (low, high) = covered(z, level), coverage_band(level, len(z))
         holds = holds and bool(np.all((low <= inside) & (inside <= high)))
         shares.append(
             f"{level} %: {inside.min():.3f} to {inside.max():.3f} "
@@ -338,7 +338,7 @@ def _coverage_table(names: Sequence[str], z: np.ndarray) -> dict[str, Any]:
         [name, *(f"{shares[level][i]:.3f}" for level in LEVELS)]
         for i, name in enumerate(names)
     ]
-    bands = [band(level, len(z)) for level in LEVELS]
+    bands = [coverage_band(level, len(z)) for level in LEVELS]
     rows.append(["band", *(f"{low:.3f} to {high:.3f}" for low, high in bands)])
     return {
         "title": f"Share of {len(z)} arms inside the interval, after both data sets",

@@ -89,7 +89,7 @@ class Exploration(Study):
                 "episodes": self.episodes,
                 "shown": FIGURES[self.name],
             },
-            "claims": claims(table, early, self.rng),
+            "claims": exploration_claims(table, early, self.rng),
             "tables": _tables(table, self.methods),
         }
 
@@ -144,7 +144,7 @@ def needed(
     return float("inf")
 
 
-def claims(
+def exploration_claims(
     table: Table,
     early: Mapping[Key, Float[np.ndarray, "seeds looks two"]],
     rng: np.random.Generator,

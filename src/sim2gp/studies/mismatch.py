@@ -79,7 +79,7 @@ class MismatchMap(Study):
                 "methods": list(METHODS),
             },
             "regret": regrets(table),
-            "claims": claims(table, self.rng),
+            "claims": mismatch_claims(table, self.rng),
             **returns_of(values),
             "tables": tables(table),
         }
@@ -110,7 +110,9 @@ def regrets(table: Table) -> dict[str, float]:
     return {method: float(each.sum()) for method, each in lost(table).items()}
 
 
-def claims(table: Table, rng: np.random.Generator) -> dict[str, dict[str, Any]]:
+def mismatch_claims(
+    table: Table, rng: np.random.Generator
+) -> dict[str, dict[str, Any]]:
     """Whether choosing costs more than having known the best model in advance.
 
     And whether sampling pays anywhere, by the mean score of the episodes.

@@ -37,7 +37,7 @@ LEVELS = (50, 90, 95)
 BAND = 0.999  # acceptance of each coverage count, if the intervals are right
 
 
-class Recording(eqx.Module):
+class ArmRecording(eqx.Module):
     """One data set: the arm from rest, and the torques that moved it."""
 
     state: Float[Array, "T1 4"]
@@ -56,8 +56,8 @@ class Learned(eqx.Module):
     """
 
     truth: Float[Array, " p"]
-    first: Recording
-    second: Recording
+    first: ArmRecording
+    second: ArmRecording
     prior: Sim2GPBelief
     posterior1: Sim2GPBelief
     middle: Sim2GPBelief
@@ -85,7 +85,7 @@ def nominal_truth() -> Float[Array, " p"]:
 
 
 @eqx.filter_jit
-def record(arm: UniformRodArm, truth: Float[Array, " p"], *, key: Key) -> Recording:
+def record(arm: UniformRodArm, truth: Float[Array, " p"], *, key: Key) -> ArmRecording:
     """Excite the free joints of an arm; a locked joint gets no torque and no noise."""
     free = jnp.asarray([0.0 if locked else 1.0 for locked in arm.locked], truth.dtype)
     noise = jnp.asarray(NOISE, truth.dtype) * jnp.concatenate([free, free])
@@ -106,7 +106,7 @@ def record(arm: UniformRodArm, truth: Float[Array, " p"], *, key: Key) -> Record
 
     rest = jnp.zeros(4, truth.dtype)
     _, path = jax.lax.scan(step, rest, (action, disturbance))
-    return Recording(jnp.concatenate([rest[None], path]), action)
+    return ArmRecording(jnp.concatenate([rest[None], path]), action)
 
 
 @in_float64
@@ -125,7 +125,7 @@ def learn(truth: Float[Array, " p"], *, key: Key) -> Learned:
 
 
 @dataclass(frozen=True)
-class Cell(AbstractCell):
+class ArmCell(AbstractCell):
     """One arm, recorded and learned; ``index`` counts the arms of a seed.
 
     method: ``prior``, an arm drawn from the prior, or ``nominal``, another recording of
@@ -176,7 +176,7 @@ class Cell(AbstractCell):
         return given | found | {"seconds": time.perf_counter() - started}
 
 
-def band(level: int, count: int) -> tuple[float, float]:
+def coverage_band(level: int, count: int) -> tuple[float, float]:
     """Shares of ``count`` arms that right intervals of ``level`` per cent hold.
 
     Binomial, central 99.9 %: what lies outside is no accident.

@@ -34,7 +34,7 @@ _FACTORS = {  # slope of displacement on integrated velocity -> what it betrays
 }
 
 
-def finite(columns: Mapping[str, Values], rows: Rows, skip: Mask) -> None:
+def check_finite_columns(columns: Mapping[str, Values], rows: Rows, skip: Mask) -> None:
     """No NaN or infinity in a used column outside the skipped rows (E101)."""
     bad = {name: ~np.isfinite(v) & ~skip for name, v in columns.items()}
     count = sum(int(b.sum()) for b in bad.values())
@@ -307,7 +307,7 @@ def shared_rows(train: Sequence[Log], test: Sequence[Log]) -> list[Note]:
     return notes
 
 
-def check_names(
+def check_column_names(
     columns: Mapping[str, object],
     states: Sequence[ChannelLike],
     actions: Sequence[ChannelLike],

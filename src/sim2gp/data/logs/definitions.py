@@ -114,7 +114,7 @@ class Definitions:
         )
 
 
-def parsed(text: str, name: str, meter: Meter) -> Definitions:
+def parse_definition(text: str, name: str, meter: Meter) -> Definitions:
     """The definition of the type ``name`` (E126 for its size, E136 for its form)."""
     if len(text) > MAX_TEXT:
         raise meter.over(

@@ -41,7 +41,7 @@ _PICKLES = (".pkl", ".pickle", ".pt", ".pth", ".ckpt", ".joblib")
 PICKLED = tuple(bytes([0x80, protocol]) for protocol in range(2, 6))
 
 
-def shown(path: Path) -> str:
+def display_path(path: Path) -> str:
     """A path as the user would write it: relative when it lies below the folder."""
     try:
         return str(path.relative_to(Path.cwd()))
@@ -60,14 +60,14 @@ def kind_of(path: Path) -> str:
         for kind, marks in FOLDERS.items():
             if any((path / mark).is_file() for mark in marks):
                 return kind
-        raise _not_a_file(shown(path), stat.S_IFDIR)
+        raise _not_a_file(display_path(path), stat.S_IFDIR)
     if path.suffix.lower() in _PICKLES:
-        raise pickled(shown(path), path.suffix)
+        raise pickled(display_path(path), path.suffix)
     if path.suffix.lower() == ".safetensors":
-        raise _tensors(read_bytes(path, first=16), shown(path))
+        raise _tensors(read_bytes(path, first=16), display_path(path))
     kind = SUFFIXES.get(path.suffix.lower(), "csv")
     if kind in MAGIC:  # a format of text has no first bytes of its own
-        _check_magic(read_bytes(path, first=16), kind, shown(path))
+        _check_magic(read_bytes(path, first=16), kind, display_path(path))
     return kind
 
 
@@ -130,7 +130,7 @@ def read_bytes(path: Path, limit: int | None = None, first: int | None = None) -
 @contextmanager
 def steady(path: Path, limit: int | None = None) -> Iterator[int]:
     """The size of a regular file that is the same afterwards (E126, E129 to E131)."""
-    where = shown(path)
+    where = display_path(path)
     _check_nul(path)
     before = _status(path)
     if not stat.S_ISREG(before.st_mode):
@@ -156,7 +156,7 @@ def _status(path: Path) -> os.stat_result:
         raise _unreadable(path, error) from error
 
 
-def library(module: str, extra: str, what: str) -> Any:
+def import_optional(module: str, extra: str, what: str) -> Any:
     """A module of an optional package, imported when a file needs it (E135)."""
     try:
         return importlib.import_module(module)
@@ -172,7 +172,9 @@ def library(module: str, extra: str, what: str) -> Any:
 
 def _check_nul(path: Path) -> None:
     if "\x00" in str(path):
-        raise error("nul_in_path", where=repr(shown(path)), got="a NUL character")
+        raise error(
+            "nul_in_path", where=repr(display_path(path)), got="a NUL character"
+        )
 
 
 def _not_a_file(where: str, mode: int) -> InputError:
@@ -202,7 +204,7 @@ def _unreadable(path: Path, caught: OSError) -> InputError:
         hint = "give yourself the right to read it"
     return error(
         "file_cannot_be_read",
-        where=shown(path),
+        where=display_path(path),
         got=(caught.strerror or str(caught)).lower(),
         fix=hint,
     )

@@ -14,7 +14,7 @@ from jaxtyping import Int
 from sim2gp.data.logs.arrays import MAX_WIDTH
 from sim2gp.data.logs.budget import Meter
 from sim2gp.data.logs.log import Note
-from sim2gp.data.logs.table import Rows, Table
+from sim2gp.data.logs.table import LogTable, Rows
 from sim2gp.errors import error
 
 NEAR = 1_000_000_000  # ns: clocks further apart than this are not one clock
@@ -99,7 +99,7 @@ def clocked(
     clock: str | None,
     where: str,
     seen: tuple[str, ...],
-) -> list[Table]:
+) -> list[LogTable]:
     """Tables in seconds since the start of the recording; what was taken is said.
 
     Header stamps and log times are mixed only where they are of one clock.
@@ -138,7 +138,7 @@ def _table(
     headed: bool,
     where: str,
     seen: tuple[str, ...],
-) -> Table:
+) -> LogTable:
     what = "its headers" if headed else "its log times"
     text = f"time of {stream.topic} in {where} is that of {what}"
     values = np.asarray(stream.values, dtype=np.float64)
@@ -146,7 +146,7 @@ def _table(
     rows = Rows(f"{where} {stream.topic}", np.asarray(stream.numbers), "message")
     seconds = (time - origin) / 1e9
     notes = (Note("W154", text),)
-    return Table(rows, seen, columns, seconds, stream.topic, notes)
+    return LogTable(rows, seen, columns, seconds, stream.topic, notes)
 
 
 def _stamp(content: Any) -> int:

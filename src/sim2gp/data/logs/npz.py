@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Shaped
 
-from sim2gp.data.logs.arrays import Entry, distinct, table_of
+from sim2gp.data.logs.arrays import LazyArray, distinct, read_columns
 from sim2gp.data.logs.budget import Meter
-from sim2gp.data.logs.file import pickled, shown, steady
-from sim2gp.data.logs.table import Table
+from sim2gp.data.logs.file import display_path, pickled, steady
+from sim2gp.data.logs.table import LogTable
 from sim2gp.errors import error
 
 MAX_HEADER = 10_000  # bytes; numpy's own limit
@@ -40,9 +40,9 @@ _AXIS = re.compile(r" *([0-9]{1,19})L? *")
 
 def read_npz(
     path: Path, wanted: Sequence[str] | None, time: str | None, meter: Meter
-) -> Table:
+) -> LogTable:
     """The wanted arrays of an archive as columns (E103 to E126, E140, E180, E182)."""
-    where = shown(path)
+    where = display_path(path)
     with steady(path), zipfile.ZipFile(path) as archive:
         members = [_checked(info, where) for info in archive.infolist()]
         names = [info.filename.removesuffix(".npy") for info in members]
@@ -51,7 +51,7 @@ def read_npz(
         for name, info in zip(names, members, strict=True):
             meter.place = f"array {name[:60]}"
             entries[name] = _entry(archive, info, meter)
-        return table_of(entries, where, wanted, time=time, meter=meter)
+        return read_columns(entries, where, wanted, time=time, meter=meter)
 
 
 def _checked(info: zipfile.ZipInfo, where: str) -> zipfile.ZipInfo:
@@ -72,13 +72,13 @@ def _checked(info: zipfile.ZipInfo, where: str) -> zipfile.ZipInfo:
     return info
 
 
-def _entry(archive: zipfile.ZipFile, info: zipfile.ZipInfo, meter: Meter) -> Entry:
+def _entry(archive: zipfile.ZipFile, info: zipfile.ZipInfo, meter: Meter) -> LazyArray:
     """The array's shape and dtype, and how to read it."""
     meter.tick()
     with archive.open(info) as member:
         shape, in_columns, dtype, start = _header(member, meter)
     if dtype.hasobject or dtype.kind == "V":
-        return Entry(shape, dtype, lambda: np.empty(0))
+        return LazyArray(shape, dtype, lambda: np.empty(0))
     count = math.prod(shape)
     claimed = count * dtype.itemsize
     if claimed != info.file_size - start:
@@ -106,7 +106,7 @@ def _entry(archive: zipfile.ZipFile, info: zipfile.ZipInfo, meter: Meter) -> Ent
         flat = content.view(dtype)
         return flat.reshape(shape, order="F" if in_columns else "C")
 
-    return Entry(shape, dtype, values)
+    return LazyArray(shape, dtype, values)
 
 
 def _header(member: Any, meter: Meter) -> tuple[tuple[int, ...], bool, np.dtype, int]:

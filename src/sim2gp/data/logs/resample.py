@@ -67,7 +67,7 @@ class Track:
         return np.cumsum(self.cuts | gaps)
 
 
-def joined(
+def join_tracks(
     tracks: Sequence[Track], resample: Resample | None, source: str
 ) -> tuple[Track, list[Note]]:
     """One track of all, and what was done to get it (E103, E116)."""

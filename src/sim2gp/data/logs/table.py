@@ -21,9 +21,9 @@ from sim2gp.data.logs.file import (
     MAGIC,
     PICKLED,
     compressed,
+    display_path,
     pickled,
     read_bytes,
-    shown,
 )
 from sim2gp.data.logs.log import Note
 from sim2gp.errors import InputError, error, nearest
@@ -53,7 +53,7 @@ class Rows:
 
 
 @dataclass(frozen=True)
-class Table:
+class LogTable:
     """Columns of one clock: ``columns[name]`` (N,), and what their rows are called.
 
     ``clock`` is in s where the format has stamps of its own, None where a column or the
@@ -67,7 +67,7 @@ class Table:
     stream: str = ""
     notes: tuple[Note, ...] = ()
 
-    def kept(self, which: Int[np.ndarray, " K"] | slice) -> "Table":
+    def kept(self, which: Int[np.ndarray, " K"] | slice) -> "LogTable":
         """Some of the rows, by their positions."""
         columns = {name: values[which] for name, values in self.columns.items()}
         clock = None if self.clock is None else self.clock[which]
@@ -98,12 +98,12 @@ def decode(content: bytes, where: str) -> str:
 
 def read_table(
     path: Path, wanted: Sequence[str] | None, time: str | None, meter: Meter
-) -> Table:
+) -> LogTable:
     """Read the wanted columns of a CSV file as float64; empty cells become NaN.
 
     None wants every named column whose first cell is a number.
     """
-    where = shown(path)
+    where = display_path(path)
     text = decode(read_bytes(path, meter.budget.bytes), where)
     lines = text.splitlines()
     filled = [i for i, line in enumerate(lines) if line and not line.isspace()]
@@ -132,7 +132,7 @@ def read_table(
         kept = table.kept(part)
         values[part] = _parse(rows[part], columns, header, kept, quoted, time)
     found = {name: values[:, i] for i, name in enumerate(wanted)}
-    return Table(table, header, found)
+    return LogTable(table, header, found)
 
 
 def _fields(lines: Sequence[str], table: Rows) -> Iterator[list[str]]:

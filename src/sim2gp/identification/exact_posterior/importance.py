@@ -77,7 +77,7 @@ class Checked:
             "k": finite_or_none(self.k),
             "draws": self.draws,
             "text": self.words(names),
-            "constants": moments(names, self.shift, self.ratio),
+            "constants": moment_changes(names, self.shift, self.ratio),
         }
 
     def words(self, names: tuple[str, ...]) -> str:
@@ -113,7 +113,7 @@ def moved(
     ]
 
 
-def moments(
+def moment_changes(
     names: tuple[str, ...],
     shift: Float[np.ndarray, " p"],
     ratio: Float[np.ndarray, " p"],
@@ -125,7 +125,7 @@ def moments(
     }
 
 
-def directions(posterior: Gaussian) -> Float[np.ndarray, "p p"]:
+def standardised_directions(posterior: Gaussian) -> Float[np.ndarray, "p p"]:
     """A row for each constant: its direction among the standardised unknowns."""
     scale = np.asarray(posterior.scale)
     found: np.ndarray = scale / np.linalg.norm(scale, axis=1)[:, None]
@@ -144,8 +144,8 @@ def check_windows(
     draws = z[None] + white @ scale.T
     found = _log_posterior(likelihood, prior, draws, e, fitted.noise)
     log_weights = np.asarray(found) + 0.5 * np.sum(np.asarray(white) ** 2, axis=1)
-    unit = directions(fitted.posterior)
-    return checked(log_weights, np.asarray(white) @ unit.T)
+    unit = standardised_directions(fitted.posterior)
+    return importance_check(log_weights, np.asarray(white) @ unit.T)
 
 
 @eqx.filter_jit
@@ -177,7 +177,7 @@ def _log_posterior(
     return found
 
 
-def checked(
+def importance_check(
     log_weights: Float[np.ndarray, " S"], draws: Float[np.ndarray, "S p"]
 ) -> Checked:
     """Shape and moments; a draw at which nothing is finite has no weight.

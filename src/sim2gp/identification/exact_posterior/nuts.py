@@ -33,9 +33,9 @@ from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.errors import missing_extra
 from sim2gp.identification.exact_posterior.importance import (
     different,
-    directions,
-    moments,
+    moment_changes,
     moved,
+    standardised_directions,
 )
 from sim2gp.identification.words import finite_or_none, listed
 from sim2gp.inference.arrowhead import Noise, eliminate
@@ -82,7 +82,7 @@ class Sampled:
             "draws": finite_or_none(self.draws),
             "divergent": self.divergent,
             "text": self.words(names),
-            "constants": moments(names, self.shift, self.ratio),
+            "constants": moment_changes(names, self.shift, self.ratio),
         }
 
     def words(self, names: tuple[str, ...]) -> str:
@@ -119,12 +119,12 @@ def sample_windows(
     """
     prior = ParameterPrior(fitted.prior, likelihood.system.parameters)
     at = fitted.z(), fitted.nuisances, fitted.noise
-    draws, divergent = sampled(likelihood, prior, *at, key)
-    unit = directions(fitted.posterior)
-    return judged(np.asarray(draws), np.asarray(divergent), unit)
+    draws, divergent = sample_posterior(likelihood, prior, *at, key)
+    unit = standardised_directions(fitted.posterior)
+    return summarise_chains(np.asarray(draws), np.asarray(divergent), unit)
 
 
-def sampled(
+def sample_posterior(
     likelihood: AbstractLikelihood,
     prior: AbstractPrior,
     z: Float[Array, " p"],
@@ -209,7 +209,7 @@ def _density(
 
 
 @in_float64
-def judged(
+def summarise_chains(
     draws: Float[np.ndarray, "chains S p"],
     divergent: Bool[np.ndarray, "chains S"],
     unit: Float[np.ndarray, "p p"],

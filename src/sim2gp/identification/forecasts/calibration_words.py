@@ -14,7 +14,7 @@ NARROW, WIDE, BOTH = "too narrow", "too wide", "wrong shape"
 PASSED, UNKNOWN = "not contradicted", "too few to say"
 
 
-def verdict(
+def calibration_verdict(
     levels: Float[np.ndarray, " L"],
     share: Float[np.ndarray, " L"],
     half: Float[np.ndarray, " L"],
@@ -74,14 +74,14 @@ def _range(
     }
 
 
-def words(
+def describe_calibration(
     channels: Mapping[str, Mapping[str, Any]],
     levels: Float[np.ndarray, " L"],
     half: Float[np.ndarray, "c L"],
     blocks: str,
     fewest: int,
 ) -> str:
-    """What is said of all channels of a forecast; ``half`` as in `verdict`, by row."""
+    """All channels in words; ``half`` as in `calibration_verdict`, by row."""
     by: dict[str, list[int]] = {}
     for c, entry in enumerate(channels.values()):
         kind = entry["verdict"]

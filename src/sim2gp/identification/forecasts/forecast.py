@@ -31,7 +31,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp.compilation import compile_async
 from sim2gp.data.grid import PERIOD, Grid
-from sim2gp.data.window_slopes import Asked, HostRun
+from sim2gp.data.window_slopes import HostRun, SlopeInputs
 from sim2gp.data.windows import Windows
 from sim2gp.inference.gaussian import LOG_2PI, Gaussian
 from sim2gp.inference.linearized import value_and_jacobian
@@ -74,7 +74,7 @@ class Forecast(eqx.Module):
 
 
 @in_float64
-def forecast(
+def forecast_windows(
     system: AbstractSystem,
     posterior: Gaussian,
     grid: Grid,
@@ -111,7 +111,7 @@ def forecast(
 
 @in_float64
 def compile_forecast(system: AbstractSystem, grid: Grid) -> None:
-    """Start to compile `forecast` for windows like these and a posterior to come.
+    """Compile `forecast_windows` early, for windows like these and any posterior.
 
     It serves where the samples asked for are such as every simulation passes.
     """
@@ -153,7 +153,7 @@ def _forecast_on_host(
     by_start, by_input, by_constants = np.split(
         np.eye(n + m + scale.shape[1]), [n, n + m]
     )
-    asked = Asked(mean, windows.start, scale @ by_constants, by_start, by_input)
+    asked = SlopeInputs(mean, windows.start, scale @ by_constants, by_start, by_input)
     run = HostRun(simulator, system, windows, asked)
     return _parts(windows, run.states, run.slopes())
 
@@ -248,10 +248,10 @@ def fit_band(found: Forecast, grid: Grid, recordings: int) -> Band:
     shape = np.where(count > 0, squares / np.maximum(count, 1), 1.0)
     rows = np.asarray((0.0, *found.rows))
     shape = np.concatenate([np.ones_like(shape[:1]), shape])
-    return Band(start_sd, np.exp(best), resolution, rows, shape, inflation_of(m))
+    return Band(start_sd, np.exp(best), resolution, rows, shape, new_log_inflation(m))
 
 
-def inflation_of(recordings: int) -> float:
+def new_log_inflation(recordings: int) -> float:
     """By what a variance seen in ``m`` training logs is raised for another log.
 
     One log says nothing of another: then twice the sd is as good as any.

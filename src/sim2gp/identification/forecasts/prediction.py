@@ -16,7 +16,7 @@ from sim2gp.data.grid import CURVE, PERIOD, Grid, steps_of
 from sim2gp.data.logs import Log
 from sim2gp.data.windows import Windows
 from sim2gp.identification.forecasts.baselines import compared, loss_sentence
-from sim2gp.identification.forecasts.forecast import Band, Forecast, forecast
+from sim2gp.identification.forecasts.forecast import Band, Forecast, forecast_windows
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.systems.base import AbstractSystem
 
@@ -25,7 +25,7 @@ _FINEST = 5  # grid samples from one point of a curve to the next
 Picture = dict[str, tuple[np.ndarray, ...]]
 
 
-def recordings(logs: Sequence[Log]) -> list[str]:
+def recording_names(logs: Sequence[Log]) -> list[str]:
     """The recording of each log; a file cut at its gaps is one recording."""
     return [log.source for log in logs]
 
@@ -35,7 +35,7 @@ def channels(system: AbstractSystem, windows: Windows) -> list[str]:
     return [system.physical_states[i].name for i in windows.outputs]
 
 
-def units(system: AbstractSystem) -> dict[str, str]:
+def channel_units(system: AbstractSystem) -> dict[str, str]:
     """Units of all channels, for the report."""
     return {c.name: c.unit for c in (*system.physical_states, *system.actions)}
 
@@ -56,7 +56,7 @@ def predicted(
 ) -> Forecast:
     """Forecasts of ``grid``'s windows, at all that is judged or drawn of them."""
     rows = np.union1d(rows_for(horizon), _rows_of_traces(grid))
-    return forecast(system, posterior, grid, rows)
+    return forecast_windows(system, posterior, grid, rows)
 
 
 class Judged(eqx.Module):
@@ -77,7 +77,7 @@ class Judged(eqx.Module):
     inside95: Bool[np.ndarray, "W R c"]
 
 
-def judged(
+def score_forecasts(
     rows: np.ndarray,
     grid: Grid,
     found: Forecast,
@@ -102,7 +102,7 @@ def judged(
     )
 
 
-def joined(parts: Sequence[Judged]) -> Judged:
+def join_folds(parts: Sequence[Judged]) -> Judged:
     """The folds of a leave-one-out side by side."""
     first = parts[0]
     fields = {
@@ -113,7 +113,7 @@ def joined(parts: Sequence[Judged]) -> Judged:
     return Judged(rows=first.rows, **fields)
 
 
-def scores(
+def forecast_scores(
     found: Judged, names: Sequence[str], logs: Sequence[Log], horizon: float
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Summary keys, tables and curves of a held-out evaluation."""
@@ -243,7 +243,7 @@ def _shown(regression: float) -> str:
     return f"{regression:.4f}" if np.isfinite(regression) else "not enough windows"
 
 
-def drawn(found: Forecast, band: Band, grid: Grid) -> Picture:
+def forecast_traces(found: Forecast, band: Band, grid: Grid) -> Picture:
     """Forecasts of half a second, for pictures: (which, time, measured, mean, half)."""
     which, rows = _pictured(grid), _rows_of_traces(grid)
     shown = found.of(which).at(rows)

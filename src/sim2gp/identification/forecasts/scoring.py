@@ -43,7 +43,7 @@ def nll(error: Values, sd: Values) -> Values:
     return np.asarray(0.5 * (error / sd) ** 2 + np.log(sd) + 0.5 * LOG_2PI)
 
 
-def spread(
+def predicted_spread(
     error: Float[np.ndarray, "W R c"],
     draws: Float[np.ndarray, "D W R c"],
     counts: Bool[np.ndarray, "W R c"],
@@ -123,7 +123,7 @@ def supported(sums: Float[np.ndarray, "models units"], rng: np.random.Generator)
     return kept
 
 
-def percent(found: Paired) -> str:
+def format_change(found: Paired) -> str:
     """``-4.1 % [-7.2, -1.0]``."""
     if not math.isfinite(found.change):
         return "ran away"
@@ -145,12 +145,12 @@ def sentence(
         return (
             f"The logs support {what[names[kept]]} ({names[kept]}): on data left out "
             f"it is better than the simulator alone in {found.better} of "
-            f"{found.units} {unit}, CRPS {percent(found)}. The simulator's equations "
-            "lack something that these logs show again and again."
+            f"{found.units} {unit}, CRPS {format_change(found)}. The simulator's "
+            "equations lack something that these logs show again and again."
         )
     best = min(range(1, len(names)), key=lambda k: against[k].change)
     found = against[best]
-    said = f"{names[best]}: CRPS {percent(found)}"
+    said = f"{names[best]}: CRPS {format_change(found)}"
     if found.change < math.inf:
         said += f", better in {found.better} of {found.units} {unit}"
     if found.change >= 0.0:

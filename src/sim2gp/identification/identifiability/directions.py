@@ -22,7 +22,7 @@ _FLAT = math.sqrt(0.5 + 1e-9)  # of the prior's sd: as much as data and prior kn
 _FAR = 20.0  # times the first move
 
 
-def directions(spec: Spectrum) -> list[dict[str, Any]]:
+def describe_directions(spec: Spectrum) -> list[dict[str, Any]]:
     """Text, combination, information (nats) and flatness; the least known first."""
     found = [_dead(spec, int(j)) for j in np.flatnonzero(spec.dead)]
     for block in blocks(spec):

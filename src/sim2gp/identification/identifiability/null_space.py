@@ -26,7 +26,7 @@ from sim2gp.identification.identifiability.spectrum import (
     FisherAt,
     Spectrum,
     null_space,
-    physical,
+    values_and_slopes,
     zero_columns,
 )
 
@@ -39,7 +39,7 @@ _CANDIDATES = 600  # pivot sets tried
 _DEGENERATE = 1e-4  # volume of orthonormal directions, seen in the pivots alone
 
 
-class Point(eqx.Module):
+class NullSpacePoint(eqx.Module):
     """The null space at one virtual vector, in prior sd of every parameter."""
 
     theta: Float[np.ndarray, " p"]
@@ -51,12 +51,12 @@ class Block(eqx.Module):
     """Parameters tied by null directions, seen at the MAP (first) and elsewhere."""
 
     index: np.ndarray
-    points: tuple[Point, ...]
+    points: tuple[NullSpacePoint, ...]
     scale: Float[np.ndarray, " q"]  # physical prior sd, linearised at the MAP
     share: Float[np.ndarray, " q"]  # of each parameter's prior variance that is null
     positive: bool = eqx.field(static=True)
 
-    def basis(self, kind: Kind, point: Point) -> Float[np.ndarray, "q k"]:
+    def basis(self, kind: Kind, point: NullSpacePoint) -> Float[np.ndarray, "q k"]:
         """Orthonormal null directions in scaled coordinates."""
         size = point.slope / self.points[0].slope
         if kind == "log":
@@ -151,12 +151,15 @@ def reduce(
     return best[1]
 
 
-def _block(spec: Spectrum, points: Sequence[Point], index: np.ndarray) -> Block:
+def _block(
+    spec: Spectrum, points: Sequence[NullSpacePoint], index: np.ndarray
+) -> Block:
     free = [spec.parameters.free[j] for j in index]
     positive = all(p.low >= 0.0 or p.map == "log" for p in free)
     positive = positive and all(bool(np.all(x.theta[index] > 0.0)) for x in points)
     seen = tuple(
-        Point(x.theta[index], x.slope[index], _range(x.null[index])) for x in points
+        NullSpacePoint(x.theta[index], x.slope[index], _range(x.null[index]))
+        for x in points
     )
     scale = (spec.slope * spec.prior_sd)[index]
     return Block(index, seen, scale, np.sum(seen[0].null ** 2, axis=1), positive)
@@ -167,14 +170,14 @@ def _point(
     tt: Float[np.ndarray, " p"],
     A: Float[np.ndarray, "r p"],
     dead: Bool[np.ndarray, " p"],
-) -> Point:
-    theta, slope = physical(spec.parameters, tt)
+) -> NullSpacePoint:
+    theta, slope = values_and_slopes(spec.parameters, tt)
     null = spec.prior_scale @ null_space(A) / spec.prior_sd[:, None]
     # The unit vectors of dead parameters are null too; what remains is without them.
-    return Point(theta, slope, _range(np.where(dead[:, None], 0.0, null)))
+    return NullSpacePoint(theta, slope, _range(np.where(dead[:, None], 0.0, null)))
 
 
-def _elsewhere(spec: Spectrum, fisher_at: FisherAt, k: int) -> list[Point]:
+def _elsewhere(spec: Spectrum, fisher_at: FisherAt, k: int) -> list[NullSpacePoint]:
     """Points around the MAP where the simulation is finite and as blind as there."""
     normal = np.random.default_rng(0).standard_normal((_POINTS, len(spec.mean)))
     points = []

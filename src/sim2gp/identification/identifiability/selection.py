@@ -26,7 +26,10 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Array, Float
 
-from sim2gp.identification.identifiability.spectrum import physical, virtual_columns
+from sim2gp.identification.identifiability.spectrum import (
+    values_and_slopes,
+    virtual_columns,
+)
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.least_squares import over, stack
 from sim2gp.inference.parameters import Parameters
@@ -80,7 +83,7 @@ def select_parameters(
     kept, held = rest[order[:open_]], rest[order[open_:]]
     left = _left(J)
     after = _left(J[:, np.concatenate([kept, first])])[:open_]
-    _, slope = physical(parameters, np.asarray(prior.mean))
+    _, slope = values_and_slopes(parameters, np.asarray(prior.mean))
     size = slope * sd
     stands_for: dict[str, dict[str, float]] = {}
     for i, j in np.argwhere(np.abs(C) > MOVED * after[:, None]):

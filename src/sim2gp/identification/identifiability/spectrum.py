@@ -100,7 +100,7 @@ def spectrum(
     weights = np.linalg.solve(L0.T, V) * np.sqrt(np.sum(L0**2, axis=1))[:, None]
     V = V * np.where(_largest(weights) < 0.0, -1.0, 1.0)
     tt = np.asarray(posterior.mean if at is None else at)
-    theta, slope = physical(parameters, tt)
+    theta, slope = values_and_slopes(parameters, tt)
     return Spectrum(
         parameters,
         np.asarray(prior.mean),
@@ -120,7 +120,7 @@ def spectrum(
     )
 
 
-def physical(
+def values_and_slopes(
     parameters: Parameters, tt: Float[np.ndarray, " p"]
 ) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
     """Physical values and their slopes ``dtheta/dtt``."""

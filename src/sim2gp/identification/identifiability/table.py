@@ -43,7 +43,7 @@ _NODES, _SPAN = 4001, 12.0
 _UPPER = 1.959963984540054  # standard normal quantile of .975
 
 
-def parameter_table(spec: Spectrum) -> dict[str, dict[str, Any]]:
+def parameter_entries(spec: Spectrum) -> dict[str, dict[str, Any]]:
     """One entry per free parameter, as summary.json and the report want it."""
     table = spec.parameters
     prior = physical_moments(table, spec.prior_mean, spec.prior_sd)

@@ -171,7 +171,7 @@ def _averaged(
     return mean, scale, 1.0 - float(weights[0])
 
 
-def words(found: Corrected, widened: Sequence[float], windows: int) -> str:
+def describe_intervals(found: Corrected, widened: Sequence[float], windows: int) -> str:
     """Which intervals these are and why, in some sentences."""
     if not found.enough:
         return (

@@ -26,7 +26,7 @@ def told_intervals(
     widened = [entry["widened"] or 1.0 for entry in parameters.values()]
     return {
         "which": "corrected" if honest.enough else "plain",
-        "text": intervals.words(honest, widened, windows),
+        "text": intervals.describe_intervals(honest, widened, windows),
         "why": intervals.why(honest, widened, windows),
         "pulls_times_white": math.sqrt(honest.inflation) if honest.enough else None,
         "windows_at_once": honest.lag,

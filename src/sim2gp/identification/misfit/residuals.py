@@ -44,7 +44,7 @@ def misfit_of_transitions(
     states = system.physical_states
     return misfit(
         r / sd,
-        np.concatenate([encoded(s[:, : len(states)], states), a], axis=1),
+        np.concatenate([encode_angles(s[:, : len(states)], states), a], axis=1),
         jacobian=J / sd[:, None],
         past=earlier(a, episode),
         group=episode,
@@ -73,7 +73,7 @@ def misfit_of_windows(likelihood: WindowsLikelihood, fitted: Estimate) -> Misfit
     states = system.physical_states
     return misfit(
         (r * scale)[kept],
-        np.concatenate([encoded(s, states), a], axis=1)[kept],
+        np.concatenate([encode_angles(s, states), a], axis=1)[kept],
         jacobian=J[..., :p],
         nuisance=J[..., p:] if free else None,
         group=group,
@@ -83,7 +83,7 @@ def misfit_of_windows(likelihood: WindowsLikelihood, fitted: Estimate) -> Misfit
     )
 
 
-def encoded(
+def encode_angles(
     x: Float[np.ndarray, "N n"], channels: tuple[Channel, ...]
 ) -> Float[np.ndarray, "N k"]:
     """The columns, angles as sine and cosine."""

@@ -31,7 +31,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.special import chdtrc, fdtrc, gammaincc
 
 from sim2gp.errors import NotFinite
-from sim2gp.identification.misfit.words import Finding, found, verdict
+from sim2gp.identification.misfit.words import Finding, make_finding, misfit_verdict
 
 LEVEL = 1e-3
 LAGS = 20
@@ -115,13 +115,13 @@ def misfit(
     stated = Projected(r, J, own, run, valid)
     scaled = stated.in_units_of(stated.rms())
     tests = {
-        "chi2": found("chi2", *_chi2(stated, noise_known), LEVEL),
-        "ljung_box": found("ljung_box", *_ljung_box(scaled, names), LEVEL),
-        "f_test": found("f_test", *_f_test(scaled, x, extra, names), LEVEL),
-        "split_half": found("split_half", *_split_half(scaled, x), LEVEL),
+        "chi2": make_finding("chi2", *_chi2(stated, noise_known), LEVEL),
+        "ljung_box": make_finding("ljung_box", *_ljung_box(scaled, names), LEVEL),
+        "f_test": make_finding("f_test", *_f_test(scaled, x, extra, names), LEVEL),
+        "split_half": make_finding("split_half", *_split_half(scaled, x), LEVEL),
     }
     count = int(used.sum())
-    return Misfit(tests, verdict(tests, count, rows), count)
+    return Misfit(tests, misfit_verdict(tests, count, rows), count)
 
 
 class Projected:

@@ -39,7 +39,7 @@ class Finding:
         return exist | about
 
 
-def found(
+def make_finding(
     test: str,
     statistic: float,
     freedom: int,
@@ -129,7 +129,7 @@ _SHORT = {
 }
 
 
-def verdict(tests: Mapping[str, Finding], count: int, rows: str) -> str:
+def misfit_verdict(tests: Mapping[str, Finding], count: int, rows: str) -> str:
     """All of it in a sentence or two; of the alarms, the most telling one."""
     if all(math.isnan(finding.p) for finding in tests.values()):
         return f"{count} {rows} are too few to test the model on."

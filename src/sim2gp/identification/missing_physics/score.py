@@ -69,7 +69,7 @@ class Scored:
 
 
 @in_float64
-def score(
+def score_candidates(
     data: AbstractData, bare: Estimate, candidates: Sequence[Candidate]
 ) -> list[Scored]:
     """Every candidate by its linearisation at the bare machine's MAP."""
@@ -103,7 +103,8 @@ def score(
         own = [system.parameters.names.index(name) for name in order]
         fits = [linear(b, x) for b, x in zip(found, z[:, own], strict=True)]
         gains = [
-            tempered(f.evidence - without.evidence, f.inflation, f.sd) for f in fits
+            tempered_gain(f.evidence - without.evidence, f.inflation, f.sd)
+            for f in fits
         ]
         ranked = np.argsort(-np.asarray(gains), kind="stable")
         steps = np.stack([fit.z for fit in fits])[ranked]
@@ -153,7 +154,7 @@ def _linear(
     )
     root = np.asarray(found.posterior.scale)
     row = root @ root[-1]
-    inflation = inflation_of(np.asarray(found.scores), data.cluster, row, -1)
+    inflation = sandwich_inflation(np.asarray(found.scores), data.cluster, row, -1)
     z = np.array(found.posterior.mean)
     return _Linear(float(found.log_evidence), z, math.sqrt(row[-1]), inflation)
 
@@ -199,7 +200,7 @@ def sine_to(
     return float(np.linalg.norm(column / length - others / size @ share)), share
 
 
-def inflation_of(
+def sandwich_inflation(
     scores: Float[np.ndarray, "W p"],
     cluster: Int[np.ndarray, " W"],
     row: Float[np.ndarray, " p"],
@@ -220,7 +221,7 @@ def inflation_of(
     return max(1.0, lost * float(np.sum((each @ row) ** 2) / row[j]))
 
 
-def tempered(gain: float, inflation: float, sd: float) -> float:
+def tempered_gain(gain: float, inflation: float, sd: float) -> float:
     """The gain in evidence when the data count for less by ``inflation`` (k).
 
     With the magnitude's ``sd`` in prior sd, the data's information is

@@ -1,8 +1,8 @@
 """What physics is missing: every effect of a library scored, the best few fitted.
 
-The score tests (`score`) rank by one linearisation; the best are fitted in earnest. An
-effect whose column lies in the span of the machine's own constants can never be told
-from them and is not ranked.
+The score tests (`score_candidates`) rank by one linearisation; then the best are
+fitted. An effect whose column lies in the span of the machine's own constants can never
+be told from them and is not ranked.
 """
 
 import math
@@ -15,9 +15,9 @@ from sim2gp.errors import NotConverged, NotFinite
 from sim2gp.identification.missing_physics.data import AbstractData
 from sim2gp.identification.missing_physics.score import (
     Scored,
-    inflation_of,
-    score,
-    tempered,
+    sandwich_inflation,
+    score_candidates,
+    tempered_gain,
     widened,
 )
 from sim2gp.inference.estimate import Estimate
@@ -51,7 +51,7 @@ class Refitted:
 
 
 @dataclass(frozen=True)
-class Search:
+class CandidateSearch:
     """Everything that was tried; refits by falling gain."""
 
     bare: Estimate
@@ -92,14 +92,14 @@ Fits = Callable[
 
 
 @in_float64
-def search(
+def search_candidates(
     data: AbstractData,
     candidates: Sequence[Candidate] | None = None,
     *,
     refits: int = REFITS,
     fits: Fits | None = None,
     on_step: Callable[[str], None] = lambda _: None,
-) -> Search:
+) -> CandidateSearch:
     """Fit the bare machine, score every candidate, fit the best few.
 
     ``fits`` replaces the loop over these, as processes do. Raises what the fit of the
@@ -109,7 +109,7 @@ def search(
         candidates = registered(data.system, windows=not data.period)
     bare = data.fit()
     on_step("the machine as it is")
-    scored = score(data, bare, candidates)
+    scored = score_candidates(data, bare, candidates)
     ranked = sorted((s for s in scored if not s.alias), key=lambda s: -s.gain)
     on_step(f"{len(scored)} effects scored")
     found, failed = [], []
@@ -122,7 +122,7 @@ def search(
     rank = {one.candidate.name: k for k, one in enumerate(ranked)}  # not who was first
     failed.sort(key=lambda name: rank[name])
     found.sort(key=lambda fit: (-fit.gain, rank[fit.scored.candidate.name]))
-    return Search(bare, tuple(scored), tuple(found), tuple(failed))
+    return CandidateSearch(bare, tuple(scored), tuple(found), tuple(failed))
 
 
 def _in_turn(
@@ -148,11 +148,11 @@ def _refit(data: AbstractData, bare: Estimate, scored: Scored) -> Refitted:
     middle = table[name].constrain(float(mean[j]))
     ends = [table[name].constrain(float(mean[j]) + k * sd) for k in (-1.0, 1.0)]
     white = np.linalg.solve(fitted.prior.scale, fitted.posterior.scale)
-    inflation = inflation_of(
+    inflation = sandwich_inflation(
         np.asarray(fitted.scores), data.cluster, white @ white[j], j
     )
     raw = float(fitted.log_evidence - bare.log_evidence)
     relative = sd / table[name].sd
-    gain = tempered(raw, inflation, relative)
+    gain = tempered_gain(raw, inflation, relative)
     half = 0.5 * (ends[1] - ends[0]) * widened(inflation, relative)
     return Refitted(scored, fitted, gain, middle, half, inflation)

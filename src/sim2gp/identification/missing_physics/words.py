@@ -72,7 +72,7 @@ def _verdict(s: Scored, refit: Refitted | None, found: Explanation) -> str:
     return "no evidence"
 
 
-def headline(found: Explanation) -> str:
+def missing_physics_headline(found: Explanation) -> str:
     """The answer in one or two sentences."""
     best, tests = found.search.best, found.best
     reasons = _reasons(tests)
@@ -123,7 +123,9 @@ def _reasons(tests: Misfit | None) -> str:
     return " ".join(t.text for t in tests.tests.values() if t.alarm)
 
 
-def table(found: Explanation, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def candidate_table(
+    found: Explanation, rows: Sequence[Mapping[str, Any]]
+) -> dict[str, Any]:
     """Candidates by evidence."""
     cells = [
         [
