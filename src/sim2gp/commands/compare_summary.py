@@ -13,6 +13,7 @@ from sim2gp.identification.forecasts import scoring
 from sim2gp.identification.forecasts.baselines import compared, forecast_sentence
 from sim2gp.identification.forecasts.prediction import recording_names
 from sim2gp.identification.forecasts.scoring import Paired
+from sim2gp.identification.words import finite_or_none
 
 FEWEST = 4  # recordings that a bootstrap can draw from; of fewer, seconds are drawn
 STRETCH = 1.0  # s
@@ -86,7 +87,7 @@ def summarise(
     for k, name in enumerate(models):
         entries[name] = _entry(table, k, at, horizons, channels)
         entries[name] |= _relative(against[k])
-        entries[name]["step_log_score"] = _plain(held.step_score[k])
+        entries[name]["step_log_score"] = finite_or_none(held.step_score[k])
     tables = [
         _by_horizon(held, crps, table, i, f"{h:g}", models, channels, unit, words, rng)
         for i, h in zip(at, horizons, strict=True)
@@ -169,7 +170,7 @@ def _entry(
     """Scores of one model: at the first horizon on top, and at all."""
 
     def named(values: np.ndarray) -> dict[str, float | None]:
-        return dict(zip(channels, map(_plain, values), strict=True))
+        return dict(zip(channels, map(finite_or_none, values), strict=True))
 
     return {
         "log_evidence": None,
@@ -190,9 +191,9 @@ def _entry(
 
 def _relative(found: Paired) -> dict[str, Any]:
     return {
-        "crps_change": _plain(found.change),
-        "crps_change_low": _plain(found.low),
-        "crps_change_high": _plain(found.high),
+        "crps_change": finite_or_none(found.change),
+        "crps_change_low": finite_or_none(found.low),
+        "crps_change_high": finite_or_none(found.high),
         "better_in": found.better,
         "of": found.units,
     }
@@ -270,10 +271,6 @@ def _by_log(
         ],
         "note": "Below the simulator's column: the model foretold this log better.",
     }
-
-
-def _plain(x: float) -> float | None:
-    return float(x) if math.isfinite(x) else None
 
 
 def _figure(x: float, how: str, missing: str = "ran away") -> str:

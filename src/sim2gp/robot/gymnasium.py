@@ -46,8 +46,8 @@ def register() -> None:
         if known not in gymnasium.registry:
             gymnasium.register(
                 known,
-                entry_point=f"{__name__}:environment",
-                vector_entry_point=f"{__name__}_vector:environments",
+                entry_point=f"{__name__}:make_environment",
+                vector_entry_point=f"{__name__}_vector:make_environments",
                 max_episode_steps=Task.horizon,
                 kwargs={"machine": machine},
             )

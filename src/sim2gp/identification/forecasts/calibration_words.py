@@ -4,11 +4,13 @@ Bands fail where the share inside leaves the simultaneous band about its level. 
 the factor is what the half-width would have to be multiplied with to hold its share.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+
+from sim2gp.identification.words import listed
 
 NARROW, WIDE, BOTH = "too narrow", "too wide", "wrong shape"
 PASSED, UNKNOWN = "not contradicted", "too few to say"
@@ -96,7 +98,7 @@ def describe_calibration(
         which, wide = by[PASSED], max(half[c, middle] for c in by[PASSED])
         low, high = max(0.5 - wide, 0.0), min(0.5 + wide, 1.0)
         texts.append(
-            f"{_listed([names[c] for c in which])}: {blocks} contradict no level from "
+            f"{listed([names[c] for c in which])}: {blocks} contradict no level from "
             f"{_percent(levels[0])} to {_percent(levels[-1])} %; so few cannot tell a "
             f"50 % band from one that holds {_percent(low)} or {_percent(high)} %."
         )
@@ -105,7 +107,7 @@ def describe_calibration(
     if UNKNOWN in by:
         counts = [channels[names[c]]["blocks"] for c in by[UNKNOWN]]
         texts.append(
-            f"{_listed([names[c] for c in by[UNKNOWN]])}: too few to say whether the "
+            f"{listed([names[c] for c in by[UNKNOWN]])}: too few to say whether the "
             f"bands are right: {min(counts)} independent blocks of windows ({blocks}), "
             f"{fewest} are needed."
         )
@@ -133,7 +135,3 @@ def _failing(found: Mapping[str, Any]) -> str:
 
 def _percent(share: float) -> str:
     return f"{100.0 * share:.0f}"
-
-
-def _listed(names: Sequence[str]) -> str:
-    return " and ".join([", ".join(names[:-1]), names[-1]] if names[1:] else names)

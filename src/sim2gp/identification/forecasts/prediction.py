@@ -17,6 +17,7 @@ from sim2gp.data.logs import Log
 from sim2gp.data.windows import Windows
 from sim2gp.identification.forecasts.baselines import compared, loss_sentence
 from sim2gp.identification.forecasts.forecast import Band, Forecast, forecast_windows
+from sim2gp.identification.forecasts.scoring import masked_mean
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.systems.base import AbstractSystem
 
@@ -123,7 +124,7 @@ def forecast_scores(
     model, hold, regression = (_rms(x, found.valid) for x in each)
     share90 = _share(found.inside90, found.valid)
     share95 = _share(found.inside95, found.valid)
-    nll = _mean(-found.log_prob, found.valid)
+    nll = masked_mean(-found.log_prob, found.valid)
 
     def named(values: np.ndarray) -> dict[str, float]:
         return dict(zip(names, map(float, values), strict=True))
@@ -320,15 +321,9 @@ def _flat(x: np.ndarray) -> np.ndarray:
     return np.concatenate([x, gap], axis=1).ravel()
 
 
-def _mean(x: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    count = valid.sum(axis=0)
-    total = np.sum(np.where(valid, x, 0.0), axis=0)
-    return np.asarray(total / np.where(count > 0, count, 1))
-
-
 def _rms(x: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    return np.sqrt(_mean(x**2, valid))
+    return np.sqrt(masked_mean(x**2, valid))
 
 
 def _share(inside: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    return _mean(inside.astype(float), valid)
+    return masked_mean(inside.astype(float), valid)

@@ -86,7 +86,7 @@ def by_unit(
 
     A step and channel is measured in the first model's mean CRPS there.
     """
-    reference = _mean(score[0], valid)
+    reference = masked_mean(score[0], valid)
     relative = np.where(valid, score / np.where(reference > 0.0, reference, 1.0), 0.0)
     weight = 1.0 / np.maximum(valid.sum(axis=0), 1)
     per_window = np.sum(relative * weight, axis=(2, 3))
@@ -164,6 +164,7 @@ def sentence(
     )
 
 
-def _mean(x: np.ndarray, valid: np.ndarray) -> np.ndarray:
+def masked_mean(x: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """The mean over windows of the valid entries; 0 where there is none."""
     total = np.sum(np.where(valid, x, 0.0), axis=0)
     return np.asarray(total / np.maximum(valid.sum(axis=0), 1))
