@@ -27,7 +27,7 @@ from sim2gp.data.logs import Log
 from sim2gp.data.split_log import cut
 from sim2gp.experiment_design import (
     AbstractCommandSignal,
-    Everything,
+    DOptimal,
     Experiment,
     FreeCommands,
     LimitBox,
@@ -44,7 +44,7 @@ from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.parameters import prior_from_moments
 from sim2gp.runs.cells import Cells, Old, add_options
 from sim2gp.runs.workers import cores, spread
-from sim2gp.studies.claims import of_median
+from sim2gp.studies.claims import bootstrap_median
 from sim2gp.systems import TwoLink
 from sim2gp.types import in_float64
 
@@ -149,12 +149,12 @@ def commands(method: str, seed: int, seconds: float) -> np.ndarray:
     if method == "multisine":
         # Optimised at the prior's middle alone.
         found = optimise_commands(
-            experiment, Everything(), limits, sine, key=key, draws=1, starts=STARTS
+            experiment, DOptimal(), limits, sine, key=key, draws=1, starts=STARTS
         )
     else:
         family = free if method == "design free" else sine
         found = optimise_commands(
-            experiment, Everything(), limits, family, key=key, starts=STARTS
+            experiment, DOptimal(), limits, family, key=key, starts=STARTS
         )
     return np.asarray(found.commands)
 
@@ -358,7 +358,9 @@ def lines(found: dict[str, list[Any]]) -> list[str]:
         for other, goal in (("random", OF_RANDOM), ("multisine", OF_MULTISINE)):
             for what in ("constants", "motion"):
                 rng = np.random.default_rng(0)
-                ratio, low, high = of_median(each(ours, what) / each(other, what), rng)
+                ratio, low, high = bootstrap_median(
+                    each(ours, what) / each(other, what), rng
+                )
                 verdict = "holds" if ratio <= goal else "does not hold"
                 out.append(
                     f"{ours}: error of the {what} at most {goal:g} of {other}'s: "

@@ -18,7 +18,7 @@ from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.forecasts.prediction import (
     channels,
-    predicted,
+    forecast_grid,
     recording_names,
 )
 from sim2gp.identification.intervals.discrepancy import corrected_windows
@@ -48,7 +48,7 @@ def compare(path: Path) -> list[str]:
     grid = evaluation_windows(others, system, longest=CURVE[-1])
     lines = []
     for name, posterior in (("MAP", belief.posterior), ("corrected mean", wide)):
-        found = predicted(system, posterior, grid, HORIZONS[0])
+        found = forecast_grid(system, posterior, grid, HORIZONS[0])
         for horizon in HORIZONS:
             errors = found.at(np.asarray([steps_of(horizon)])).rmse()[0]
             each = zip(channels(system, windows), errors, strict=True)

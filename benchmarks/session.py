@@ -39,7 +39,7 @@ from design import (
 from sim2gp.commands.design import expectation
 from sim2gp.data.logs import Log
 from sim2gp.experiment_design import (
-    Everything,
+    DOptimal,
     FreeCommands,
     MultisineCommands,
     optimise_commands,
@@ -48,7 +48,7 @@ from sim2gp.experiment_design.verdict import DesignOptions, experiment_verdict
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.runs.cells import Cells, Old, add_options
 from sim2gp.runs.workers import cores, spread
-from sim2gp.studies.claims import of_median
+from sim2gp.studies.claims import bootstrap_median
 from sim2gp.types import in_float64
 
 SECONDS = 10.0
@@ -97,7 +97,7 @@ def session(seed: int, rounds: int) -> tuple[dict[str, Any], list[np.ndarray]]:
         now = eqx.tree_at(lambda e: e.belief, experiment, belief)
         key = jax.random.key(100 * seed + len(logs))
         found = optimise_commands(
-            now, Everything(), limits, signal, key=key, starts=STARTS
+            now, DOptimal(), limits, signal, key=key, starts=STARTS
         )
         worth, said = experiment_verdict(ASKED, expectation(now, found), found.nats)
         stopped = not worth
@@ -115,7 +115,7 @@ def tuned() -> np.ndarray:
     experiment, limits = setting(SECONDS)
     signal, key = MultisineCommands(PERIOD, experiment.steps), jax.random.key(0)
     found = optimise_commands(
-        experiment, Everything(), limits, signal, key=key, draws=1, starts=STARTS
+        experiment, DOptimal(), limits, signal, key=key, draws=1, starts=STARTS
     )
     return found.commands
 
@@ -190,7 +190,7 @@ def lines(rows: list[dict[str, Any]]) -> list[str]:
         errors = f"{each[0]:12.2e}{each[1]:26.2e}{each[2]:24.2e}"
         out.append(f"{i:<4d}{len(row['errors']):6d}{errors}")
     each = np.asarray([error(r, "session") / error(r, "more") for r in rows])
-    middle, low, high = of_median(each, np.random.default_rng(0))
+    middle, low, high = bootstrap_median(each, np.random.default_rng(0))
     held = "holds" if middle <= 1.0 else "does not hold"
     stopped = sum(row["stopped"] for row in rows)
     seconds = SECONDS * np.median([len(row["errors"]) for row in rows])

@@ -15,7 +15,7 @@ from mass_task import GainModel, mass_task, single
 from sim2gp import checks
 from sim2gp import systems as sy
 from sim2gp.data.grid import evaluation_windows
-from sim2gp.experiment_design.goals import Everything
+from sim2gp.experiment_design.goals import DOptimal
 from sim2gp.experiment_design.search import optimise_commands
 from sim2gp.experiment_design.signals import FreeCommands
 from sim2gp.experiment_design.signals import MultisineCommands as Sines
@@ -68,7 +68,7 @@ def cut(**options):
 def searched(**options):
     plan = experiment()
     boxes, signal = limits(plan.system), FreeCommands(0.01, 200)
-    return optimise_commands(plan, Everything(), boxes, signal, key=KEY, **options)
+    return optimise_commands(plan, DOptimal(), boxes, signal, key=KEY, **options)
 
 
 def sim(**options):

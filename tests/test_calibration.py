@@ -13,20 +13,20 @@ from sim2gp.identification.forecasts.calibration import (
     calibrate_forecasts,
     half_widths,
 )
-from sim2gp.identification.forecasts.prediction import Judged
+from sim2gp.identification.forecasts.prediction import ScoredForecasts
 
 HORIZON = 0.5  # s; windows start every 0.1 s, so that five of them overlap
 NAMES = ("q1", "q2")
 
 
-def judged(z: np.ndarray, log: np.ndarray | None = None) -> Judged:
+def judged(z: np.ndarray, log: np.ndarray | None = None) -> ScoredForecasts:
     """Forecasts at the horizons .1 and .5 s whose standardised errors are ``z``."""
     both = np.stack([0.0 * z, z], axis=1)
     valid = np.isfinite(both)
     none = np.zeros_like(both)
     scale = np.full_like(both, 0.2)
     of = np.zeros(len(z), int) if log is None else log
-    return Judged(
+    return ScoredForecasts(
         np.array([50, 250]), valid, 0.2 * np.where(valid, both, 0.0), scale, none, none,
         none, of, valid, valid,
     )  # fmt: skip

@@ -38,13 +38,13 @@ def test_a_medians_interval_is_its_exact_bootstrap(lost: int):
     cumulative = np.cumsum(shares)
     low, high = (values[np.searchsorted(cumulative, t)] for t in (0.025, 0.975))
     values[count - lost :] = np.inf  # seeds that never got there
-    middle, below, above = claims.of_median(values[::-1], rng())
+    middle, below, above = claims.bootstrap_median(values[::-1], rng())
     assert (middle, below) == (11.0, low)
     assert above == (np.inf if lost else high)
 
 
 def test_every_resample_has_as_many_seeds():
-    weights = claims.resampled(7, rng())
+    weights = claims.bootstrap_weights(7, rng())
     np.testing.assert_array_equal(weights.sum(axis=1), 7.0)
     assert weights.mean(axis=0) == pytest.approx(np.ones(7), abs=0.05)
     assert weights.var(axis=0) == pytest.approx(np.full(7, 6 / 7), abs=0.08)

@@ -26,7 +26,7 @@ from sim2gp.data.split_log import cut
 from sim2gp.data.windows_likelihood import WindowsLikelihood, information_at
 from sim2gp.errors import InputError
 from sim2gp.experiment_design import by_gradients
-from sim2gp.experiment_design.limits import excess, kept
+from sim2gp.experiment_design.limits import clip_commands, excess
 from sim2gp.inference.arrowhead import Noise
 from simulated_logs import pendulum
 
@@ -101,20 +101,20 @@ def test_goals_are_those_of_dense_covariances() -> None:
     def volume(C: np.ndarray) -> float:
         return 0.5 * float(np.linalg.slogdet(C)[1])
 
-    assert nats(d.Everything()) == pytest.approx(volume(C0) - volume(C1), rel=1e-10)
+    assert nats(d.DOptimal()) == pytest.approx(volume(C0) - volume(C1), rel=1e-10)
     some = np.ix_([2, 0], [2, 0])
     expected = volume(C0[some]) - volume(C1[some])
-    assert nats(d.Named((2, 0))) == pytest.approx(expected, rel=1e-10)
+    assert nats(d.SubsetDOptimal((2, 0))) == pytest.approx(expected, rel=1e-10)
     G = rng.standard_normal((5, 4))
     ratio = np.trace(G @ C0 @ G.T) / np.trace(G @ C1 @ G.T)
-    goal = d.Prediction(jnp.asarray(G))
+    goal = d.VOptimal(jnp.asarray(G))
     assert nats(goal) == pytest.approx(0.5 * np.log(ratio), rel=1e-10)
 
 
 def test_goals_count_their_directions() -> None:
     """All sd smaller by one factor are worth its log, once for each direction."""
     scale = jnp.asarray(np.random.default_rng(0).standard_normal((4, 4)))
-    goals = (d.Everything(), d.Named((2, 0)), d.Prediction(scale[:3]))
+    goals = (d.DOptimal(), d.SubsetDOptimal((2, 0)), d.VOptimal(scale[:3]))
     for goal, count in zip(goals, (4, 2, 1), strict=True):
         assert goal.directions(scale) == count
         worth = float(goal.nats(scale, scale / 1.7))
@@ -197,7 +197,7 @@ def test_random_motions_have_sd_one() -> None:
 
 def test_rates_are_followed_by_the_nearest_command() -> None:
     box = limits(pendulum(), {}, {"voltage": 100.0})
-    U = kept(box, jnp.full((4, 1), 2.5), PERIOD)
+    U = clip_commands(box, jnp.full((4, 1), 2.5), PERIOD)
     np.testing.assert_allclose(U[:, 0], [1.0, 2.0, 2.5, 2.5])
 
 

@@ -67,7 +67,7 @@ def test_worth_is_that_of_the_definition() -> None:
     np.testing.assert_allclose(found, states, rtol=0.0, atol=1e-9)
     A = d.information(experiment, jnp.asarray(z), U, states)
     scale = d.posterior_scale(experiment.belief, A)
-    goal = d.Everything()
+    goal = d.DOptimal()
     nats, told = by_samples.worth_at(experiment, goal, z, np.asarray(U))
     expected = goal.nats(experiment.belief.scale, scale)
     assert nats == pytest.approx(float(expected), rel=1e-6)
@@ -84,7 +84,7 @@ def test_the_search_keeps_its_limits_and_beats_random_motions(
     for name, value in {"ROUNDS": 3, "SAMPLES": 8, "ELITES": 3, "CHECKED": 60}.items():
         monkeypatch.setattr(by_samples, name, value)
     experiment = experiment_with()
-    box, goal, key = box_of(experiment), d.Everything(), jax.random.key(0)
+    box, goal, key = box_of(experiment), d.DOptimal(), jax.random.key(0)
     signal, p = d.MultisineCommands(PERIOD, STEPS), experiment.belief.mean.size
     best = d.optimise_commands(experiment, goal, box, signal, key=key, draws=2)
     assert best.violations <= search.ALLOWED

@@ -14,15 +14,15 @@ from sim2gp import systems as sy
 from sim2gp.identification.missing_physics.data import OneStepData
 from sim2gp.identification.missing_physics.explain import find_missing_physics
 from sim2gp.identification.missing_physics.score import (
-    Scored,
+    ScoredCandidate,
     sandwich_inflation,
     score_candidates,
+    sd_widening,
     tempered_gain,
-    widened,
 )
 from sim2gp.identification.missing_physics.search import (
     CandidateSearch,
-    Refitted,
+    FittedCandidate,
     search_candidates,
 )
 from sim2gp.identification.missing_physics.words import (
@@ -156,7 +156,7 @@ def test_tempered_gain_is_that_of_so_many_rows(m: float, k: float) -> None:
     N = 300.0
     sd = 1.0 / math.sqrt(N + 1.0)
     assert tempered_gain(gain(N), k, sd) == pytest.approx(gain(N / k), rel=1e-12)
-    assert widened(k, sd) * sd == pytest.approx(1.0 / math.sqrt(N / k + 1.0))
+    assert sd_widening(k, sd) * sd == pytest.approx(1.0 / math.sqrt(N / k + 1.0))
     assert tempered_gain(math.nan, k, sd) == -math.inf
 
 
@@ -170,8 +170,8 @@ def found_with(*refits: tuple[str, float, float, int]) -> CandidateSearch:
     made = []
     for where, gain, value, sign in refits:
         candidate = sy.Candidate(sy.Spring(where, 1.0), sign=sign)
-        scored = Scored(candidate, system, gain, 1.0, (), np.zeros((1, 8)))
-        made.append(Refitted(scored, bare, gain, value, 0.1, 1.0))
+        scored = ScoredCandidate(candidate, system, gain, 1.0, (), np.zeros((1, 8)))
+        made.append(FittedCandidate(scored, bare, gain, value, 0.1, 1.0))
     return CandidateSearch(bare, tuple(r.scored for r in made), tuple(made))
 
 

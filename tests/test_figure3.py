@@ -31,12 +31,12 @@ def test_transitions_needed_by_hand():
     rmse = 10.0 / (250.0 * np.arange(1, 4))
     for count in (30.0, 100.0, 180.0, 250.0, 600.0, 750.0):
         error = 10.0 / count * (1.0 + 1e-12)
-        assert figure3.needed(early, rmse, error) == pytest.approx(count)
-    assert figure3.needed(early, rmse, 1.0) == 25.0
-    assert figure3.needed(early, rmse, 1e-3) == np.inf
+        assert figure3.transitions_needed(early, rmse, error) == pytest.approx(count)
+    assert figure3.transitions_needed(early, rmse, 1.0) == 25.0
+    assert figure3.transitions_needed(early, rmse, 1e-3) == np.inf
     # A look that failed is passed over.
     early[1, 1] = np.nan
-    assert figure3.needed(early, rmse, 0.1) == pytest.approx(100.0)
+    assert figure3.transitions_needed(early, rmse, 0.1) == pytest.approx(100.0)
 
 
 def planted(best: str, times: float):

@@ -16,9 +16,9 @@ from sim2gp.data.logs import Log
 from sim2gp.data.split_log import cut
 from sim2gp.identification.forecasts.forecast import Band, Forecast
 from sim2gp.identification.forecasts.prediction import (
+    forecast_grid,
     forecast_traces,
-    predicted,
-    rows_for,
+    scored_rows,
     trace_arrays,
 )
 from sim2gp.project import load_project
@@ -86,7 +86,7 @@ def test_neither_fit_nor_band_sees_what_is_held_out(
         return SimpleNamespace(posterior=None)
 
     def forecasts(system: Any, posterior: Any, grid: Any, horizon: float) -> Any:
-        rows = rows_for(horizon)
+        rows = scored_rows(horizon)
         valid = np.asarray(grid.windows.mask)[:, rows]
         none = np.zeros(valid.shape)
         slopes = [np.zeros((*valid.shape, k)) for k in (4, 1)]
@@ -129,7 +129,7 @@ def test_windows_too_short_to_be_drawn_are_not() -> None:
     one = np.ones(2)
     band = Band(np.ones(4), np.ones(1), one, np.array([0.0]), one[None], 1.0)
     prior = CartPole().parameters.prior()
-    found = predicted(CartPole(), prior, grid, 0.1)
+    found = forecast_grid(CartPole(), prior, grid, 0.1)
     picture = forecast_traces(found, band, grid)
     assert trace_arrays(picture, grid, short, ["x", "theta"]) == {}
     assert film(CartPole(), prior, picture, grid, short, "none") == ({}, {})

@@ -14,7 +14,7 @@ from sim2gp.data.grid import CURVE, evaluation_windows, parabola_slopes, steps_o
 from sim2gp.data.logs import Log
 from sim2gp.identification.forecasts.forecast import (
     Band,
-    _forecast,
+    _forecast_batch,
     compile_forecast,
     fit_band,
     forecast_windows,
@@ -135,7 +135,9 @@ def test_a_forecast_compiled_in_advance_is_the_same(
     plain = forecast_windows(system, belief, grid, rows)
     compile_forecast(system, grid)
     forecast_windows(system, belief, grid, rows)
-    monkeypatch.setattr(_forecast, "_jitted", None)  # nothing is left to compile with
+    monkeypatch.setattr(
+        _forecast_batch, "_jitted", None
+    )  # nothing is left to compile with
     again = forecast_windows(system, belief, grid, rows)
     np.testing.assert_array_equal(again.mean, plain.mean)
     np.testing.assert_array_equal(again.by_constants, plain.by_constants)

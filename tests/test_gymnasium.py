@@ -18,7 +18,13 @@ from sim2gp.planning import AbstractPlanner, World
 from sim2gp.planning.episode import Purpose, key_for, oracle_world, run_episode
 from sim2gp.planning.mpc import from_unit
 from sim2gp.planning.tasks import MACHINES, Task, draw_truth, furuta_swingup
-from sim2gp.robot.gymnasium import NAMES, _kind, make_environment, register, step_task
+from sim2gp.robot.gymnasium import (
+    NAMES,
+    _environment_class,
+    make_environment,
+    register,
+    step_task,
+)
 from sim2gp.systems import Delay, Furuta
 from sim2gp.types import Key, State
 
@@ -266,7 +272,7 @@ def test_a_machine_that_cannot_be_followed_is_an_error() -> None:
 
 
 def test_without_gymnasium_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    _kind.cache_clear()
+    _environment_class.cache_clear()
     monkeypatch.setitem(sys.modules, "gymnasium", None)
     with pytest.raises(InputError, match=r"E135.*sim2gp\[gym\]"):
         make_environment("furuta")

@@ -13,7 +13,7 @@ from scipy.stats import norm
 from descents import minimise, standard
 from sim2gp.errors import InputError
 from sim2gp.identification.exact_posterior.nuts import (
-    Sampled,
+    ChainSummary,
     sample_posterior,
     sampler,
     summarise_chains,
@@ -22,7 +22,7 @@ from sim2gp.inference.arrowhead import Blocks, Noise
 from sim2gp.inference.least_squares import factor
 from sim2gp.inference.likelihood import AbstractLikelihood
 
-GOOD = Sampled(np.zeros(2), np.ones(2), 1.001, 900.0, 0)
+GOOD = ChainSummary(np.zeros(2), np.ones(2), 1.001, 900.0, 0)
 
 
 class Bent(AbstractLikelihood):

@@ -20,7 +20,7 @@ import numpy as np
 
 from sim2gp.belief import AbstractModel
 from sim2gp.commands.compare_setup import Setup, prepare_comparison
-from sim2gp.commands.compare_summary import Held, summarise
+from sim2gp.commands.compare_summary import FoldForecasts, summarise
 from sim2gp.commands.result import AbstractResult
 from sim2gp.data.logs import Log, note_lines
 from sim2gp.data.one_step_log import (
@@ -121,10 +121,10 @@ def compare(
     total = len(folds) * len(models) + 1
     with (progress or Progress()).task("compare", total) as task:
         if workers > 1 and models is MODELS and project.can_be_loaded:
-            parts = _in_processes(jobs, workers, task)
+            parts = _folds_in_processes(jobs, workers, task)
         else:
-            parts = [_fold(setup, job, models, task.advance) for job in jobs]
-        whole = _fit(setup, [], _key(seed, len(folds)))
+            parts = [_run_fold(setup, job, models, task.advance) for job in jobs]
+        whole = _fit_without(setup, [], _fold_key(seed, len(folds)))
         task.advance("evidence")
     names = channels(project.system, setup.windows)
     units = {c.name: c.unit for c in project.system.physical_states}
@@ -164,29 +164,31 @@ class CompareJob(NamedTuple):
     left: list[int]
 
 
-def _in_processes(jobs: Sequence[CompareJob], workers: int, task: Task) -> list[Held]:
+def _folds_in_processes(
+    jobs: Sequence[CompareJob], workers: int, task: Task
+) -> list[FoldForecasts]:
     """The folds, computed as processes are free."""
 
     def done(job: CompareJob) -> None:
         task.advance(f"without {job.logs[job.left[0]].name}", len(MODELS))
 
-    return in_order(_fold_of, jobs, workers, done)
+    return in_order(_fold_in_process, jobs, workers, done)
 
 
-def _fold(
+def _run_fold(
     setup: Setup, job: CompareJob, models: Learners, done: Callable[[str], None]
-) -> Held:
-    return compare_fold(setup, job.left, models, _key(job.seed, job.number), done)
+) -> FoldForecasts:
+    return compare_fold(setup, job.left, models, _fold_key(job.seed, job.number), done)
 
 
-def _key(seed: int, number: int) -> jax.Array:
+def _fold_key(seed: int, number: int) -> jax.Array:
     return jax.random.fold_in(jax.random.key(seed), number)
 
 
-def _fold_of(job: CompareJob) -> Held:
+def _fold_in_process(job: CompareJob) -> FoldForecasts:
     """The same in a process of its own."""
     setup, _ = prepare_comparison(load_project(job.path), job.logs, job.horizons)
-    return _fold(setup, job, MODELS, lambda done: None)
+    return _run_fold(setup, job, MODELS, lambda done: None)
 
 
 def compare_fold(
@@ -195,13 +197,13 @@ def compare_fold(
     models: Learners,
     key: jax.Array,
     done: Callable[[str], None],
-) -> Held:
+) -> FoldForecasts:
     """All models without the logs ``left``, judged on them.
 
     What is left out is masked, not removed, so that folds share their compilations.
     """
     first, *keys = jax.random.split(key, 1 + len(models))
-    belief = _fit(setup, left, first)
+    belief = _fit_without(setup, left, first)
     out = np.isin(setup.samples.step_log(), left)
     test = np.isin(setup.steps.log, left)
     tt = belief.posterior.mean
@@ -233,7 +235,7 @@ def compare_fold(
         sd.append(wide[test])
         steps.append(float(np.mean(np.asarray(log_scores(fitted, held))[out])))
         done(f"{name} without {setup.logs[left[0]].name}")
-    return Held(
+    return FoldForecasts(
         np.stack(error),
         np.stack(sd),
         _trivial(setup, test),
@@ -254,7 +256,7 @@ def _trivial(setup: Setup, test: np.ndarray) -> np.ndarray:
     return np.stack([hold, regression_errors(train, tested, rows)])
 
 
-def _fit(setup: Setup, left: Sequence[int], key: jax.Array) -> Estimate:
+def _fit_without(setup: Setup, left: Sequence[int], key: jax.Array) -> Estimate:
     """The simulator's constants from the windows of all logs but ``left``."""
     mask = np.asarray(setup.windows.mask) & ~np.isin(setup.of, left)[:, None, None]
     kept = eqx.tree_at(lambda w: w.mask, setup.windows, mask)

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from sim2gp.commands.folds import fit_fold, without
+from sim2gp.commands.folds import fit_fold, leave_out
 from sim2gp.commands.identification import Identification
 from sim2gp.commands.result import AbstractResult, numeric_entries
 from sim2gp.data.grid import CURVE, Grid, evaluation_windows, steps_of
@@ -29,16 +29,16 @@ from sim2gp.identification.forecasts.baselines import (
 )
 from sim2gp.identification.forecasts.calibration import calibrate_forecasts
 from sim2gp.identification.forecasts.prediction import (
-    Judged,
+    ScoredForecasts,
     channel_units,
     channels,
+    forecast_grid,
     forecast_scores,
     forecast_traces,
     join_folds,
-    predicted,
     recording_names,
-    rows_for,
     score_forecasts,
+    scored_rows,
     trace_arrays,
 )
 from sim2gp.inference.gaussian import Gaussian
@@ -102,10 +102,10 @@ def evaluate(
         got = "an identification alone"
         raise error("no_logs_to_evaluate", where="logs", got=got)
     assert fit.project is not None
-    return _forecast(fit, as_logs(fit.project, logs), horizon, progress)
+    return _forecast_logs(fit, as_logs(fit.project, logs), horizon, progress)
 
 
-def _forecast(
+def _forecast_logs(
     fit: Identification, tested: Sequence[Log], horizon: float, progress: Progress
 ) -> Evaluation:
     """Logs predicted by a fit of others."""
@@ -114,9 +114,9 @@ def _forecast(
     assert found is not None
     system = found.system
     with progress.task("evaluate", 1) as task:
-        rows, longest = rows_for(horizon), max(horizon, CURVE[-1])
+        rows, longest = scored_rows(horizon), max(horizon, CURVE[-1])
         grid = windows_for(tested, found, longest, horizon)
-        result = predicted(system, fit.plain, grid, horizon)
+        result = forecast_grid(system, fit.plain, grid, horizon)
         train = _training(fit)
         linear = np.full((len(grid.windows), len(rows), len(result.mean[0, 0])), np.nan)
         if train is not None:
@@ -181,8 +181,8 @@ def _leave_one_out(
     )
     jobs = [EvaluateJob(project.path, logs, horizon, left) for left in of_file]
     apart = workers if project.can_be_loaded else 1
-    cut = _cut(project, jobs[0])
-    work = _fold_of if apart > 1 else partial(_fold, project, cut)
+    cut = _cut_for_fold(project, jobs[0])
+    work = _forecast_in_process if apart > 1 else partial(_forecast_fold, project, cut)
     with progress.task("logs", len(jobs)) as task:
         found = in_order(
             work,
@@ -209,18 +209,18 @@ def _leave_one_out(
     return _evaluation(summary, curves | arrays, project, started)
 
 
-def _cut(project: Project, job: EvaluateJob) -> Cut:
+def _cut_for_fold(project: Project, job: EvaluateJob) -> Cut:
     windows, of = cut_logs(project, job.logs)
     longest = max(job.horizon, CURVE[-1])
     return Cut(windows, of, windows_for(job.logs, project, longest, job.horizon))
 
 
-def _fold(
+def _forecast_fold(
     project: Project, cut: Cut, job: EvaluateJob
-) -> tuple[Judged, dict[str, np.ndarray], np.ndarray]:
+) -> tuple[ScoredForecasts, dict[str, np.ndarray], np.ndarray]:
     """Forecasts, traces and parameters of the fit without the logs ``job.left``."""
     windows, of, grid = cut
-    part = without(job.left, job.logs, of, grid)
+    part = leave_out(job.left, job.logs, of, grid)
     # One start: the folds are small changes of one problem.
     key = jax.random.key(0)
     found = fit_fold(project, windows, grid, part, job.horizon, key=key, starts=1)
@@ -230,12 +230,12 @@ def _fold(
     return found.judged, traced, _constrain(project.system, found.posterior)
 
 
-def _fold_of(
+def _forecast_in_process(
     job: EvaluateJob,
-) -> tuple[Judged, dict[str, np.ndarray], np.ndarray]:
+) -> tuple[ScoredForecasts, dict[str, np.ndarray], np.ndarray]:
     """The same in a process of its own."""
     project = load_project(job.path)
-    return _fold(project, _cut(project, job), job)
+    return _forecast_fold(project, _cut_for_fold(project, job), job)
 
 
 @in_float64

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from sim2gp.commands.identification import physical_mode
-from sim2gp.commands.unseen import Unseen, unseen
+from sim2gp.commands.unseen import Unseen, forecast_unseen
 from sim2gp.data.clock import clock_warnings
 from sim2gp.data.grid import CURVE, Grid
 from sim2gp.data.logs import Log, note_lines
@@ -22,18 +22,18 @@ from sim2gp.identification.forecasts.prediction import (
     Picture,
     channel_units,
     channels,
+    forecast_grid,
     forecast_traces,
-    predicted,
     recording_names,
-    rows_for,
-    thinned,
+    scored_rows,
+    thin_windows,
     trace_arrays,
 )
 from sim2gp.identification.intervals.discrepancy import (
     corrected_windows,
 )
-from sim2gp.identification.intervals.scatter import Corrected
-from sim2gp.identification.intervals.words import lacking_table, told_intervals
+from sim2gp.identification.intervals.scatter import CorrectedFit
+from sim2gp.identification.intervals.words import interval_entry, missing_physics_table
 from sim2gp.identification.misfit.residuals import misfit_of_windows
 from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
@@ -55,7 +55,7 @@ def identification_results(
     fitted: Estimate,
     seed: int,
     held_out: bool,
-) -> tuple[dict[str, Any], dict[str, np.ndarray], Corrected]:
+) -> tuple[dict[str, Any], dict[str, np.ndarray], CorrectedFit]:
     """The run's summary and arrays, and the corrected intervals."""
     table, (windows, places) = project.system.parameters, cuts
     band, own = _own_forecasts(project, fitted.posterior, grid, logs)
@@ -63,9 +63,15 @@ def identification_results(
     likelihood = WindowsLikelihood(project.system, windows)
     of = np.asarray([k for k, _ in places])
     honest = corrected_windows(likelihood, known, of)
-    summary = _summarise(project, logs, likelihood, known, honest, band, seed)
+    summary = _identification_summary(
+        project, logs, likelihood, known, honest, band, seed
+    )
     arrays = _stored(table, known, honest.posterior, band, seed)
-    other = unseen(project, logs, windows, places, grid, known) if held_out else None
+    other = (
+        forecast_unseen(project, logs, windows, places, grid, known)
+        if held_out
+        else None
+    )
     said, drawings = _drawings(project, logs, own, other)
     return summary | said, arrays | drawings, honest
 
@@ -79,9 +85,9 @@ def _own_forecasts(
     as long for them as for the fit.
     """
     if simulator_of(project.system) is not None:
-        grid = thinned(grid)
-    found = predicted(project.system, posterior, grid, CURVE[0])
-    rows = rows_for(CURVE[0])[1:]
+        grid = thin_windows(grid)
+    found = forecast_grid(project.system, posterior, grid, CURVE[0])
+    rows = scored_rows(CURVE[0])[1:]
     band = fit_band(found.at(rows), grid, len(set(recording_names(logs))))
     return band, (posterior, forecast_traces(found, band, grid), grid)
 
@@ -112,12 +118,12 @@ def _stored(
     }
 
 
-def _summarise(
+def _identification_summary(
     project: Project,
     logs: Sequence[Log],
     likelihood: WindowsLikelihood,
     fitted: Estimate,
-    honest: Corrected,
+    honest: CorrectedFit,
     band: Band,
     seed: int,
 ) -> dict[str, Any]:
@@ -134,12 +140,12 @@ def _summarise(
     noise = dict(zip(names, np.asarray(fitted.noise.sd).tolist(), strict=True))
     rows = sum(len(log) for log in logs)
     actions = [channel.name for channel in system.actions]
-    about = told_intervals(system, honest, found["parameters"], len(windows))
+    about = interval_entry(system, honest, found["parameters"], len(windows))
     listed = configuration_entries(system, logs, found["parameters"])
-    listed["tables"] = [*lacking_table(about), *listed.get("tables", ())]
+    listed["tables"] = [*missing_physics_table(about), *listed.get("tables", ())]
     return {
         "command": "identify",
-        "title": f"{project.name}: what {_count(logs)}",
+        "title": f"{project.name}: what {_count_of_logs(logs)}",
         "headline": identified_headline(found["parameters"]),
         "seed": seed,
         "converged": True,
@@ -181,7 +187,7 @@ def identified_headline(parameters: dict[str, dict[str, Any]]) -> str:
     )
 
 
-def _count(logs: Sequence[Log]) -> str:
+def _count_of_logs(logs: Sequence[Log]) -> str:
     count = len(set(recording_names(logs)))
     return "one log determines" if count == 1 else f"{count} logs determine"
 

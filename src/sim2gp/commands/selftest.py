@@ -100,7 +100,7 @@ def selftest(*, seed: int = 0, progress: Progress | None = None) -> SelfTest:
     for number, (name, check) in enumerate(CHECKS.items()):
         # Its own stream: a check's figure does not hang on the others.
         found[name] = measure(check, np.random.default_rng([seed, number]))
-        progress.say(_line(name, found[name]))
+        progress.say(_check_line(name, found[name]))
     failed = [name for name, entry in found.items() if entry["result"] != "PASS"]
     summary = {
         "command": "selftest",
@@ -138,7 +138,7 @@ def measure(check: Check, rng: np.random.Generator) -> dict[str, Any]:
     return row | ({"error": error[:200]} if error else {})
 
 
-def _line(name: str, row: dict[str, Any]) -> str:
+def _check_line(name: str, row: dict[str, Any]) -> str:
     figure = "no figure" if row["figure"] is None else f"{row['figure']:.2g}"
     text = f"{row['result']} {name:<12} {figure} (at most {row['limit']:.2g})"
     text += f", {row['seconds']:.1f} s"

@@ -41,7 +41,7 @@ class Unseen(NamedTuple):
     picture: Picture
 
 
-def unseen(
+def forecast_unseen(
     project: Project,
     logs: Sequence[Log],
     windows: Windows,

@@ -69,7 +69,7 @@ def evaluation_windows(
     for k, log in enumerate(logs):
         y, valid = on_grid(log, measured)
         first = _starts(valid)
-        starts, centred = _states(y, states, measured)
+        starts, centred = _start_states(y, states, measured)
         rows = first[:, None] + np.arange(L)[None]
         inside = rows < len(y)
         rows = np.minimum(rows, len(y) - 1)
@@ -164,7 +164,7 @@ def _starts(valid: Bool[np.ndarray, "N c"]) -> Int[np.ndarray, " W"]:
     return first[valid[past].all(axis=(1, 2))]
 
 
-def _states(
+def _start_states(
     y: Float[np.ndarray, "N c"], states: Sequence[str], measured: Sequence[str]
 ) -> tuple[Float[np.ndarray, "N n"], Float[np.ndarray, "N n"]]:
     """Every sample's state as a forecast would start, and its centred estimate."""

@@ -76,7 +76,7 @@ class HostRun:
     ) -> None:
         names = names_on_host(simulator, system)
         given, by = _given_by(names, system, windows, asked)
-        self.inputs, by_delay = _inputs(system, windows, given.delays)
+        self.inputs, by_delay = _delayed_inputs(system, windows, given.delays)
         inputs, of_inputs = self.inputs, by_delay[..., None] * by.delays[:, None]
         if asked.added_by is not None:
             of_inputs += asked.added_by
@@ -120,7 +120,7 @@ def _given_by(
     return given, OnHost(*(J @ asked.tt_by for J in by_tt))
 
 
-def _inputs(
+def _delayed_inputs(
     system: AbstractSystem, windows: Pieces, late: Float[np.ndarray, "W m"]
 ) -> tuple[Float[np.ndarray, "W L m"], Float[np.ndarray, "W L m"]]:
     """The inputs that arrive, and their derivatives in their delays."""

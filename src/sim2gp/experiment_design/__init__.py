@@ -6,9 +6,18 @@ from sim2gp.experiment_design.experiment import (
     posterior_scale,
     trajectory,
 )
-from sim2gp.experiment_design.goals import AbstractGoal, Everything, Named, Prediction
+from sim2gp.experiment_design.goals import (
+    AbstractGoal,
+    DOptimal,
+    SubsetDOptimal,
+    VOptimal,
+)
 from sim2gp.experiment_design.limits import LimitBox
-from sim2gp.experiment_design.search import Designed, optimise_commands, prediction_rows
+from sim2gp.experiment_design.search import (
+    DesignResult,
+    optimise_commands,
+    prediction_rows,
+)
 from sim2gp.experiment_design.signals import (
     AbstractCommandSignal,
     FreeCommands,
@@ -18,14 +27,14 @@ from sim2gp.experiment_design.signals import (
 __all__ = [
     "AbstractCommandSignal",
     "AbstractGoal",
-    "Designed",
-    "Everything",
+    "DOptimal",
+    "DesignResult",
     "Experiment",
     "FreeCommands",
     "LimitBox",
     "MultisineCommands",
-    "Named",
-    "Prediction",
+    "SubsetDOptimal",
+    "VOptimal",
     "information",
     "optimise_commands",
     "posterior_scale",

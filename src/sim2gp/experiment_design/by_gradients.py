@@ -26,7 +26,7 @@ from sim2gp.experiment_design.experiment import (
     trajectory,
 )
 from sim2gp.experiment_design.goals import AbstractGoal
-from sim2gp.experiment_design.limits import LimitBox, all_excess, excess, narrowed
+from sim2gp.experiment_design.limits import LimitBox, all_excess, excess, narrow_limits
 from sim2gp.experiment_design.signals import AbstractCommandSignal
 from sim2gp.experiment_design.ways import SearchPrograms
 from sim2gp.models.training import adamw, descend
@@ -57,11 +57,11 @@ def compiled_programs(
     nothing = jnp.zeros((experiment.steps, limits.low.size))
     rough, coarse = _coarser(experiment, signal)
     improve = _climber(rough, coarse, goal, limits, informed, trials)
-    _checked.compile_for(experiment, limits, nothing, held_out)
+    _plausible_states.compile_for(experiment, limits, nothing, held_out)
     _worth.compile_for(experiment, goal, informed, nothing)
     return SearchPrograms(
         improve,
-        lambda U: _checked(experiment, limits, U, held_out),
+        lambda U: _plausible_states(experiment, limits, U, held_out),
         lambda U: _worth(experiment, goal, informed, U),
     )
 
@@ -96,12 +96,14 @@ def _climber(
     experiment, goal, limits, draws, trials = single(
         (experiment, goal, limits, draws, trials)
     )
-    inner, inputs = narrowed(limits), limits.low.size
+    inner, inputs = narrow_limits(limits), limits.low.size
     costs = goal.directions(experiment.belief.scale) * np.geomspace(CHEAP, COST, BLOCKS)
     total = jnp.asarray(BLOCK * BLOCKS)
 
     def beyond(C: Array) -> Array:
-        return _checked(experiment, inner, signal.commands(C, limits), trials)[1]
+        return _plausible_states(experiment, inner, signal.commands(C, limits), trials)[
+            1
+        ]
 
     def block(C: Array, state: optax.OptState, guards: Array, i: int) -> Any:
         cost, at = jnp.asarray(costs[i], jnp.float32), jnp.asarray(BLOCK * i)
@@ -154,13 +156,13 @@ def _climb(
     total: Array,
 ) -> tuple[Float[Array, "k m"], optax.OptState]:
     """Steps of Adam on the worth at one draw after the other, less what guards pay."""
-    beyond = _beyond_of(experiment, narrowed(limits))
+    beyond = _beyond_of(experiment, narrow_limits(limits))
 
     near = jax.vmap(experiment.plausible.at)(guards)
 
     def loss(C: Float[Array, "k m"], z: Float[Array, " p"]) -> Array:
         U, own = signal.commands(C, limits), experiment.belief.at(z)
-        states = _states(experiment, U, jnp.concatenate([own[None], near]))
+        states = _trajectories(experiment, U, jnp.concatenate([own[None], near]))
         worth, _ = _worth_at(experiment, goal, z, U, states[0])
         return cost * beyond(states[1:]) - worth
 
@@ -211,17 +213,17 @@ def _worth(
     return jnp.mean(nats), scales[0], middle
 
 
-def _states(experiment: Experiment, U: Array, machines: Array) -> Array:
+def _trajectories(experiment: Experiment, U: Array, machines: Array) -> Array:
     """Of every machine, at its virtual values."""
     return jax.vmap(lambda tt: trajectory(experiment, tt, U))(machines)
 
 
 @compile_async
-def _checked(
+def _plausible_states(
     experiment: Experiment, limits: LimitBox, U: Array, draws: Array
 ) -> tuple[Array, Array]:
     """Of plausible machines, and how far each leaves the limits; infinite when lost."""
-    states = _states(experiment, U, jax.vmap(experiment.plausible.at)(draws))
+    states = _trajectories(experiment, U, jax.vmap(experiment.plausible.at)(draws))
     return states, all_excess(limits, states)
 
 

@@ -22,7 +22,7 @@ from sim2gp.experiment_design.experiment import (
     posterior_scale,
 )
 from sim2gp.experiment_design.goals import AbstractGoal
-from sim2gp.experiment_design.limits import LimitBox, all_excess, narrowed
+from sim2gp.experiment_design.limits import LimitBox, all_excess, narrow_limits
 from sim2gp.experiment_design.signals import AbstractCommandSignal
 from sim2gp.experiment_design.ways import SearchPrograms
 from sim2gp.systems.host import simulator_of
@@ -65,7 +65,7 @@ def sensitivity(
     first = np.arange(0, experiment.steps - periods + 1, periods)
     n = states.shape[1]
     asked = about(tt, states[first], np.eye(tt.size), np.zeros(n))
-    J = _rows(experiment, asked, U, first, periods)
+    J = _sensitivity_rows(experiment, asked, U, first, periods)
     return jnp.asarray(J[:, -1, :, n:].reshape(-1, tt.size))
 
 
@@ -75,7 +75,7 @@ def states_of(
     """Those at the beginning and after each period, of machines at virtual values."""
     first, start = np.zeros(len(machines), int), np.asarray(experiment.start)
     asked = SlopeInputs.at(machines, np.tile(start, (len(machines), 1)))
-    run = _run(experiment, asked, U, first, experiment.steps)
+    run = _run_pieces(experiment, asked, U, first, experiment.steps)
     return run.states[:, :: experiment.substeps]
 
 
@@ -100,8 +100,8 @@ def worth_at(
     first = np.arange(0, experiment.steps - count + 2, count)
     scale, n = experiment.belief.scale, states.shape[1]
     asked = about(tt, states[first], scale, experiment.start_sd)
-    J = _rows(experiment, asked, U, first, count - 1)
-    A = _about(jnp.asarray(J.reshape(len(first), -1, n + p)), n)
+    J = _sensitivity_rows(experiment, asked, U, first, count - 1)
+    A = _about_constants(jnp.asarray(J.reshape(len(first), -1, n + p)), n)
     scale = posterior_scale(experiment.belief, A.reshape(-1, p))
     return float(goal.nats(experiment.belief.scale, scale)), scale
 
@@ -124,7 +124,7 @@ def sampling_search(
     guards: Float[np.ndarray, "G p"],
 ) -> Callable[[Key], Float[np.ndarray, "k m"]]:
     """From random motions to a better one, in rounds of samples."""
-    inner, inputs = narrowed(limits), limits.low.size
+    inner, inputs = narrow_limits(limits), limits.low.size
     costs = goal.directions(experiment.belief.scale) * np.geomspace(CHEAP, COST, ROUNDS)
 
     def value(C: np.ndarray, z: np.ndarray, cost: float) -> float:
@@ -158,7 +158,7 @@ def sampling_search(
     return improved
 
 
-def _rows(
+def _sensitivity_rows(
     experiment: Experiment,
     asked: SlopeInputs,
     U: np.ndarray,
@@ -166,12 +166,12 @@ def _rows(
     periods: int,
 ) -> Float[np.ndarray, "W times c k"]:
     """Slopes of what is measured of pieces that begin at states, in noise sd."""
-    J = _run(experiment, asked, U, first, periods).slopes()
+    J = _run_pieces(experiment, asked, U, first, periods).slopes()
     J = J[:, :: experiment.substeps, list(experiment.outputs)]
     return np.asarray(J / np.asarray(experiment.noise)[:, None])
 
 
-def _run(
+def _run_pieces(
     experiment: Experiment,
     asked: SlopeInputs,
     U: np.ndarray,
@@ -192,7 +192,7 @@ def _pieces(experiment: Experiment, U: Array, first: Array, periods: int) -> Pie
 
 
 @eqx.filter_jit
-def _about(J: Float[Array, "W N q"], n: int) -> Float[Array, "W rows p"]:
+def _about_constants(J: Float[Array, "W N q"], n: int) -> Float[Array, "W rows p"]:
     return jax.vmap(lambda one: about_constants(one, n))(J)
 
 

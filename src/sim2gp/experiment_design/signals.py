@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sim2gp import checks
-from sim2gp.experiment_design.limits import LimitBox, kept
+from sim2gp.experiment_design.limits import LimitBox, clip_commands
 from sim2gp.planning.coloured_noise import coloured_noise
 from sim2gp.planning.mpc import from_unit
 from sim2gp.types import Box, Key
@@ -76,7 +76,7 @@ class MultisineCommands(AbstractCommandSignal):
         steepest = jnp.max(jnp.abs(jnp.diff(U, axis=0)), axis=0) / self.period
         share = jnp.maximum(jnp.max(jnp.abs(U), axis=0) / half, steepest / limits.rate)
         # The last digits: a product may round up.
-        return kept(limits, U / jnp.maximum(share, 1.0)[None], self.period)
+        return clip_commands(limits, U / jnp.maximum(share, 1.0)[None], self.period)
 
     def random(self, key: Key, inputs: int) -> Float[Array, "k m"]:
         return jax.random.normal(key, (self.coefficients, inputs))
@@ -100,7 +100,7 @@ class FreeCommands(AbstractCommandSignal):
         share = jnp.asarray((at - left)[:, None], C.dtype)
         line = (1.0 - share) * C[left] + share * C[left + 1]
         box = Box(jnp.asarray(limits.low), jnp.asarray(limits.high))
-        return kept(limits, from_unit(line, box), self.period)
+        return clip_commands(limits, from_unit(line, box), self.period)
 
     def random(self, key: Key, inputs: int) -> Float[Array, "k m"]:
         none = jnp.zeros((self.coefficients, inputs))

@@ -34,7 +34,7 @@ def configuration_entries(
     differing = {x: None for c in variants for x in (*dict(c.fixed), *c.own)}
     rows = [["recordings", *(str(entry["recordings"]) for entry in about.values())]]
     for constant in differing:
-        cells = [_cell(table, c, constant, parameters) for c in variants]
+        cells = [_configuration_cell(table, c, constant, parameters) for c in variants]
         rows.append([constant, *cells])
     listed = {
         "title": "The machine's configurations",
@@ -45,7 +45,7 @@ def configuration_entries(
     return {"configurations": about, "tables": [listed]}
 
 
-def _cell(
+def _configuration_cell(
     table: Parameters,
     variant: Variant,
     constant: str,

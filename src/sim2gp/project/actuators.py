@@ -33,7 +33,7 @@ def with_actuators(
     if not spec.actuators:
         return system
     inputs = [channel.name for channel in system.actions]
-    tables = _tables(spec, source, inputs)
+    tables = _inputs_by_table(spec, source, inputs)
     ties = {
         name: found[0]
         for pattern, found in tables.items()
@@ -59,7 +59,7 @@ def with_actuators(
     return with_parts(system, parts, stated)
 
 
-def _tables(
+def _inputs_by_table(
     spec: ProjectSpec, source: ProjectSource, inputs: Sequence[str]
 ) -> dict[str, list[str]]:
     """The inputs of each table; no input has two (E145), one alone no tie (E160)."""

@@ -15,7 +15,7 @@ from sim2gp.inference.parameters import Parameter, Parameters, unknown_parameter
 from sim2gp.project import slips
 from sim2gp.project.actuators import with_actuators
 from sim2gp.project.effects import with_effects
-from sim2gp.project.priors import located, prior
+from sim2gp.project.priors import prior, with_location
 from sim2gp.project.schema import (
     ColumnSpec,
     LogSpec,
@@ -33,11 +33,11 @@ def build_system(
     spec: ProjectSpec, source: ProjectSource, kind: type[AbstractPlant]
 ) -> AbstractSystem:
     """The machine of the file, with effects and actuators (E141, E145, E160)."""
-    options = _options(spec.options, source, kind)
+    options = _class_options(spec.options, source, kind)
     try:
         plain = kind(**options)
     except InputError as caught:
-        raise located(caught, source.where("options")) from caught
+        raise with_location(caught, source.where("options")) from caught
     except (TypeError, ValueError) as caught:
         where, expected = source.where("options"), str(caught)
         got = ", ".join(f"{k} = {v}" for k, v in options.items())
@@ -45,7 +45,7 @@ def build_system(
             "options_refused", where=where, got=got, expected=expected
         ) from caught
     shared = {k: v for k, v in spec.parameters.items() if AT not in k}
-    table = _table(plain.parameters, shared, source, ("parameters",))
+    table = _parameters_with_priors(plain.parameters, shared, source, ("parameters",))
     plant: Any = kind(parameters=table, **options)
     return with_actuators(with_effects(plant, spec.effects, source), spec, source)
 
@@ -60,12 +60,12 @@ def build_own(
     for name in spec.options:
         raise unknown("option", name, (), source.where("options", name))
     shared = {k: v for k, v in spec.parameters.items() if AT not in k}
-    table = _table(system.parameters, shared, source, ("parameters",))
+    table = _parameters_with_priors(system.parameters, shared, source, ("parameters",))
     machine = replace(as_machine(system), parameters=table)
     return with_actuators(with_effects(machine, spec.effects, source), spec, source)
 
 
-def _options(
+def _class_options(
     options: Mapping[str, Any], source: ProjectSource, kind: type[AbstractPlant]
 ) -> dict[str, Any]:
     """The options that the class takes, each of its declared type."""
@@ -87,12 +87,12 @@ def _options(
             out[name] = adapter.validate_python(given)
         except ValidationError as error:
             expected = describe_violation({**error.errors()[0]})
-            fix = slips.of_value(("options", name), value, expected)
+            fix = slips.fix_for_value(("options", name), value, expected)
             raise wrong_value("E160", where, value, expected, fix) from error
     return out
 
 
-def _table(
+def _parameters_with_priors(
     table: Parameters,
     specs: Mapping[str, ParameterSpec | float],
     source: ProjectSource,
@@ -111,7 +111,7 @@ def _table(
             base = Parameter(name, "", "", "identity", mean=fixed[name], sd=1.0)
         else:
             known = [*table.names, *fixed]
-            raise located(unknown_parameter(name, known), where)
+            raise with_location(unknown_parameter(name, known), where)
         changes[name] = prior(stated, base, where, fixed.get(name))
     return table.replace(**changes)
 
@@ -138,7 +138,7 @@ def check_known_names(
         for name in group.fixed:
             if name not in constants:
                 where = source.where("logs", i, "fixed", name)
-                raise located(unknown_parameter(name, constants), where)
+                raise with_location(unknown_parameter(name, constants), where)
         for k, (low, high) in enumerate(group.exclude):
             where = source.where("logs", i, "exclude", k)
             _check_pair("excluded interval", low, high, where)

@@ -20,7 +20,7 @@ from sim2gp.data.logs import (
     Log,
     RawLog,
     Resample,
-    none_unused,
+    check_all_used,
     read_log,
 )
 from sim2gp.data.logs.file import display_path
@@ -32,7 +32,7 @@ from sim2gp.project.schema import (
     ResampleSpec,
 )
 from sim2gp.project.source import ProjectSource, read_source
-from sim2gp.project.validate import validated
+from sim2gp.project.validate import validate_project
 
 if TYPE_CHECKING:
     from sim2gp.systems import AbstractPlant, AbstractSystem
@@ -115,7 +115,7 @@ class Project:
             where, got = self.source.where("logs"), "no [[logs]] table"
             raise error("no_logs_in_project", where=where, got=got)
         if strict:
-            none_unused(logs)
+            check_all_used(logs)
         return tuple(_uniquely_named(logs))
 
     def read_logs(
@@ -191,10 +191,10 @@ class Project:
     def _read(self, path: Path | RawLog, group: int, spec: LogSpec) -> tuple[Log, ...]:
         return read_log(
             path,
-            {name: _column(value) for name, value in spec.columns.items()},
+            {name: _column_of(value) for name, value in spec.columns.items()},
             states=self.system.physical_states,
             actions=self.system.actions,
-            time=None if spec.time is None else _clock(spec.time),
+            time=None if spec.time is None else _clock_column(spec.time),
             period=spec.period,
             episode=spec.episode,
             resample=_resample(spec.resample),
@@ -226,7 +226,7 @@ def load_project(
     source, spec = read_spec(path, own=system is not None)
     # Imported late: a misspelt key is reported before the simulators are loaded.
     from sim2gp.project.build import build_own, build_system, check_known_names
-    from sim2gp.project.configure import in_configurations, weighed
+    from sim2gp.project.configure import with_configurations, with_linear_measurements
     from sim2gp.systems.machine import as_machine
 
     if system is not None and spec.system == IN_MEMORY:
@@ -243,7 +243,9 @@ def load_project(
     else:
         system = build_system(spec, source, system_class(spec.system))
     check_known_names(spec, source, system)
-    system = weighed(spec, source, in_configurations(spec, source, system))
+    system = with_linear_measurements(
+        spec, source, with_configurations(spec, source, system)
+    )
     return Project(path, source, spec, system, own=own)
 
 
@@ -255,7 +257,7 @@ def read_spec(
     The system of the file must be known, but for a user's ``own``.
     """
     source = read_source(Path(path))
-    spec = validated(source)
+    spec = validate_project(source)
     if not (own or spec.system in SYSTEMS or is_model(spec.system)):
         raise unknown_system(spec.system, source.where("system"))
     return source, spec
@@ -291,7 +293,7 @@ def system_class(name: str) -> "type[AbstractPlant]":
     return found
 
 
-def _column(value: str | float | ColumnSpec) -> Column | float:
+def _column_of(value: str | float | ColumnSpec) -> Column | float:
     if isinstance(value, str):
         return Column(value)
     if not isinstance(value, ColumnSpec):
@@ -307,8 +309,8 @@ def _column(value: str | float | ColumnSpec) -> Column | float:
     )
 
 
-def _clock(value: str | ColumnSpec) -> Column | str:
-    found = _column(value)
+def _clock_column(value: str | ColumnSpec) -> Column | str:
+    found = _column_of(value)
     return found if isinstance(found, Column) else str(found)
 
 

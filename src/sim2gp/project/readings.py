@@ -87,7 +87,7 @@ def finer(options: Sequence[Reading]) -> str | None:
 
 
 @dataclass
-class Found:
+class BestReadings:
     """The best reading of each channel, and how sure that is.
 
     ``surer[name]``: the sign test's z against the best reading in which the channel
@@ -104,26 +104,30 @@ class Found:
 
 
 @in_float64
-def find_readings(system: AbstractSystem, asked: Question, *, until: float) -> Found:
+def find_readings(
+    system: AbstractSystem, asked: Question, *, until: float
+) -> BestReadings:
     """The reading of joints and inputs that explains the logs best.
 
     ``until`` (of `time.monotonic`, s): what was not tried by then keeps its first
     option. Raises `InputError` E116 where no window can be cut.
     """
-    found = Found({name: options[0] for name, options in asked.options.items()})
-    groups = _groups(asked)
+    found = BestReadings({name: options[0] for name, options in asked.options.items()})
+    groups = _channel_groups(asked)
     try:
         trial = _Trial(system, asked, until)
         for turn in range(1 if len(groups) == 1 else 2):
             found.images = 1
             for names in groups:
-                _settle(trial, asked, names, found, alone=turn == 0 < len(groups) - 1)
+                _settle_readings(
+                    trial, asked, names, found, alone=turn == 0 < len(groups) - 1
+                )
     except TimeoutError:
         pass
     return found
 
 
-def _groups(asked: Question) -> Sequence[Sequence[str]]:
+def _channel_groups(asked: Question) -> Sequence[Sequence[str]]:
     """All channels at once where their readings are few; those with one are known."""
     open_ = [name for name, options in asked.options.items() if len(options) > 1]
     if np.prod([len(asked.options[name]) for name in open_]) <= EXHAUSTIVE:
@@ -132,11 +136,11 @@ def _groups(asked: Question) -> Sequence[Sequence[str]]:
     return [names for names in groups if names]
 
 
-def _settle(
+def _settle_readings(
     trial: "_Trial",
     asked: Question,
     names: Sequence[str],
-    found: Found,
+    found: BestReadings,
     *,
     alone: bool,
 ) -> None:
@@ -199,7 +203,7 @@ class _Trial:
             c.name: c.unit for c in (*system.physical_states, *system.actions)
         }
         self.base = {name: finer(options) for name, options in asked.options.items()}
-        self.step, self.until = _step_of(system), until
+        self.step, self.until = _nominal_step(system), until
 
     def scores(self, readings: Sequence[Readings], names: Sequence[str]) -> Scores:
         """Of each reading and window, by some channels or, where none is measured, all.
@@ -277,7 +281,7 @@ def _beginning(logs: Sequence[Log]) -> list[Log]:
     return some
 
 
-def _step_of(system: AbstractSystem) -> Callable[..., Float[np.ndarray, "B n"]]:
+def _nominal_step(system: AbstractSystem) -> Callable[..., Float[np.ndarray, "B n"]]:
     """One step of many rows at the parameters' nominal values.
 
     MuJoCo's own engine where it is one: nothing is compiled then.

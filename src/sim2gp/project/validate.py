@@ -30,7 +30,7 @@ _WORDS = {
 }
 
 
-def validated(source: ProjectSource) -> ProjectSpec:
+def validate_project(source: ProjectSource) -> ProjectSpec:
     """The file's values as a `ProjectSpec`, or its first error (E141, E144, E160)."""
     try:
         return ProjectSpec.model_validate(source.values)
@@ -41,7 +41,7 @@ def validated(source: ProjectSource) -> ProjectSpec:
     deep = [(path, error) for path, error in faults if path not in above]
     path, error = min(deep, key=lambda fault: _order(source, fault[0]))
     if error["type"] == "missing":
-        raise _missing(source, path, error)
+        raise _missing_key(source, path, error)
     if error["type"] == "extra_forbidden":
         raise _unknown_key(source, path, error["input"])
     raise _wrong(source, path, error, [e for p, e in deep if p == path])
@@ -63,7 +63,9 @@ def _order(source: ProjectSource, path: Path_) -> int:
     return int(source.where(*path).split(":line ")[1].split(",")[0])
 
 
-def _missing(source: ProjectSource, path: Path_, failure: dict[str, Any]) -> InputError:
+def _missing_key(
+    source: ProjectSource, path: Path_, failure: dict[str, Any]
+) -> InputError:
     name, value = str(failure["loc"][-1]), failure["input"]
     got = ", ".join(value)[:60] or "an empty table"
     return error("missing_key", where=source.where(*path), got=got, name=name)
@@ -76,7 +78,7 @@ def _unknown_key(source: ProjectSource, path: Path_, value: Any) -> InputError:
         fix = f"write system = {slips.toml(value)}" if named else "remove it"
         return error("reserved_section", where=where, got=key, section=key, fix=fix)
     known = keys_at(path[:-1])
-    fix = slips.of_key(path, known) or "remove it"
+    fix = slips.fix_for_key(path, known) or "remove it"
     return error("unknown_key", where=where, got=key, known=", ".join(known), fix=fix)
 
 
@@ -94,10 +96,10 @@ def _wrong(
         code = "E141"
     elif {"sd", "relative_sd", "start_sd", "noise_floor"} & set(path):
         code = "E144" if kind in ("greater_than", "finite_number") else "E160"
-    fix = slips.of_value(path, value, expected)
+    fix = slips.fix_for_value(path, value, expected)
     choices = [e["ctx"]["expected"] for e in same if e["type"] == "literal_error"]
     if choices and not fix:
-        fix = slips.of_choice(value, choices[0])
+        fix = slips.fix_for_choice(value, choices[0])
     return wrong_value(code, source.where(*path), value, expected, fix)
 
 

@@ -35,7 +35,7 @@ def colour(index: int) -> str:
     return COLOURS[index % len(COLOURS)]
 
 
-def _sentence(item: object) -> object:
+def _item_text(item: object) -> object:
     if isinstance(item, Mapping):
         return item.get("text") or ", ".join(
             f"{key.replace('_', ' ')} {format_value(key, value)}"
@@ -98,7 +98,7 @@ def noise_and_misfit(summary: Summary) -> Section:
         "asked": bool(misfit),
         "verdict": None if explains else about.get("verdict"),
         "tests": _tests(tests) if tests else None,
-        "notes": list(map(_sentence, about.get("noise") or ())),
+        "notes": list(map(_item_text, about.get("noise") or ())),
     }
 
 

@@ -20,10 +20,10 @@ def glance(summary: Summary) -> dict[str, str]:
         return {}
     return {
         "What was learned": str(summary.get("headline") or ""),
-        "How sure": _sure(summary),
+        "How sure": _width_answer(summary),
         "Does it predict": _predicts(summary),
-        "What is missing": _missing(summary),
-        "What next": _next(summary),
+        "What is missing": _misfit_answer(summary),
+        "What next": _next_command(summary),
     }
 
 
@@ -32,7 +32,7 @@ def _entries(summary: Summary) -> Mapping[str, Mapping[str, Any]]:
     return found
 
 
-def _sure(summary: Summary) -> str:
+def _width_answer(summary: Summary) -> str:
     """How wide the intervals are, and what they allow for."""
     shares = [
         100.0 * entry["sd"] / abs(entry["mean"])
@@ -63,7 +63,7 @@ def _predicts(summary: Summary) -> str:
     return str(about.get("headline") or about.get("text") or "Not asked (--quick).")
 
 
-def _missing(summary: Summary) -> str:
+def _misfit_answer(summary: Summary) -> str:
     """What the residuals say of the model."""
     misfit = summary.get("misfit") or {}
     if misfit.get("alarm"):
@@ -71,7 +71,7 @@ def _missing(summary: Summary) -> str:
     return str(misfit.get("verdict") or "")
 
 
-def _next(summary: Summary) -> str:
+def _next_command(summary: Summary) -> str:
     """The command that helps most."""
     misfit = summary.get("misfit") or {}
     if misfit.get("alarm"):
@@ -82,7 +82,7 @@ def _next(summary: Summary) -> str:
         if entry.get("verdict") not in ("identified", "dead")
     ]
     if open_:
-        names = _listed(open_)
+        names = _first_names(open_)
         return f"sim2gp design RUN: an experiment that tells more of {names}."
     longer = summary.get("longer") or {}
     if longer.get("advised") and longer.get("text"):
@@ -93,7 +93,7 @@ def _next(summary: Summary) -> str:
     )
 
 
-def _listed(names: Sequence[str]) -> str:
+def _first_names(names: Sequence[str]) -> str:
     shown = ", ".join(names[:MANY])
     rest = len(names) - MANY
     return f"{shown} and {format_number(rest)} more" if rest > 0 else shown

@@ -39,11 +39,11 @@ def unit_text(unit: object) -> str:
     return re.sub(r"\^(-?\d+)", lambda m: m[1].translate(_SUPERSCRIPT), str(unit or ""))
 
 
-def _power(exponent: int) -> str:
+def _power_suffix(exponent: int) -> str:
     return f" × {power_of_ten(exponent)}" if exponent else ""
 
 
-def _fixed(value: float, decimals: int) -> str:
+def _fixed_point(value: float, decimals: int) -> str:
     text = f"{value:.{max(decimals, 0)}f}"
     if float(text) == 0:
         text = text.lstrip("-")
@@ -61,7 +61,9 @@ def format_number(value: object, digits: int = 3) -> str:
     if exponent == 0 and abs(x) >= 10_000:
         return format_number(round(x))
     scaled = x / 10.0**exponent
-    return _fixed(scaled, digits - 1 - _exponent(scaled)) + _power(exponent)
+    return _fixed_point(scaled, digits - 1 - _exponent(scaled)) + _power_suffix(
+        exponent
+    )
 
 
 def plus_minus(mean: object, sd: object) -> str:
@@ -74,8 +76,8 @@ def plus_minus(mean: object, sd: object) -> str:
     exponent = _shared_exponent(m, s)
     decimals = 1 - _exponent(s / 10.0**exponent)
     m, s = m / 10.0**exponent, s / 10.0**exponent
-    text = f"{_fixed(m, decimals)} ± {_fixed(s, decimals)}"
-    return f"({text}){_power(exponent)}" if exponent else text
+    text = f"{_fixed_point(m, decimals)} ± {_fixed_point(s, decimals)}"
+    return f"({text}){_power_suffix(exponent)}" if exponent else text
 
 
 def format_interval(low: object, high: object) -> str:
@@ -88,8 +90,8 @@ def format_interval(low: object, high: object) -> str:
     exponent = _shared_exponent(a, b)
     a, b = a / 10.0**exponent, b / 10.0**exponent
     decimals = 1 - _exponent((b - a) / 4) if b > a else 3
-    text = f"{_fixed(a, decimals)} to {_fixed(b, decimals)}"
-    return f"({text}){_power(exponent)}" if exponent else text
+    text = f"{_fixed_point(a, decimals)} to {_fixed_point(b, decimals)}"
+    return f"({text}){_power_suffix(exponent)}" if exponent else text
 
 
 def format_percent(share: object) -> str:

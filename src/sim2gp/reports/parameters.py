@@ -64,7 +64,7 @@ def _interval(entry: Mapping[str, Any]) -> TableCell:
     )
 
 
-def _row(name: str, entry: Mapping[str, Any], truth: bool) -> list[object]:
+def _parameter_row(name: str, entry: Mapping[str, Any], truth: bool) -> list[object]:
     verdict = entry.get("verdict")
     why = entry.get("note") or VERDICTS.get(str(verdict), ("", ""))[1]
     if verdict == "identified":  # its note says by how much, as "spread left" does
@@ -90,7 +90,7 @@ def parameter_section(summary: Summary) -> Section:
     truth = any(is_number(entry.get("truth")) for entry in entries.values())
     columns = ["parameter", "unit", "prior", "posterior", "95 % interval"]
     columns += ["spread left", *(["truth"] if truth else []), "verdict"]
-    rows = [_row(name, entry, truth) for name, entry in entries.items()]
+    rows = [_parameter_row(name, entry, truth) for name, entry in entries.items()]
     # Which intervals these are; what --longer, --check and --nuts found.
     about = [summary.get(key) for key in ("intervals", "longer", "check", "nuts")]
     return {
@@ -110,7 +110,7 @@ def _area(axes: svg.Axes, draws: np.ndarray, axis: densities.View, css: str) -> 
     )
 
 
-def _density(
+def _density_chart(
     name: str,
     entry: Mapping[str, Any],
     prior: np.ndarray | None,
@@ -152,7 +152,9 @@ def parameter_densities(summary: Summary, arrays: Arrays) -> Section:
         return None
     before = arrays.get("parameters/prior_samples")
     drawn = [
-        _density(name, entry, None if before is None else before[:, i], samples[:, i])
+        _density_chart(
+            name, entry, None if before is None else before[:, i], samples[:, i]
+        )
         for i, (name, entry) in enumerate(entries.items())
     ]
     keys = [] if before is None else [("quiet", "prior")]
@@ -233,7 +235,7 @@ def correlations(summary: Summary, arrays: Arrays) -> Section:
     return {"drawing": _matrix(list(entries), matrix)}
 
 
-def _direction(entry: Mapping[str, Any]) -> dict[str, Any]:
+def _direction_row(entry: Mapping[str, Any]) -> dict[str, Any]:
     text, combination = entry.get("text") or "", entry.get("combination")
     repeated, nats = str(combination) in str(text), entry.get("information")
     return {
@@ -261,6 +263,6 @@ def directions_section(summary: Summary) -> Section:
     ]
     columns = ["combination", "value", "unit", "verdict"]
     return {
-        "found": [_direction(entry) for entry in entries],
+        "found": [_direction_row(entry) for entry in entries],
         "base": make_table(columns, rows, words=(0, 2, 3), cards=True),
     }

@@ -29,7 +29,7 @@ def _series(summary: Summary, arrays: Arrays) -> dict[str, np.ndarray]:
     return {name: value for name, value in known.items() if value.size}
 
 
-def _lines(axes: svg.Axes, values: np.ndarray, css: str) -> list[str]:
+def _return_marks(axes: svg.Axes, values: np.ndarray, css: str) -> list[str]:
     """One seed: its line. Many: the median, the quartiles, every seed as a dot."""
     episodes = np.arange(1.0, values.shape[1] + 1)
     if len(values) == 1:
@@ -119,7 +119,7 @@ def returns_section(summary: Summary, arrays: Arrays) -> Section:
         svg.level(axes, value, "quiet", words) for words, value in references.items()
     ]
     for index, values in enumerate(series.values()):
-        marks += _lines(axes, values, colour(index))
+        marks += _return_marks(axes, values, colour(index))
     said = "; ".join(
         f"{method_name(name)} {_median(values[:, 0])} in the first episode, "
         f"{_median(values[:, -1])} in the last"

@@ -71,16 +71,16 @@ def make_environment(
     Raises `InputError` E135 without Gymnasium, E145 for an unknown truth, constant or
     effect, E101 for a constant that is not finite.
     """
-    made = hidden(machine, truth, params or {}, effects)
+    made = make_machine_spec(machine, truth, params or {}, effects)
     try:
-        return _kind()(made)
+        return _environment_class()(made)
     except ImportError as error:
         what = "an environment cannot be made"
         raise missing_extra(what, error, "gym") from error
 
 
 @functools.cache
-def _kind() -> Any:
+def _environment_class() -> Any:
     """The one class of environments; it exists where Gymnasium does."""
     import gymnasium
     from gymnasium.spaces import Box
@@ -95,7 +95,7 @@ def _kind() -> Any:
         metadata = {"render_modes": [], "render_fps": round(1.0 / Task.dt)}  # noqa: RUF012
         render_mode = None
 
-        def __init__(self, made: Hidden) -> None:
+        def __init__(self, made: MachineSpec) -> None:
             self.made = made
             self.task = made.published()
             self.bound = bound_of(self.task, made.machine)
@@ -140,7 +140,7 @@ def _kind() -> Any:
 
 
 @dataclass(frozen=True)
-class Hidden:
+class MachineSpec:
     """What a machine is made of, but for what a seed draws."""
 
     machine: str
@@ -163,12 +163,12 @@ class Hidden:
         return preset(vars(drawn) | dict(self.params), self.effects)
 
 
-def hidden(
+def make_machine_spec(
     machine: str,
     truth: str,
     params: Mapping[str, float],
     effects: Sequence[AbstractPart | str],
-) -> Hidden:
+) -> MachineSpec:
     """The same, checked; words name effects of the catalogue and their strength.
 
     Raises `InputError` E145 for an unknown truth, constant or effect, E101 for a
@@ -185,7 +185,7 @@ def hidden(
             where = f"params of {machine}"
             raise error("constant_not_finite", where=where, got=value, name=name)
     made = tuple(_effect(machine, e) if isinstance(e, str) else e for e in effects)
-    return Hidden(machine, truth, dict(params), made)
+    return MachineSpec(machine, truth, dict(params), made)
 
 
 def _effect(machine: str, words: str) -> AbstractPart:

@@ -21,12 +21,12 @@ from sim2gp.planning.tasks import Task
 from sim2gp.robot.gymnasium import (
     PUBLISHED,
     SEEDS,
-    Hidden,
+    MachineSpec,
     StepOutcome,
     bound_of,
     check_met,
-    hidden,
     key_of,
+    make_machine_spec,
     reset_task,
     step_task,
     validate_action,
@@ -49,9 +49,9 @@ def make_environments(
 
     Options and errors are those of `sim2gp.robot.gymnasium.make_environment`.
     """
-    made = hidden(machine, truth, params or {}, effects)
+    made = make_machine_spec(machine, truth, params or {}, effects)
     try:
-        return _kind()(made, num_envs, max_episode_steps)
+        return _vector_class()(made, num_envs, max_episode_steps)
     except ImportError as error:
         what = "environments cannot be made"
         raise missing_extra(what, error, "gym") from error
@@ -98,7 +98,7 @@ def step_batch(
 class Fleet:
     """The machines and where they are, without Gymnasium."""
 
-    def __init__(self, made: Hidden, count: int, longest: int) -> None:
+    def __init__(self, made: MachineSpec, count: int, longest: int) -> None:
         self.made, self.count = made, count
         self.task = made.published()
         self.bound = bound_of(self.task, made.machine)
@@ -148,7 +148,7 @@ class Fleet:
 
 
 @functools.cache
-def _kind() -> Any:
+def _vector_class() -> Any:
     """The one class of vectors of environments."""
     import gymnasium
     from gymnasium.spaces import Box
@@ -165,7 +165,7 @@ def _kind() -> Any:
         }
         render_mode = None
 
-        def __init__(self, made: Hidden, count: int, longest: int) -> None:
+        def __init__(self, made: MachineSpec, count: int, longest: int) -> None:
             self.fleet = Fleet(made, count, longest)
             self.num_envs = count
             m, bound = self.fleet.task.actions.low.size, self.fleet.bound

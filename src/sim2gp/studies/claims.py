@@ -20,7 +20,7 @@ def claim(holds: bool, figure: str, text: str) -> dict[str, Any]:
     return {"holds": bool(holds), "figure": figure, "text": text}
 
 
-def resampled(
+def bootstrap_weights(
     seeds: int, rng: np.random.Generator
 ) -> Float[np.ndarray, "resamples seeds"]:
     """How often each seed is drawn, in `RESAMPLES` draws of as many as there are."""
@@ -34,7 +34,7 @@ def bootstrap_interval(
     level: float = LEVEL,
 ) -> tuple[float, float]:
     """Central share ``level`` of the bootstrap distribution of a mean over seeds."""
-    means = resampled(len(difference), rng) @ difference / len(difference)
+    means = bootstrap_weights(len(difference), rng) @ difference / len(difference)
     return central(means, level)
 
 
@@ -49,14 +49,14 @@ def central(
     return float(low), float(high)
 
 
-def of_median(
+def bootstrap_median(
     each: Float[np.ndarray, " seeds"], rng: np.random.Generator
 ) -> tuple[float, float, float]:
     """The median over seeds, and the central share `LEVEL` of its bootstrap.
 
     A seed may be infinite, for never: the ends are medians that were drawn.
     """
-    weights = resampled(len(each), rng).astype(int)
+    weights = bootstrap_weights(len(each), rng).astype(int)
     medians = np.asarray([np.median(np.repeat(each, w)) for w in weights])
     return float(np.median(each)), *central(medians, method="nearest")
 

@@ -97,7 +97,7 @@ class PosteriorSampling(Study):
             },
             "claims": check(table, self.rng),
             **returns_of(values),
-            "tables": [_table(table, methods)],
+            "tables": [_median_score_table(table, methods)],
         }
 
     def pictures(
@@ -217,7 +217,7 @@ def _best(
     return at_least_as_good(name, early, rng, f"{text} {score}")
 
 
-def _table(table: Table, methods: tuple[str, ...]) -> dict[str, Any]:
+def _median_score_table(table: Table, methods: tuple[str, ...]) -> dict[str, Any]:
     """Median episodes to 95 %, and the median best score of the last episode."""
     groups = [(m, c) for m in MACHINES for c in CONDITIONS]
     rows = []

@@ -49,7 +49,7 @@ class ArmRecording(eqx.Module):
         return Transitions.of(s[:-1], np.asarray(self.action), s[1:])
 
 
-class Learned(eqx.Module):
+class LearnedArm(eqx.Module):
     """Both data sets of one arm, and the belief that each stage starts and ends with.
 
     ``middle`` is posterior 1 as the prior of the free arm.
@@ -110,7 +110,7 @@ def record(arm: UniformRodArm, truth: Float[Array, " p"], *, key: Key) -> ArmRec
 
 
 @in_float64
-def learn(truth: Float[Array, " p"], *, key: Key) -> Learned:
+def learn(truth: Float[Array, " p"], *, key: Key) -> LearnedArm:
     """Record and learn both data sets in turn; raises what `Sim2GP.fit` raises."""
     one, two, fit1, fit2 = jax.random.split(key, 4)
     locked, free = UniformRodArm(locked=LOCKED), UniformRodArm()
@@ -121,7 +121,7 @@ def learn(truth: Float[Array, " p"], *, key: Key) -> Learned:
     model = Sim2GP(free, dt=DT).with_prior(posterior1.posterior)
     middle = model.init(fit2)
     posterior2 = model.fit(middle, second.transitions(), key=fit2)
-    return Learned(truth, first, second, prior, posterior1, middle, posterior2)
+    return LearnedArm(truth, first, second, prior, posterior1, middle, posterior2)
 
 
 @dataclass(frozen=True)
@@ -185,7 +185,7 @@ def coverage_band(level: int, count: int) -> tuple[float, float]:
     return float(low) / count, float(high) / count
 
 
-def covered(z: Float[np.ndarray, "seeds p"], level: int) -> Float[np.ndarray, " p"]:
+def coverage(z: Float[np.ndarray, "seeds p"], level: int) -> Float[np.ndarray, " p"]:
     """Share of arms whose truth lies in the central interval of each parameter."""
     limit = scipy.stats.norm.ppf(0.5 + level / 200.0)
     return np.asarray(np.mean(np.abs(z) <= limit, axis=0))

@@ -80,7 +80,9 @@ def read_columns(
             raise missing_column(name, header, source, name == time)
         _check_kind(entries[places[name][0]], name, source)
     bases = list(dict.fromkeys(places[name][0] for name in wanted))
-    rows = _count(entries, bases, places[time][0] if time in places else None, source)
+    rows = _row_count(
+        entries, bases, places[time][0] if time in places else None, source
+    )
     used = [entries[base] for base in bases]
     meter.place = ""
     meter.claim(sum(math.prod(e.shape) * max(e.dtype.itemsize, 8) for e in used))
@@ -94,7 +96,7 @@ def read_columns(
         read = entries[base].read()
         for name in names:
             raw = read if read.ndim == 1 else read[:, places[name][1]]
-            columns[name], said = _numbers(raw, name, source, name == time)
+            columns[name], said = _as_float64(raw, name, source, name == time)
             notes += said
     meter.place = ""
     table_rows = Rows(source, np.arange(rows), "row")
@@ -145,7 +147,7 @@ def _check_kind(entry: LazyArray, name: str, source: str) -> None:
         raise error("not_a_table", where=where, got=f"shape {entry.shape}")
 
 
-def _count(
+def _row_count(
     entries: Mapping[str, LazyArray],
     bases: Sequence[str],
     time: str | None,
@@ -180,7 +182,7 @@ def _count(
     )
 
 
-def _numbers(
+def _as_float64(
     raw: Shaped[np.ndarray, " N"], name: str, source: str, is_time: bool
 ) -> tuple[Float[np.ndarray, " N"], list[Note]]:
     """As float64; dates, and whole numbers too large for it, count from the first."""

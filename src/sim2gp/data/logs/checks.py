@@ -264,7 +264,7 @@ def excitation(
     return notes
 
 
-def unused(names: Sequence[str], source: str) -> list[Note]:
+def unused_columns(names: Sequence[str], source: str) -> list[Note]:
     """Columns of a file that nothing takes: perhaps one was forgotten (W105)."""
     if not names:
         return []
@@ -273,7 +273,7 @@ def unused(names: Sequence[str], source: str) -> list[Note]:
     return [Note("W105", f"columns of {source} that nothing takes: {text}")]
 
 
-def none_unused(logs: Sequence[Log]) -> None:
+def check_all_used(logs: Sequence[Log]) -> None:
     """Whoever is strict takes every column (E105)."""
     for log in logs:
         for note in log.notes:

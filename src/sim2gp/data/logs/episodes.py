@@ -17,7 +17,12 @@ from jaxtyping import Shaped
 
 from sim2gp.data.logs.arrays import LazyArray, read_columns, split
 from sim2gp.data.logs.budget import Meter
-from sim2gp.data.logs.file import display_path, import_optional, read_bytes, steady
+from sim2gp.data.logs.file import (
+    display_path,
+    import_optional,
+    read_bytes,
+    unchanged_size,
+)
 from sim2gp.data.logs.hdf5 import entries_of
 from sim2gp.data.logs.log import Note
 from sim2gp.data.logs.parquet import read_parquet
@@ -62,17 +67,19 @@ def read_lerobot(
     asked = None if wanted is None else [*dict.fromkeys([*wanted, *own])]
     if asked is not None and not stamped:
         asked += ["episode_index"]
-    labels = _labels(info)
+    labels = _feature_labels(info)
     tables = [read_parquet(file, asked, time, meter, labels) for file in files]
-    pieces = split(_joined(tables, where), "episode_index")
+    pieces = split(_join_tables(tables, where), "episode_index")
     notes = _announced(info.get("total_episodes"), [n for n, _ in pieces], where)
-    pieces = [(n, _timed(t, info, stamped)) for n, t in sorted(pieces, key=_number)]
+    pieces = [
+        (n, _timed(t, info, stamped)) for n, t in sorted(pieces, key=_episode_number)
+    ]
     number, first = pieces[0]
     pieces[0] = (number, replace(first, notes=(*first.notes, *notes)))
     return [(str(n), table) for n, table in pieces]
 
 
-def _number(piece: tuple[int, Any]) -> int:
+def _episode_number(piece: tuple[int, Any]) -> int:
     return piece[0]
 
 
@@ -86,7 +93,7 @@ def _json(path: Path, meter: Meter) -> dict[str, Any]:
     return values
 
 
-def _labels(info: Mapping[str, Any]) -> dict[str, list[str]]:
+def _feature_labels(info: Mapping[str, Any]) -> dict[str, list[str]]:
     """The names of the entries of each feature, where the dataset gives them."""
     labels: dict[str, list[str]] = {}
     features = info.get("features")
@@ -100,7 +107,7 @@ def _labels(info: Mapping[str, Any]) -> dict[str, list[str]]:
     return labels
 
 
-def _joined(tables: Sequence[LogTable], where: str) -> LogTable:
+def _join_tables(tables: Sequence[LogTable], where: str) -> LogTable:
     """The rows of all files after each other, numbered as LeRobot's index does."""
     columns = {
         name: np.concatenate([table.columns[name] for table in tables])
@@ -152,14 +159,14 @@ def read_minari(
         )
     h5py = import_optional("h5py", "hdf5", "a Minari dataset")
     main = folder / "main_data.hdf5"
-    with steady(main), h5py.File(main, "r") as file:
+    with unchanged_size(main), h5py.File(main, "r") as file:
         episodes: dict[int, dict[str, LazyArray]] = {}
         for name, entry in entries_of(file, where, meter).items():
             if found := _EPISODE.match(name):
                 inner = episodes.setdefault(int(found[1]), {})
                 inner[name[found.end() :]] = entry
         pieces = []
-        for number, inner in sorted(episodes.items(), key=_number):
+        for number, inner in sorted(episodes.items(), key=_episode_number):
             source = f"{where} episode {number}"
             aligned = _aligned(inner, source)
             table = read_columns(aligned, source, wanted, time=time, meter=meter)
@@ -187,7 +194,7 @@ def _aligned(entries: Mapping[str, LazyArray], source: str) -> dict[str, LazyArr
             got=f"{rows} observations, {steps} actions",
         )
     kept = {n: e for n, e in entries.items() if _is(n, "observations", "infos")}
-    held = {n: _held(e) for n, e in entries.items() if _is(n, "actions")}
+    held = {n: _repeat_last(e) for n, e in entries.items() if _is(n, "actions")}
     return kept | held
 
 
@@ -195,7 +202,7 @@ def _is(name: str, *groups: str) -> bool:
     return name.split("/", 1)[0] in groups
 
 
-def _held(entry: LazyArray) -> LazyArray:
+def _repeat_last(entry: LazyArray) -> LazyArray:
     def values() -> Shaped[np.ndarray, "..."]:
         read = entry.read()
         return np.concatenate([read, read[-1:]])

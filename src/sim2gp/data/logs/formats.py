@@ -75,7 +75,7 @@ def _recordings(
 ) -> tuple[Recording, ...]:
     clock = None if period is not None else (time or TIME)
     if isinstance(path, RawLog):
-        asked = _with(wanted, clock, episode)
+        asked = _wanted_with(wanted, clock, episode)
         pieces = [("", _in_memory(path, asked, clock, meter))]
         return _by_episode(pieces, episode)
     if kind in BAGS:
@@ -84,10 +84,10 @@ def _recordings(
     if kind == "lerobot":
         _check_no_episode(path, episode, kind)
         stamped = time is None and period is None
-        asked = _with(wanted, time)
+        asked = _wanted_with(wanted, time)
         found = read_lerobot(path, asked, time, stamped, meter)
         return tuple(Recording(name, (table,)) for name, table in found)
-    asked = _with(wanted, clock, episode)
+    asked = _wanted_with(wanted, clock, episode)
     if kind == "minari":
         _check_no_episode(path, episode, kind)
         pieces = read_minari(path, asked, clock, meter)
@@ -135,7 +135,7 @@ def columns_of(
     return {name: v for table in tables for name, v in table.columns.items()}
 
 
-def _with(wanted: Sequence[str] | None, *names: str | None) -> list[str] | None:
+def _wanted_with(wanted: Sequence[str] | None, *names: str | None) -> list[str] | None:
     if wanted is None:
         return None
     return list(dict.fromkeys([*(n for n in names if n is not None), *wanted]))

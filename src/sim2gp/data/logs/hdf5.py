@@ -16,9 +16,9 @@ from jaxtyping import Shaped
 
 from sim2gp.data.logs.arrays import LazyArray, read_columns
 from sim2gp.data.logs.budget import Meter
-from sim2gp.data.logs.file import display_path, import_optional, steady
+from sim2gp.data.logs.file import display_path, import_optional, unchanged_size
 from sim2gp.data.logs.table import LogTable
-from sim2gp.data.logs.unpack import inflated, lzf_pieces
+from sim2gp.data.logs.unpack import inflate, lzf_pieces
 from sim2gp.errors import error
 
 #: Groups whose names are one of these words and a number hold an episode each.
@@ -45,7 +45,7 @@ def read_hdf5(
     """
     where = display_path(path)
     h5py = import_optional("h5py", "hdf5", "an HDF5 file")
-    with steady(path), h5py.File(path, "r") as file:
+    with unchanged_size(path), h5py.File(path, "r") as file:
         entries = entries_of(file, where, meter)
         bases = {re.sub(r"\[\d+\]$", "", name) for name in wanted or ()}
         groups = {} if bases & {*entries} else episodes_of(entries, bases)
@@ -68,13 +68,13 @@ def entries_of(file: Any, where: str, meter: Meter) -> dict[str, LazyArray]:
     def visit(name: str, item: Any) -> None:
         meter.tick()
         if isinstance(item, h5py.Dataset) and item.shape:
-            found[name] = _entry(item, f"{where}:dataset {name}", meter)
+            found[name] = _lazy_dataset(item, f"{where}:dataset {name}", meter)
 
     file.visititems(visit)
     return found
 
 
-def _entry(dataset: Any, where: str, meter: Meter) -> LazyArray:
+def _lazy_dataset(dataset: Any, where: str, meter: Meter) -> LazyArray:
     def values() -> Shaped[np.ndarray, "..."]:
         if dataset.external or dataset.is_virtual:
             raise error(
@@ -134,7 +134,7 @@ def _check_chunks(dataset: Any, where: str, meter: Meter) -> None:
         _, content = dataset.id.read_direct_chunk(chunk.chunk_offset)
         if used[-1] == _CHECKSUM:
             content = content[:-4]
-        unpacked = inflated(content) if packed == [_GZIP] else lzf_pieces(content)
+        unpacked = inflate(content) if packed == [_GZIP] else lzf_pieces(content)
         # A checksum may lie inside. What is read is counted when it is read.
         meter.again().measure(unpacked, declared + 64, "chunk")
 

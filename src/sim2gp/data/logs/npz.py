@@ -18,7 +18,7 @@ from jaxtyping import Shaped
 
 from sim2gp.data.logs.arrays import LazyArray, distinct, read_columns
 from sim2gp.data.logs.budget import Meter
-from sim2gp.data.logs.file import display_path, pickled, steady
+from sim2gp.data.logs.file import display_path, pickle_error, unchanged_size
 from sim2gp.data.logs.table import LogTable
 from sim2gp.errors import error
 
@@ -43,24 +43,24 @@ def read_npz(
 ) -> LogTable:
     """The wanted arrays of an archive as columns (E103 to E126, E140, E180, E182)."""
     where = display_path(path)
-    with steady(path), zipfile.ZipFile(path) as archive:
-        members = [_checked(info, where) for info in archive.infolist()]
+    with unchanged_size(path), zipfile.ZipFile(path) as archive:
+        members = [_check_member(info, where) for info in archive.infolist()]
         names = [info.filename.removesuffix(".npy") for info in members]
         distinct(names, where)
         entries = {}
         for name, info in zip(names, members, strict=True):
             meter.place = f"array {name[:60]}"
-            entries[name] = _entry(archive, info, meter)
+            entries[name] = _lazy_member(archive, info, meter)
         return read_columns(entries, where, wanted, time=time, meter=meter)
 
 
-def _checked(info: zipfile.ZipInfo, where: str) -> zipfile.ZipInfo:
+def _check_member(info: zipfile.ZipInfo, where: str) -> zipfile.ZipInfo:
     name = info.filename.replace("\\", "/")
     path = PurePosixPath(name)
     if path.is_absolute() or ".." in path.parts or ":" in path.parts[0]:
         raise error("entry_outside_archive", where=where, got=repr(info.filename)[:60])
     if path.suffix == ".pkl" or "data.pkl" in path.parts:
-        raise pickled(where, info.filename)
+        raise pickle_error(where, info.filename)
     if path.suffix != ".npy":
         raise error("member_not_an_array", where=where, got=repr(info.filename)[:60])
     if info.compress_type not in _PLAIN:
@@ -72,11 +72,13 @@ def _checked(info: zipfile.ZipInfo, where: str) -> zipfile.ZipInfo:
     return info
 
 
-def _entry(archive: zipfile.ZipFile, info: zipfile.ZipInfo, meter: Meter) -> LazyArray:
+def _lazy_member(
+    archive: zipfile.ZipFile, info: zipfile.ZipInfo, meter: Meter
+) -> LazyArray:
     """The array's shape and dtype, and how to read it."""
     meter.tick()
     with archive.open(info) as member:
-        shape, in_columns, dtype, start = _header(member, meter)
+        shape, in_columns, dtype, start = _array_header(member, meter)
     if dtype.hasobject or dtype.kind == "V":
         return LazyArray(shape, dtype, lambda: np.empty(0))
     count = math.prod(shape)
@@ -109,7 +111,9 @@ def _entry(archive: zipfile.ZipFile, info: zipfile.ZipInfo, meter: Meter) -> Laz
     return LazyArray(shape, dtype, values)
 
 
-def _header(member: Any, meter: Meter) -> tuple[tuple[int, ...], bool, np.dtype, int]:
+def _array_header(
+    member: Any, meter: Meter
+) -> tuple[tuple[int, ...], bool, np.dtype, int]:
     """Shape, order, dtype and length of an array's header; ValueError for any other."""
     version = np.lib.format.read_magic(member)
     form = "<H" if version == (1, 0) else "<I"

@@ -13,7 +13,7 @@ from jaxtyping import Shaped
 
 from sim2gp.data.logs.arrays import LazyArray, distinct, read_columns
 from sim2gp.data.logs.budget import Meter
-from sim2gp.data.logs.file import MAGIC, display_path, import_optional, steady
+from sim2gp.data.logs.file import MAGIC, display_path, import_optional, unchanged_size
 from sim2gp.data.logs.table import LogTable
 from sim2gp.errors import error
 
@@ -35,16 +35,16 @@ def read_parquet(
     where = display_path(path)
     import_optional("pyarrow", "parquet", "a Parquet file")
     parquet = import_optional("pyarrow.parquet", "parquet", "a Parquet file")
-    with steady(path) as size:
+    with unchanged_size(path) as size:
         _check_end(path, size, where)
         with parquet.ParquetFile(path, page_checksum_verification=True) as file:
             meter.claim(8 * file.metadata.num_rows, "rows")
             distinct(file.schema_arrow.names, where)
             entries, leaf = {}, 0
             for field in file.schema_arrow:
-                leaves = range(leaf, leaf + _leaves(field.type))
+                leaves = range(leaf, leaf + _leaf_count(field.type))
                 found = (labels or {}).get(field.name)
-                entries[field.name] = _entry(file, field, leaves, meter, found)
+                entries[field.name] = _lazy_column(file, field, leaves, meter, found)
                 leaf = leaves.stop
             if leaf != file.metadata.num_columns:
                 raise ValueError(
@@ -61,16 +61,16 @@ def _check_end(path: Path, size: int, where: str) -> None:
         raise error("no_footer", where=where, got=f"{size} bytes without a footer")
 
 
-def _leaves(kind: Any) -> int:
+def _leaf_count(kind: Any) -> int:
     """How many columns of the file hold a field: those of a record count each."""
     types = import_optional("pyarrow.types", "parquet", "a Parquet file")
     kind = getattr(kind, "storage_type", kind)
     if not types.is_nested(kind):
         return 1
-    return sum(_leaves(kind.field(i).type) for i in range(kind.num_fields))
+    return sum(_leaf_count(kind.field(i).type) for i in range(kind.num_fields))
 
 
-def _entry(
+def _lazy_column(
     file: Any, field: Any, leaves: range, meter: Meter, labels: Sequence[str] | None
 ) -> LazyArray:
     """A column's shape and dtype; the width of a list is what the footer counts."""
@@ -82,7 +82,7 @@ def _entry(
     width = _width(file.metadata, leaves.start) if is_list else 1
 
     def values() -> Shaped[np.ndarray, "..."]:
-        return _column(file, field.name, leaves, width, meter)
+        return _read_column(file, field.name, leaves, width, meter)
 
     if not is_list:
         return LazyArray((rows,), _dtype(kind), values)
@@ -119,7 +119,7 @@ def _dtype(kind: Any) -> np.dtype:
     return np.dtype(kind.to_pandas_dtype())
 
 
-def _column(
+def _read_column(
     file: Any, name: str, leaves: range, width: int, meter: Meter
 ) -> Shaped[np.ndarray, "..."]:
     """All values of a column, and of no other that its name is a part of."""
@@ -145,13 +145,13 @@ def _array(chunk: Any, name: str, where: str) -> Shaped[np.ndarray, "..."]:
     """One chunk as numpy; nulls are NaN, lists are rows of one width (E140)."""
     types = import_optional("pyarrow.types", "parquet", "a Parquet file")
     if not (types.is_nested(chunk.type)):
-        return _plain(chunk)
+        return _chunk_values(chunk)
     if chunk.null_count == 0:
         inner = chunk.flatten()
         width = len(inner) // len(chunk)
         widths = chunk.value_lengths() if hasattr(chunk, "value_lengths") else None
         if widths is None or set(widths.unique().to_pylist()) == {width}:
-            return _plain(inner).reshape(len(chunk), width)
+            return _chunk_values(inner).reshape(len(chunk), width)
     raise error(
         "lists_of_different_lengths",
         where=f"{where}:column {name}",
@@ -159,7 +159,7 @@ def _array(chunk: Any, name: str, where: str) -> Shaped[np.ndarray, "..."]:
     )
 
 
-def _plain(chunk: Any) -> Shaped[np.ndarray, " N"]:
+def _chunk_values(chunk: Any) -> Shaped[np.ndarray, " N"]:
     types = import_optional("pyarrow.types", "parquet", "a Parquet file")
     if types.is_dictionary(chunk.type):
         chunk = chunk.dictionary_decode()

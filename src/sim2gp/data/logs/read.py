@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from sim2gp.data.logs import checks
-from sim2gp.data.logs.alignment import misaligned
+from sim2gp.data.logs.alignment import alignment_notes
 from sim2gp.data.logs.budget import Budget
 from sim2gp.data.logs.file import display_path
 from sim2gp.data.logs.formats import BOOKKEEPING, TIME, Recording, read_recordings
@@ -101,15 +101,15 @@ def read_log(
         )
     except InputError as error:
         raise _or_constant(error, plan) from error
-    about = checks.unused(_left(found[0].tables), place)
-    logs = _episodes(found, plan, path, dict(fixed or {}), group, about)
+    about = checks.unused_columns(_unread_columns(found[0].tables), place)
+    logs = _logs_of_recordings(found, plan, path, dict(fixed or {}), group, about)
     if not logs:
         raise _too_short(place, 1)
-    about += misaligned(max(logs, key=len), states, longest_delay)
+    about += alignment_notes(max(logs, key=len), states, longest_delay)
     return (replace(logs[0], notes=(*logs[0].notes, *about)), *logs[1:])
 
 
-def _episodes(
+def _logs_of_recordings(
     found: Sequence[Recording],
     plan: _Plan,
     path: Path | RawLog,
@@ -163,10 +163,10 @@ def _assembled(
         group,
         tuple(notes),
     )  # fmt: skip
-    return _cut(log, whole.cuts, whole.rows)
+    return _split_at_gaps(log, whole.cuts, whole.rows)
 
 
-def _left(tables: Sequence[LogTable]) -> list[str]:
+def _unread_columns(tables: Sequence[LogTable]) -> list[str]:
     """The columns that were not read, but for a format's own.
 
     A message of a bag has the fields of its type, whoever needs them.
@@ -187,8 +187,8 @@ def _track(table: LogTable, plan: _Plan) -> Track:
     checks.stamps(time, rows)
     known = table.clock is not None or plan.period is not None
     notes += checks.rate(time, cuts, rows.source, in_seconds=known)
-    channels, mask, masked = _channels(table, plan)
-    inputs, clipped = _inputs(table, plan)
+    channels, mask, masked = _measured_channels(table, plan)
+    inputs, clipped = _commanded_inputs(table, plan)
     said = (*table.notes, *notes, *masked, *clipped)
     return Track(table.stream, rows, time, cuts, channels, mask, inputs, said)
 
@@ -271,7 +271,7 @@ def _converted(
     return spec.sign * spec.scale * values + spec.offset
 
 
-def _channels(
+def _measured_channels(
     table: LogTable, plan: _Plan
 ) -> tuple[dict[str, Values], dict[str, Mask], list[Note]]:
     """Measured channels in the system's units, their masks, and what to say."""
@@ -321,7 +321,9 @@ def _wraps(
     return [Note("W122", text)]
 
 
-def _inputs(table: LogTable, plan: _Plan) -> tuple[dict[str, Values], list[Note]]:
+def _commanded_inputs(
+    table: LogTable, plan: _Plan
+) -> tuple[dict[str, Values], list[Note]]:
     """What was commanded; a command beyond its saturation reaches the motor clipped."""
     inputs: dict[str, Values] = {}
     notes: list[Note] = []
@@ -342,7 +344,7 @@ def _inputs(table: LogTable, plan: _Plan) -> tuple[dict[str, Values], list[Note]
     return inputs, notes
 
 
-def _cut(log: Log, cuts: Mask, rows: Rows) -> tuple[Log, ...]:
+def _split_at_gaps(log: Log, cuts: Mask, rows: Rows) -> tuple[Log, ...]:
     """Split at gaps (W111) and at removed rows; pieces of one row are left out."""
     steps = np.diff(log.time)
     gaps = np.concatenate([[False], steps > checks.GAP * np.median(steps)])

@@ -18,13 +18,13 @@ from sim2gp.data.logs.chunks import check_bag, check_database, check_mcap
 from sim2gp.data.logs.definitions import full_name, parse_definition
 from sim2gp.data.logs.file import (
     MAGIC,
-    compressed,
+    compression_error,
     display_path,
     import_optional,
     read_bytes,
-    steady,
+    unchanged_size,
 )
-from sim2gp.data.logs.messages import Message, clocked, collected
+from sim2gp.data.logs.messages import Message, assign_times, collect_streams
 from sim2gp.data.logs.table import LogTable
 from sim2gp.data.logs.unpack import STEP, pieces
 from sim2gp.errors import InputError, error
@@ -48,22 +48,22 @@ def read_bag(
     where = display_path(path)
     with ExitStack() as stack:
         start, messages = _opened(path, kind, wanted, meter, stack)
-        streams, seen = collected(messages, wanted, meter)
+        streams, seen = collect_streams(messages, wanted, meter)
     for name in wanted or ():
         if not any(name in stream.names for stream in streams):
-            known = seen if wanted is None else _names(path, kind, meter)
+            known = seen if wanted is None else _topic_fields(path, kind, meter)
             raise missing_column(name, known, where)
     if not streams:
         raise error("no_messages", where=where, got="no numbers")
-    return clocked(streams, start, clock, where, seen)
+    return assign_times(streams, start, clock, where, seen)
 
 
-def _names(path: Path, kind: str, meter: Meter) -> tuple[str, ...]:
+def _topic_fields(path: Path, kind: str, meter: Meter) -> tuple[str, ...]:
     """The fields of every topic, for the message about one that is missing."""
     again = meter.again()
     with ExitStack() as stack:
         _, messages = _opened(path, kind, None, again, stack)
-        return collected(messages, None, again)[1]
+        return collect_streams(messages, None, again)[1]
 
 
 def _opened(
@@ -77,7 +77,7 @@ def _opened(
     files = _files(path, meter) if path.is_dir() else [path]
     readers = []
     for file in files:
-        stack.enter_context(steady(file))
+        stack.enter_context(unchanged_size(file))
         meter.place = file.name if path.is_dir() else ""
         if kind == "rosbag1":
             check_bag(file, meter)
@@ -130,7 +130,7 @@ def _files(path: Path, meter: Meter) -> list[Path]:
     for file in files:
         first = read_bytes(file, first=16)
         if first.startswith(_ZSTD):
-            raise compressed(display_path(file), first)
+            raise compression_error(display_path(file), first)
         if not first.startswith((MAGIC["mcap"], MAGIC["rosbag2"])):
             meter.place = file.name
             raise ValueError(f"first bytes {first[:8]!r}")

@@ -49,7 +49,7 @@ def _streamed(content: bytes, make: Callable[[], Any]) -> Iterator[bytes]:
         content = stream.unused_data or b""
 
 
-def inflated(content: bytes) -> Iterator[bytes]:
+def inflate(content: bytes) -> Iterator[bytes]:
     """Unpacked bytes of a zlib stream, as HDF5 compresses with gzip."""
     stream = zlib.decompressobj()
     while not stream.eof:

@@ -36,7 +36,7 @@ from sim2gp.identification.forecasts.calibration_words import (
     calibration_verdict,
     describe_calibration,
 )
-from sim2gp.identification.forecasts.prediction import Judged, recording_names
+from sim2gp.identification.forecasts.prediction import ScoredForecasts, recording_names
 
 LEVELS = (*(round(0.05 * k, 2) for k in range(1, 20)), 0.99)
 FEWEST = 8  # blocks that a verdict needs
@@ -57,7 +57,7 @@ class Blocks(NamedTuple):
 
 
 def calibrate_forecasts(
-    found: Judged, names: Sequence[str], logs: Sequence[Log], horizon: float
+    found: ScoredForecasts, names: Sequence[str], logs: Sequence[Log], horizon: float
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Summary entry and arrays ``calibration/...`` of forecasts at the horizon.
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from sim2gp.identification.words import listed
+from sim2gp.identification.words import join_names
 
 NARROW, WIDE, BOTH = "too narrow", "too wide", "wrong shape"
 PASSED, UNKNOWN = "not contradicted", "too few to say"
@@ -44,19 +44,20 @@ def calibration_verdict(
         "shares": share[failed].tolist(),
         "factors": factor[failed].tolist(),
         "ranges": [
-            _range(levels, share, factor, off, part) for part in _runs(failed, off)
+            _failed_range(levels, share, factor, off, part)
+            for part in _failed_runs(failed, off)
         ],
     }
 
 
-def _runs(failed: np.ndarray, off: Float[np.ndarray, " L"]) -> list[np.ndarray]:
+def _failed_runs(failed: np.ndarray, off: Float[np.ndarray, " L"]) -> list[np.ndarray]:
     """Neighbouring levels that fail in one direction."""
     sign = np.where(failed, np.sign(off), 0.0)
     cuts = np.flatnonzero(np.diff(sign)) + 1
     return [p for p in np.split(np.arange(len(sign)), cuts) if sign[p[0]] != 0.0]
 
 
-def _range(
+def _failed_range(
     levels: np.ndarray,
     share: np.ndarray,
     factor: np.ndarray,
@@ -98,18 +99,19 @@ def describe_calibration(
         which, wide = by[PASSED], max(half[c, middle] for c in by[PASSED])
         low, high = max(0.5 - wide, 0.0), min(0.5 + wide, 1.0)
         texts.append(
-            f"{listed([names[c] for c in which])}: {blocks} contradict no level from "
-            f"{_percent(levels[0])} to {_percent(levels[-1])} %; so few cannot tell a "
-            f"50 % band from one that holds {_percent(low)} or {_percent(high)} %."
+            f"{join_names([names[c] for c in which])}: {blocks} contradict no level "
+            f"from {_percent(levels[0])} to {_percent(levels[-1])} %; so few cannot "
+            f"tell a 50 % band from one that holds {_percent(low)} "
+            f"or {_percent(high)} %."
         )
     elif "failed" in by:
         texts.append(f"Judged by {blocks}.")
     if UNKNOWN in by:
         counts = [channels[names[c]]["blocks"] for c in by[UNKNOWN]]
         texts.append(
-            f"{listed([names[c] for c in by[UNKNOWN]])}: too few to say whether the "
-            f"bands are right: {min(counts)} independent blocks of windows ({blocks}), "
-            f"{fewest} are needed."
+            f"{join_names([names[c] for c in by[UNKNOWN]])}: too few to say whether "
+            f"the bands are right: {min(counts)} independent blocks of windows "
+            f"({blocks}), {fewest} are needed."
         )
     return " ".join(texts)
 

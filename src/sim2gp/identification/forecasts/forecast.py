@@ -95,11 +95,11 @@ def forecast_windows(
     parts = []
     for first in range(0, W, size):
         which = np.minimum(np.arange(first, first + size), W - 1)
-        some = _some(grid, which, passed)
+        some = _window_batch(grid, which, passed)
         if simulator is not None:
             found = _forecast_on_host(simulator, system, posterior, some)
         else:
-            found = _forecast(system, posterior, jax.device_put(some))
+            found = _forecast_batch(system, posterior, jax.device_put(some))
         parts.append([np.asarray(x)[: W - first, places] for x in found])
     mean, by_start, by_input, by_constants = map(
         np.concatenate, zip(*parts, strict=True)
@@ -117,13 +117,13 @@ def compile_forecast(system: AbstractSystem, grid: Grid) -> None:
     """
     if simulator_of(system) is not None:
         return  # its programs are small
-    first = _some(grid, np.zeros(_BATCH, int), _passed(grid))
+    first = _window_batch(grid, np.zeros(_BATCH, int), _passed(grid))
     arrays = jax.device_put(first)
-    _forecast.compile_for(system, system.parameters.prior(), arrays)
+    _forecast_batch.compile_for(system, system.parameters.prior(), arrays)
 
 
 @compile_async
-def _forecast(
+def _forecast_batch(
     system: AbstractSystem, posterior: Gaussian, windows: Windows
 ) -> tuple[Array, Array, Array, Array]:
     """Outputs at all rows, their slopes in start and input, variance by constants."""
@@ -136,7 +136,7 @@ def _forecast(
             return simulate(system, params, window, window.start + x[:n], x[n : n + m])
 
         x = jnp.zeros(n + m + posterior.scale.shape[1])
-        return _parts(window, *value_and_jacobian(states, x))
+        return _forecast_parts(window, *value_and_jacobian(states, x))
 
     found: tuple[Array, Array, Array, Array] = windows.each(one)
     return found
@@ -155,10 +155,10 @@ def _forecast_on_host(
     )
     asked = SlopeInputs(mean, windows.start, scale @ by_constants, by_start, by_input)
     run = HostRun(simulator, system, windows, asked)
-    return _parts(windows, run.states, run.slopes())
+    return _forecast_parts(windows, run.states, run.slopes())
 
 
-def _parts(
+def _forecast_parts(
     window: Windows,
     states: Float[AnyArray, "*W L n"],
     slopes: Float[AnyArray, "*W L n k"],
@@ -176,7 +176,7 @@ def _passed(grid: Grid) -> Int[np.ndarray, " L"]:
     return np.union1d([1], np.arange(0, grid.windows.span.shape[1], grid.every))
 
 
-def _some(grid: Grid, which: np.ndarray, rows: np.ndarray) -> Windows:
+def _window_batch(grid: Grid, which: np.ndarray, rows: np.ndarray) -> Windows:
     """Some of the windows, in steps from one of ``rows`` to the next."""
     chosen = grid.windows.some(which)
     new = np.diff(which, prepend=-1) > 0  # what fills a batch up does not move

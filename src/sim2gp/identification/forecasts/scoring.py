@@ -62,7 +62,7 @@ def predicted_spread(
 
 
 @dataclass(frozen=True)
-class Paired:
+class PairedComparison:
     """One model against another: relative change of CRPS, its interval, and wins."""
 
     change: float
@@ -77,7 +77,7 @@ class Paired:
         return self.change < -MATTERS and self.high < 0.0
 
 
-def by_unit(
+def crps_by_unit(
     score: Float[np.ndarray, "models W R c"],
     valid: Bool[np.ndarray, "W R c"],
     unit: Int[np.ndarray, " W"],
@@ -94,36 +94,38 @@ def by_unit(
     return np.stack([per_window[:, unit == u].sum(axis=1) for u in units], axis=1)
 
 
-def paired(
+def compare_paired(
     new: Float[np.ndarray, " units"],
     old: Float[np.ndarray, " units"],
     rng: np.random.Generator,
-) -> Paired:
+) -> PairedComparison:
     """Two models' sums by unit; the interval resamples units (percentile bootstrap).
 
     A model that is not finite somewhere loses.
     """
     count = len(old)
     if not np.all(np.isfinite(new)):
-        return Paired(math.inf, math.inf, math.inf, 0, count)
+        return PairedComparison(math.inf, math.inf, math.inf, 0, count)
     picked = rng.integers(0, count, (RESAMPLES, count))
     changes = new[picked].sum(axis=1) / old[picked].sum(axis=1) - 1.0
     low, high = np.quantile(changes, [0.5 - LEVEL / 2, 0.5 + LEVEL / 2])
     change = float(new.sum() / old.sum() - 1.0)
     better = int(np.sum(new < old))
-    return Paired(change, float(low), float(high), better, count)
+    return PairedComparison(change, float(low), float(high), better, count)
 
 
-def supported(sums: Float[np.ndarray, "models units"], rng: np.random.Generator) -> int:
+def select_model(
+    sums: Float[np.ndarray, "models units"], rng: np.random.Generator
+) -> int:
     """The model to keep, of models from simple to complex: a tie keeps the simpler."""
     kept = 0
     for k in range(1, len(sums)):
-        if paired(sums[k], sums[kept], rng).wins:
+        if compare_paired(sums[k], sums[kept], rng).wins:
             kept = k
     return kept
 
 
-def format_change(found: Paired) -> str:
+def format_change(found: PairedComparison) -> str:
     """``-4.1 % [-7.2, -1.0]``."""
     if not math.isfinite(found.change):
         return "ran away"
@@ -131,8 +133,8 @@ def format_change(found: Paired) -> str:
     return f"{100 * found.change:+.1f} % [{low:+.1f}, {high:+.1f}]"
 
 
-def sentence(
-    what: Mapping[str, str], against: Sequence[Paired], kept: int, unit: str
+def selection_sentence(
+    what: Mapping[str, str], against: Sequence[PairedComparison], kept: int, unit: str
 ) -> str:
     """What the logs support, as one would say it to whoever runs the machine.
 

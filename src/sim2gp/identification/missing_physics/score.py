@@ -46,7 +46,7 @@ FARTHEST = 3.0  # prior sd, of a refit's start
 
 
 @dataclass(frozen=True)
-class Scored:
+class ScoredCandidate:
     """A candidate beside the bare machine, by one linearisation.
 
     ``gain`` is the evidence that it is worth, nats; ``sine`` the part of its effect
@@ -71,7 +71,7 @@ class Scored:
 @in_float64
 def score_candidates(
     data: AbstractData, bare: Estimate, candidates: Sequence[Candidate]
-) -> list[Scored]:
+) -> list[ScoredCandidate]:
     """Every candidate by its linearisation at the bare machine's MAP."""
     machine, n = data.system, bare.nuisances.shape[1]
     names, likelihood = machine.parameters.names, data.likelihood(machine)
@@ -85,7 +85,7 @@ def score_candidates(
     def linear(blocks: np.ndarray, z: np.ndarray) -> _Linear:
         return _linear(data, likelihood, bare, blocks, z)
 
-    plain = _columns(every, whole, [*names, None], n)
+    plain = _select_columns(every, whole, [*names, None], n)
     without = linear(plain, np.asarray([*mode.values(), 0.0]))
     out = []
     for candidate in candidates:
@@ -96,10 +96,10 @@ def score_candidates(
             [_extended(mode, system, {candidate.name: x}) for x in candidate.grid]
         )
         if candidate.smooth:
-            found = _columns(every, whole, order, n)[None]
+            found = _select_columns(every, whole, order, n)[None]
         else:
             each = np.asarray(data.blocks(system, z, bare.nuisances))
-            found = np.stack([_columns(b, system, order, n) for b in each])
+            found = np.stack([_select_columns(b, system, order, n) for b in each])
         own = [system.parameters.names.index(name) for name in order]
         fits = [linear(b, x) for b, x in zip(found, z[:, own], strict=True)]
         gains = [
@@ -115,7 +115,9 @@ def score_candidates(
         best = int(ranked[0])
         sine, shared = _alias(found[best], bare)
         partners = tuple(names[j] for j in shared)
-        out.append(Scored(candidate, system, gains[best], sine, partners, starts))
+        out.append(
+            ScoredCandidate(candidate, system, gains[best], sine, partners, starts)
+        )
     return out
 
 
@@ -238,7 +240,7 @@ def tempered_gain(gain: float, inflation: float, sd: float) -> float:
     return fit * share - 0.5 * math.log1p(less)
 
 
-def widened(inflation: float, sd: float) -> float:
+def sd_widening(inflation: float, sd: float) -> float:
     """How many times ``sd`` (in prior sd) the magnitude is uncertain by then."""
     information = max(1.0 / sd**2 - 1.0, 0.0)
     return math.sqrt((1.0 + information) / (1.0 + information / inflation))
@@ -254,7 +256,7 @@ def _extended(
     return np.asarray([known[name] for name in table.names])
 
 
-def _columns(
+def _select_columns(
     blocks: np.ndarray, system: AbstractSystem, names: Sequence[str | None], n: int
 ) -> np.ndarray:
     """The factors of some constants' columns, in this order; None is an empty one.

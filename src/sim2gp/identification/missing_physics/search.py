@@ -14,11 +14,11 @@ import numpy as np
 from sim2gp.errors import NotConverged, NotFinite
 from sim2gp.identification.missing_physics.data import AbstractData
 from sim2gp.identification.missing_physics.score import (
-    Scored,
+    ScoredCandidate,
     sandwich_inflation,
     score_candidates,
+    sd_widening,
     tempered_gain,
-    widened,
 )
 from sim2gp.inference.estimate import Estimate
 from sim2gp.systems.effects.registry import Candidate
@@ -30,14 +30,14 @@ ODDS = 19.0  # "nothing missing" must be as improbable as 1 in 20
 
 
 @dataclass(frozen=True)
-class Refitted:
+class FittedCandidate:
     """A candidate fitted in earnest; ``gain`` in nats, ``value`` and ``sd`` physical.
 
     ``inflation`` is how much larger the variance of the magnitude is when errors may be
     correlated within clusters of windows; the data's part of the gain is divided by it.
     """
 
-    scored: Scored
+    scored: ScoredCandidate
     fitted: Estimate
     gain: float
     value: float
@@ -55,8 +55,8 @@ class CandidateSearch:
     """Everything that was tried; refits by falling gain."""
 
     bare: Estimate
-    scored: tuple[Scored, ...]
-    refitted: tuple[Refitted, ...]
+    scored: tuple[ScoredCandidate, ...]
+    refitted: tuple[FittedCandidate, ...]
     failed: tuple[str, ...] = field(default=())
 
     @property
@@ -66,7 +66,7 @@ class CandidateSearch:
         return math.log(ODDS * max(ranked, 1))
 
     @property
-    def best(self) -> Refitted | None:
+    def best(self) -> FittedCandidate | None:
         """The best candidate that gains enough and has a possible sign."""
         for refit in self.refitted:
             if refit.gain > self.threshold and refit.physical:
@@ -74,7 +74,7 @@ class CandidateSearch:
         return None
 
     @property
-    def tied(self) -> tuple[Refitted, ...]:
+    def tied(self) -> tuple[FittedCandidate, ...]:
         """Candidates that the evidence does not put behind the best (20 to 1)."""
         best = self.best
         if best is None:
@@ -87,7 +87,8 @@ class CandidateSearch:
 
 #: How the best candidates are fitted: the name of each, and its fit or None.
 Fits = Callable[
-    [AbstractData, Estimate, Sequence[Scored]], Iterable[tuple[str, Refitted | None]]
+    [AbstractData, Estimate, Sequence[ScoredCandidate]],
+    Iterable[tuple[str, FittedCandidate | None]],
 ]
 
 
@@ -126,13 +127,15 @@ def search_candidates(
 
 
 def _in_turn(
-    data: AbstractData, bare: Estimate, ranked: Sequence[Scored]
-) -> Iterator[tuple[str, "Refitted | None"]]:
+    data: AbstractData, bare: Estimate, ranked: Sequence[ScoredCandidate]
+) -> Iterator[tuple[str, "FittedCandidate | None"]]:
     for one in ranked:
         yield one.candidate.name, refit(data, bare, one)
 
 
-def refit(data: AbstractData, bare: Estimate, scored: Scored) -> Refitted | None:
+def refit(
+    data: AbstractData, bare: Estimate, scored: ScoredCandidate
+) -> FittedCandidate | None:
     """A candidate fitted in earnest; None where that does not converge."""
     try:
         return _refit(data, bare, scored)
@@ -140,7 +143,9 @@ def refit(data: AbstractData, bare: Estimate, scored: Scored) -> Refitted | None
         return None
 
 
-def _refit(data: AbstractData, bare: Estimate, scored: Scored) -> Refitted:
+def _refit(
+    data: AbstractData, bare: Estimate, scored: ScoredCandidate
+) -> FittedCandidate:
     fitted = data.refit(scored.system, scored.starts, bare)
     table, name = scored.system.parameters, scored.candidate.name
     j = table.names.index(name)
@@ -154,5 +159,5 @@ def _refit(data: AbstractData, bare: Estimate, scored: Scored) -> Refitted:
     raw = float(fitted.log_evidence - bare.log_evidence)
     relative = sd / table[name].sd
     gain = tempered_gain(raw, inflation, relative)
-    half = 0.5 * (ends[1] - ends[0]) * widened(inflation, relative)
-    return Refitted(scored, fitted, gain, middle, half, inflation)
+    half = 0.5 * (ends[1] - ends[0]) * sd_widening(inflation, relative)
+    return FittedCandidate(scored, fitted, gain, middle, half, inflation)

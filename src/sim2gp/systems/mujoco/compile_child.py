@@ -20,7 +20,7 @@ from typing import Any
 MEMORY = 8 << 30
 
 
-def given(folder: str, i: int) -> dict[str, Any]:
+def read_model(folder: str, i: int) -> dict[str, Any]:
     """A model's kind (``suffix``), its text, and files by the names it has for them."""
     with open(os.path.join(folder, f"{i}.json"), encoding="utf-8") as file:
         found: dict[str, Any] = json.load(file)
@@ -112,7 +112,7 @@ def compile_models(seconds: str, folder: str, form: str, count: str) -> int:
     mujoco.set_mju_user_warning(lambda text: say("WARNING:", text))
     warnings.simplefilter("always")
     warnings.showwarning = lambda message, *_: say("WARNING:", message)
-    models = [given(folder, i) for i in range(int(count))]
+    models = [read_model(folder, i) for i in range(int(count))]
     outs = [os.path.join(folder, f"{i}.{form}") for i in range(int(count))]
     files = [open(out, "wb") for out in outs]  # noqa: SIM115 (closed at the end)
     forbid_files()

@@ -34,7 +34,7 @@ def backends(environment: Mapping[str, str], platform: str) -> list[str]:
     return ["egl", "osmesa"]
 
 
-def rendered(
+def render_motion(
     model: Any,
     recorded: Float[np.ndarray, "T nq"],
     forecast: Float[np.ndarray, "T nq"],
