@@ -173,7 +173,7 @@ class Explain(Reads):
     def run(self, call: Call) -> dict[str, Any]:
         out = run_directory(self.out, f"explain-{self.path.name}")
         module = "commands.explain"
-        run = function(module, "explainable")(
+        run = function(module, "load_explainable")(
             self.path, budget(self.budget), strict=self.strict
         )
         file = function(module, "project_file")(run) if self.add else None

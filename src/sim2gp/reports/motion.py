@@ -44,7 +44,7 @@ def film(
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Summary entry "animation" and its arrays; both empty for an unknown machine.
 
-    ``picture`` is what `drawn` of the forecasts made of ``grid``. Of a machine in
+    ``picture`` is what `forecast_traces` made of ``grid``. Of a machine in
     several configurations the film keeps to that of its first window.
     """
     machine = plant_of(system)

@@ -1,6 +1,6 @@
 """Three answers told apart: nothing is missing, this effect is, or none of these.
 
-An effect is missing when its evidence makes "nothing" improbable (`missing.search`);
+An effect is missing when its evidence makes "nothing" improbable (`search_candidates`);
 whether the library holds the truth is asked of what the best fit leaves over
 (`misfit`). Evidence alone would always name somebody: the least bad candidate of a
 library that does not hold the truth gains as much as a true one.
