@@ -1,6 +1,6 @@
 """The child process that renders a motion with MuJoCo: run as a script, in isolation.
 
-    python -I mujoco_render.py FOLDER
+    python -I render.py FOLDER
 
 FOLDER holds ``model.mjb`` and ``motion.npz``: joint positions ``recorded`` and
 ``forecast``, ``lookat``, and ``view`` (azimuth and elevation in degrees, distance,
