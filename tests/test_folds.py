@@ -97,7 +97,7 @@ def test_neither_fit_nor_band_sees_what_is_held_out(
         one = np.ones(2)
         return Band(np.ones(4), np.ones(1), one, np.array([0.0]), one[None], 1.0)
 
-    for name, stub in (("fit_windows", fitted), ("predicted", forecasts)):
+    for name, stub in (("fit_windows", fitted), ("forecast_grid", forecasts)):
         monkeypatch.setattr(folds, name, stub)
     monkeypatch.setattr(folds, "fit_band", band)
     path = tmp_path / "cart.toml"
