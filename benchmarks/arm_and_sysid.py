@@ -189,8 +189,8 @@ def table(rows: list[dict[str, Any]]) -> str:
     ]
     who = {
         "ours": "sim2gp, delay learned",
-        "told": "sim2gp, delay told",
-        "sysid": "mujoco.sysid, delay told",
+        "told": "sim2gp, delay given",
+        "sysid": "mujoco.sysid, delay given",
     }
     for seconds in dict.fromkeys(row["seconds"] for row in rows):
         warm = [r for r in rows if r["seconds"] == seconds and not r["cold"]]

@@ -77,7 +77,7 @@ class _Known:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Medians over seeds, as Markdown."""
-    lines = ["| log | windows | delay learned | delay told |", "|---|---|---|---|"]
+    lines = ["| log | windows | delay learned | delay given |", "|---|---|---|---|"]
     for seconds, window in dict.fromkeys((r["seconds"], r["window"]) for r in rows):
         mine = [r for r in rows if (r["seconds"], r["window"]) == (seconds, window)]
         cut_ = "the whole log" if window == seconds else f"{window:g} s"

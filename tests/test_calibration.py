@@ -159,7 +159,7 @@ def test_the_words_name_levels_direction_and_factor() -> None:
         np.testing.assert_allclose(entry["factors"], factor, rtol=0.01)
         assert entry["blocks"] == about["independent"] == 16
     assert (
-        "right: 16 stretches of about 12 s in 1 recording contradict no level"
+        "right: 16 stretches of about 12 s in 1 recording contradict no band"
         in (about["text"])
     )
     assert "bands hold too few measurements (the" in about["text"]

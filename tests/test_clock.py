@@ -61,7 +61,7 @@ def test_a_row_is_a_whole_number_of_the_models_steps(hertz: int, step: float) ->
     (span,) = spans_of(log_of(period), arm(step))
     assert span == pytest.approx(period / count)
     (line,) = clock_lines([log_of(period)], arm(step))
-    assert ("as in its file: constants" in line) == (abs(span - step) > 1e-9)
+    assert ("as in its file: parameters" in line) == (abs(span - step) > 1e-9)
     assert (f'timestep="{span:.6g}"' in line) == (abs(span - step) > 1e-9)
     assert bool(clock_warnings([log_of(period)], arm(step))) == (
         abs(span - step) > 1e-9

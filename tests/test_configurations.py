@@ -144,7 +144,7 @@ def test_what_makes_no_sense_is_refused() -> None:
         Variant("a", own=("paylod",))
     )
     twice = Variant("a", (("payload", 0.1),), ("payload",))
-    assert "E145 a constant stated twice" in refused(twice)
+    assert "E145 a parameter stated twice" in refused(twice)
     assert "two configurations of one name" in refused(BARE, BARE)
     unknown = refused(BARE, LOADED, **{"payload @ bare": arm().parameters["payload"]})
     assert "E145 unknown parameter: got payload @ bare" in unknown

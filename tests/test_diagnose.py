@@ -290,7 +290,7 @@ def test_signed_parameters_move_in_their_units():
         "Raise mass by 1 %, raise offset by 0.000667 rad",
         "Raise offset by 0.001 rad, raise mass by 1.5 %",
     )
-    assert open_["text"].removesuffix(": the data cannot tell.") in told
+    assert open_["text"].removesuffix(": the data stay the same.") in told
 
 
 def test_units_of_products_cancel():

@@ -260,7 +260,7 @@ def test_the_words_say_whether_physics_is_missing() -> None:
     assert "sim2gp explain" in text
     sound = CorrectedFit(posterior, 9.0, 1, 30.0, True, 0.04, ("q1.coulomb",))
     text = intervals.describe_intervals(sound, [3.0], 40)
-    assert "coloured and pull the constants 3 times" in text
+    assert "coloured and pull the parameters 3 times" in text
     assert "missing, which has a probability of 4 %" in text
     none = CorrectedFit(posterior, 9.0, 1, 30.0, True)
     assert "not physics that the model lacks" in intervals.describe_intervals(

@@ -159,7 +159,7 @@ def test_the_arm_in_words():
     second = 100.0 * 0.04 * per / nominal["I1"]
     assert open_["text"] == (
         f"Raise m2 by 1 %, lower m1r1 by {first:.3g} %, lower I1 by {second:.3g} %: "
-        "the data cannot tell."
+        "the data stay the same."
     )
     assert out["parameters"]["m2"]["partners"] == ["m1r1"] or out["parameters"]["m2"][
         "partners"

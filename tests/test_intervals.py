@@ -267,15 +267,15 @@ def test_a_corrected_posterior_changes_spreads_and_not_the_structure() -> None:
     with jax.enable_x64(True):
         other = Gaussian(belief[2].mean, belief[2].scale.at[2].multiply(16.0))
     open_now = json.dumps(study(*belief, corrected=other)["directions"])
-    assert "The data fix c" in json.dumps(plain["directions"])
-    assert "The data hardly tell c: 80 % of the prior" in open_now
+    assert "The data determine c" in json.dumps(plain["directions"])
+    assert "The data hardly determine c: 80 % of the prior" in open_now
 
 
 def test_the_words_say_which_intervals_these_are() -> None:
     found = intervals.CorrectedFit(gaussian(np.zeros(1), np.eye(1)), 9.0, 2, 30.0, True)
     text = intervals.describe_intervals(found, [1.0, 2.96, 3.31], 40)
     assert text.startswith("Intervals are 1 to 3.3 times as wide")
-    assert "40 windows are coloured and pull the constants 3 times" in text
+    assert "40 windows are coloured and pull the parameters 3 times" in text
     assert "are 3 times as wide" in intervals.describe_intervals(found, [3.0, 3.0], 40)
     white = dataclasses.replace(found, inflation=1.0)
     text = intervals.describe_intervals(white, [1.02, 1.1], 40)

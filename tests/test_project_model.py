@@ -87,7 +87,7 @@ value = 0.3
     assert system.parameters.names == ("joint/shoulder/damping",)
     assert dict(system.parameters.fixed) == {"joint/elbow/damping": 0.3}
     text = '[parameters]\n"joint/*/damping" = 1.0\n"joint/s*/damping" = 2.0\n'
-    with pytest.raises(InputError, match=r"E145 a constant named twice.*line 2"):
+    with pytest.raises(InputError, match=r"E145 a parameter named twice.*line 2"):
         load_project(project(tmp_path, text))
 
 
@@ -266,7 +266,7 @@ def test_its_constants_go_into_the_file(identified: Path, capsys) -> None:
     assert main(["apply", run, "--out", str(out), "--json", "--quiet"]) == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["written"] == [str(out)]
-    assert summary["not_written"] == {"push.delay": "no constant of the model's file"}
+    assert summary["not_written"] == {"push.delay": "no parameter of the model's file"}
     model = mujoco.MjModel.from_xml_path(str(out))
     damping, gear = model.dof_damping[0], model.actuator_gear[0, 0]
     assert model.dof_damping.tolist() == [damping, damping]

@@ -260,7 +260,7 @@ def export(name, model, data, before, belief, tmp_path):
         export_model(belief, out, SYSTEM, dt=DT, draws=3, key=KEY)
         assert (out / "arrays.npz").exists()
         return
-    with pytest.raises(InputError, match=r"^E134 no constants in a belief of type"):
+    with pytest.raises(InputError, match=r"^E134 no parameters in a belief of type"):
         export_model(belief, out, SYSTEM, dt=DT, draws=3, key=KEY)
     assert not out.exists()
 

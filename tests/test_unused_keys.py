@@ -63,7 +63,7 @@ WITHOUT_EFFECT: dict[str, tuple[str, str]] = {
     "a pattern whose constants are all named": (
         'system = "arm.xml"\n[parameters."joint/*/damping"]\ntie = true\n'
         '[parameters]\n"joint/shoulder/damping" = 0.1\n"joint/elbow/damping" = 0.1\n',
-        "E145 pattern without constants of its own.*line 2",
+        "E145 pattern without parameters of its own.*line 2",
     ),
     "an option of another machine": (
         "[options]\nlength1 = 0.2\n",

@@ -201,7 +201,7 @@ def test_a_project_file_says_what_was_weighed(tmp_path: Path) -> None:
         ("1.24", "-1.0", "E142 a measured sum that the bounds rule out"),
         ("0.005", "0.0", "E144"),
         ('"m2"', '"mm2"', "did you mean m2"),
-        ('"m2"', '"m1"', "E145 a constant twice"),
+        ('"m2"', '"m1"', "E145 a parameter twice"),
         ("sd =", "weights = [1.0]\nsd =", "E160 weights of a sum"),
         ("sd =", "weight = 1.0\nsd =", "did you mean weights"),
         ("[[weighed]]", "[parameters]\nm1 = 1.0\nm2 = 0.24\n[[weighed]]", "unknowns"),

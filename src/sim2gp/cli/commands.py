@@ -47,7 +47,7 @@ from sim2gp.runs.store import check_absent, read_run
 
 @dataclass(kw_only=True)
 class Demo(Writes):
-    """Learn to swing up a pendulum whose constants are unknown, in a few trials."""
+    """Learn to swing up a pendulum whose parameters are unknown, in a few trials."""
 
     machine: Literal["furuta", "cartpole"] = "furuta"
     """Which pendulum."""
@@ -58,12 +58,12 @@ class Demo(Writes):
     episodes: Count = 3
     """Real episodes of each run, 5 s each."""
     truth: Literal["prior", "2sd", "3sd", "outside"] = "prior"
-    """Hidden constants: as believed, each so far off, or beyond its bounds."""
+    """Hidden parameters: as believed, each so far off, or beyond its bounds."""
     log_to: Annotated[
         Literal["jsonl", "tensorboard", "wandb"] | None,
         option("{jsonl,tensorboard,wandb}"),
     ] = None
-    """Write each episode's numbers, as they come, beside the run directory."""
+    """Write each episode's numbers, as they come, next to the run directory."""
 
     def run(self, call: Call) -> dict[str, Any]:
         out = run_directory(self.out, "demo")
@@ -78,7 +78,7 @@ class Demo(Writes):
 
 @dataclass(kw_only=True)
 class Design(Writes, Chosen):
-    """The next experiment on a machine, and what it should tell."""
+    """The next experiment on a machine, and how much it should narrow intervals."""
 
     run_or_project: Annotated[Positional[Path], arg(metavar="RUN|PROJECT")]
     """An identify run; a project file where there is no log yet."""
@@ -87,15 +87,15 @@ class Design(Writes, Chosen):
     kind: Literal["free", "multisine"] = "free"
     """Family of the commands."""
     about: Annotated[tuple[str, ...], option("NAME...")] = ()
-    """Constants to learn; default all."""
+    """Parameters to learn; default all."""
     predict: SomeSeconds = None
     """Learn what predictions so far ahead depend on."""
     within: Percent = 2.0
     """Known within so much is known well enough."""
     limit: Annotated[tuple[str, ...], option("NAME=LOW:HIGH...")] = ()
-    """Limits of inputs and states, beside the project's."""
+    """Limits of inputs and states, in addition to the project's."""
     rate: Annotated[tuple[str, ...], option("NAME=RATE...")] = ()
-    """Largest change of an input per s, beside the project's."""
+    """Largest change of an input per s, in addition to the project's."""
     start: Annotated[tuple[str, ...], option("NAME=VALUE...")] = ()
     """Where the machine rests before; default zero."""
     period: SomeSeconds = None
@@ -126,7 +126,7 @@ class Design(Writes, Chosen):
 
 @dataclass(kw_only=True)
 class Apply(Wide):
-    """Write identified constants into the MuJoCo model's own file; shows the diff."""
+    """Write identified parameters into the MuJoCo model's own file; shows the diff."""
 
     path: Annotated[Positional[Path], arg(metavar="RUN")]
     """The folder of identify."""
@@ -184,7 +184,7 @@ class Export(Writes, Wide):
 
 @dataclass(kw_only=True)
 class Report(Common):
-    """Draw the report of a run anew."""
+    """Draw the report of a run again."""
 
     path: Annotated[Positional[Path], arg(metavar="RUN")]
     """The folder of an earlier command."""

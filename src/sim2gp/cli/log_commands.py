@@ -88,18 +88,18 @@ class Init(Common):
 
 @dataclass(kw_only=True)
 class Identify(Reads):
-    """Posterior of a machine's constants from its logs."""
+    """Posterior of a machine's parameters from its logs."""
 
     project: Annotated[Positional[Path], arg(metavar="PROJECT")]
     """The project file (TOML)."""
     seed: Seed = 0
     """Draws the starts of the fit."""
     check: Flag = False
-    """Hold the posterior against the exact one (Pareto k); takes as long again."""
+    """Compare the posterior with the exact one (Pareto k); takes as long again."""
     nuts: Flag = False
-    """Hold it against draws by NUTS, too (extra mcmc); half an hour and more."""
+    """Compare it with draws by NUTS, too (extra mcmc); half an hour and more."""
     longer: Flag = False
-    """Fit windows five times as long, too: do they tell more?"""
+    """Fit windows five times as long, too: are intervals narrower?"""
     quick: Flag = False
     """No second fit, which forecasts data that it has not seen."""
 

@@ -97,7 +97,7 @@ def apply(
         _write_models(file, edited, Path(folder, f"model{file.suffix}"))
     summary = {
         "command": "apply",
-        "title": f"{found.name}: its constants in {file.source.name}",
+        "title": f"{found.name}: its parameters in {file.source.name}",
         "model": str(file.source),
         **posterior_entries(found.summary, posterior),
         "written": [],
@@ -144,7 +144,7 @@ def _model_values(
             matching(system.file().constants, name)  # raises with the nearest name
             raise error("constant_not_open", got=name)
     apart = {
-        name: "no constant of the model's file"
+        name: "no parameter of the model's file"
         for name, value in values.items()
         if name not in system.names and (name in learned or value != _neutral(name))
     }

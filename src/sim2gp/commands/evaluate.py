@@ -252,13 +252,13 @@ def _constants_table(
     """The constants of every fold: what does not stay put was not determined."""
     names = {log.source: log.name for log in logs}
     return {
-        "title": "Constants of each fit (MAP)",
+        "title": "Parameters of each fit (most probable values)",
         "columns": ["without", *project.system.parameters.names],
         "rows": [
             [names[file], *(f"{x:.3g}" for x in row)]
             for file, row in zip(files, values, strict=True)
         ],
-        "note": "One log fewer should not move a constant that the logs determine.",
+        "note": "One log fewer should not move a parameter that the logs determine.",
     }
 
 

@@ -179,7 +179,7 @@ def identified_headline(parameters: dict[str, dict[str, Any]]) -> str:
     """How many constants the logs determine, and which they do not."""
     sure = [n for n, entry in parameters.items() if entry["verdict"] == "identified"]
     rest = [n for n in parameters if n not in sure]
-    text = f"{len(sure)} of {len(parameters)} constants are identified"
+    text = f"{len(sure)} of {len(parameters)} parameters are identified"
     if sure:
         text += f" ({', '.join(sure)})"
     return (

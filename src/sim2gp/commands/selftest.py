@@ -43,12 +43,12 @@ CHECKS = {
     ),
     "degenerate": Check(
         "no data, one row, zero sensitivity, equal rows, rank one, condition 1e16, "
-        "more constants than rows: departure from the prior where nothing is known",
+        "more parameters than rows: departure from the prior where nothing is known",
         checks.degenerate,
         1e-10,
     ),
     "bounds": Check(
-        "constants outside their bounds at virtual values up to infinity; round trip",
+        "parameters outside their bounds at virtual values up to infinity; round trip",
         checks.bounds_round_trip,
         1e-12,
     ),

@@ -82,7 +82,7 @@ def forecast_unseen(
         channel_units(project.system),
     )
     summary["text"] = (
-        f"The constants were fitted once more without {part.words}, which that fit "
+        f"The parameters were fitted once more without {part.words}, which that fit "
         "then forecast, knowing its inputs. The other sections rest on all of the data."
     )
     if part.recordings == 1:

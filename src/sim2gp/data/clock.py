@@ -89,7 +89,7 @@ def _clock_line(log: Log, own: float) -> tuple[str, bool]:
     text += f" of the model, {_ms(step)}"
     text += " each, " if count > 1 else ", "
     if other:
-        text += f"not {_ms(own)} as in its file: constants are those of this step, "
+        text += f"not {_ms(own)} as in its file: parameters are those of this step, "
         text += f'set timestep="{step:.6g}" where you use them'
     else:
         text += "as in its file"

@@ -144,7 +144,7 @@ def expected_table(expected: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     ]
     return {
         "title": "What the experiment should tell",
-        "columns": ["constant", "MAP", "corrected sd", "sd now", "sd after", "left"],
+        "columns": ["parameter", "MAP", "corrected sd", "sd now", "sd after", "left"],
         "rows": rows,
         "note": "The corrected sd has the model's errors in it, and the limits of the "
         "states hold for machines as different as that. The others are plain: expected "

@@ -40,7 +40,7 @@ def configuration_entries(
         "title": "The machine's configurations",
         "columns": ["", *about],
         "rows": rows,
-        "note": "All other constants are shared: one number for all recordings.",
+        "note": "All other parameters are shared: one number for all recordings.",
     }
     return {"configurations": about, "tables": [listed]}
 

@@ -84,7 +84,7 @@ def _constant_lines(c: Contents, file: bool) -> list[str]:
     selection = c.selection or Selection({}, {})
     opened = [p for p in table if p.name not in selection.held]
     whose = "within a factor of three of the file's numbers" if file else "as bundled"
-    rows = [f"# {len(opened)} constants are open, {whose}:"]
+    rows = [f"# {len(opened)} parameters are open, {whose}:"]
     if c.unselected:
         rows.append(f"# (which of them the logs tell apart is {c.unselected})")
     value = {p.name: f"{nominal[p.name]:.4g} {p.unit}".rstrip() for p in table}

@@ -37,10 +37,10 @@ _OLDER = {"box": "bounded", "log_box": "log_bounded"}
 
 
 class PriorSpec(Section):
-    """What is believed of one constant: a value, moments, a box, or both of these."""
+    """What is known of one parameter: a value, a mean and sd, bounds, or both."""
 
     value: FiniteFloat | None = None
-    """Fixes the constant."""
+    """Fixes the parameter."""
     mean: FiniteFloat | None = None
     """Prior mean; needs `sd` or `relative_sd`."""
     sd: FiniteFloat | None = None
@@ -53,32 +53,31 @@ class PriorSpec(Section):
     high: FiniteFloat | None = None
     """Upper bound."""
     map: Map | None = None
-    """How it is unbounded for the fit (older files say box and log_box): by its place
-    in the box, the same of the logarithm, its logarithm, itself; the last two
-    without bounds."""
+    """The scale of the fit: between bounds its place (bounded) or that of its logarithm
+    (log_bounded); without bounds its logarithm or itself. Older files say box and
+    log_box."""
 
 
 class ParameterSpec(PriorSpec):
-    """A prior of a constant of the machine, or of all that a pattern names."""
+    """A prior of a parameter of the machine, or of all that a pattern names."""
 
     tie: bool = False
-    """The constants of a pattern are one number for each quantity (model's file alone).
-    """
+    """All parameters of a pattern are one number for each quantity (MuJoCo models)."""
 
 
 class EffectSpec(PriorSpec):
-    """Physics that the machine's equations lack: its magnitude, as any constant's.
+    """Physics that the machine's equations lack: its magnitude, as any parameter's.
 
-    ``[effects.theta.coulomb]`` adds the constant ``theta.coulomb``; a bare number
-    fixes it. Below are options of the effects that have them.
+    ``[effects.theta.coulomb]`` adds the parameter ``theta.coulomb``; a bare
+    number fixes it. Below are options of the effects that have them.
     """
 
     width: Positive | None = None
-    """Of the smoothed step of a dry friction (the channel's velocity)."""
+    """Over which dry friction changes its sign (the channel's velocity)."""
     speed: Positive | None = None
     """Over which Stribeck friction falls (the channel's velocity)."""
     smoothing: Positive | None = None
-    """Of the edge of a dead zone (the input's unit)."""
+    """Width of the edge of a dead zone (the input's unit)."""
 
 
 #: What an effect has beside the prior of its magnitude.
@@ -93,8 +92,8 @@ class ColumnSpec(Section):
     column: str
     """The column's name in the file."""
     unit: str | None = None
-    """What the file holds (`deg`, `mm`, `ms`, `rpm`, ...); the channel's own if not
-    said."""
+    """What the file holds (`deg`, `mm`, `ms`, `rpm`, ...); by default the channel's
+    own."""
     sign: Literal[1, -1] = 1
     """The sensor's or motor's sign."""
     scale: FiniteFloat = 1.0
@@ -144,21 +143,21 @@ class LogSpec(Section):
     """By channel: its column; of an input also a constant number, `0.0` where it was
     not driven."""
     fixed: dict[str, FiniteFloat] = {}
-    """Constants known in this configuration alone, as a payload's mass."""
+    """Parameters known in this configuration alone, such as a payload's mass."""
     free: list[str] = []
-    """Constants of this configuration alone, `x @ name` in the tables; all others are
+    """Parameters of this configuration alone, `x @ name` in the tables; all others are
     shared."""
     drop_nonfinite: bool = False
     """Mask measurements and cut at inputs that are not finite instead of `E101`."""
 
 
 class WeighedSpec(Section):
-    """A measured sum of constants, each times its weight (default 1)."""
+    """A measured sum of parameters, each times its weight (default 1)."""
 
     of: Annotated[list[str], Field(min_length=1)]
-    """Constants by name; one of a configuration as `x @ name`."""
+    """Parameters by name; one of a configuration as `x @ name`."""
     weights: list[FiniteFloat] | None = None
-    """Of each in the sum, 1 if left out."""
+    """The weight of each in the sum, 1 if left out."""
     value: FiniteFloat
     """The sum as measured."""
     sd: Positive
@@ -185,16 +184,16 @@ class LikelihoodSpec(Section):
     """Seconds that the simulator runs before it starts again; 0 predicts one row from
     the last, and needs every state measured."""
     start: Literal["smoothed", "causal"] = "smoothed"
-    """A window's start is guessed from the samples around it, or from the past alone as
-    a predictor must."""
+    """Where a window's start is guessed from: the samples around it, or the past alone,
+    as in a forecast."""
     robust: bool = False
-    """A Student-t weight (4 degrees of freedom) for each window: for pushes and
-    collisions."""
+    """Windows that do not fit count less (Student-t, 4 degrees of freedom): for pushes
+    and collisions."""
     start_sd: Positive | dict[str, Positive] | None = None
-    """Sd of the start about that guess, by channel or for all; if not said 100 sensor
+    """Sd of the start about that guess, by channel or for all; by default 100 sensor
     steps of a measured state, and the size of an unmeasured one."""
     noise_floor: Positive | dict[str, Positive] | None = None
-    """The least noise, by channel or for all; if not said the sensor's step as the log
+    """The least noise, by channel or for all; by default the sensor's step, as the log
     shows it."""
 
 
@@ -207,20 +206,20 @@ class ProjectSpec(Section):
     """Settings of the [machine](#machines); of a model's file `root`, the folder its
     parts must lie in."""
     parameters: dict[str, FiniteFloat | ParameterSpec] = {}
-    """What is believed of its constants."""
+    """What is known of its parameters before the logs."""
     effects: dict[str, dict[str, FiniteFloat | EffectSpec]] = {}
     """[physics](#effectschannelname) that its equations lack."""
     weighed: list[WeighedSpec] = []
-    """[sums of constants](#weighed) that were measured."""
+    """[sums of parameters](#weighed) that were measured, for example on a scale."""
     logs: list[LogSpec] = []
     """Groups of recordings."""
     actuators: dict[str, ActuatorSpec] = {}
     """What lies between a command and the force."""
     likelihood: LikelihoodSpec = LikelihoodSpec()
-    """What the fit holds the recordings against."""
+    """How the fit compares simulator and recordings."""
     limits: dict[str, Pair] = {}
-    """By channel, in its unit: of the next experiment; samples beyond a state's are
-    masked."""
+    """By channel, in its unit, for the next experiment; samples of a log beyond a
+    state's limits are masked."""
     rates: dict[str, Positive] = {}
     """By input, its unit per second: the steepest command of an experiment."""
 

@@ -111,7 +111,7 @@ def _of_text(key: str, value: str, expected: str) -> str:
         return ""
     if not found[2]:
         return "write the value without quotes"
-    return f"write {found[1]}, in the unit of its channel or constant"
+    return f"write {found[1]}, in the unit of its channel or parameter"
 
 
 def _of_table(path: Path_, value: dict[str, Any]) -> str:

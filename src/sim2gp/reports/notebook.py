@@ -54,7 +54,7 @@ def _main_table(summary: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]
     """The constants, or else the first table of the report."""
     constants = summary.get("parameters")
     if isinstance(constants, Mapping):
-        columns = ["constant", "mean", "95 % interval", "unit", "verdict"]
+        columns = ["parameter", "mean", "95 % interval", "unit", "verdict"]
         rows = [
             [
                 name,

@@ -96,7 +96,7 @@ class ChainSummary:
         told = describe_shifts(names, self.shift, self.ratio)
         if told:
             return f"NUTS ({about}) differs from the Gaussian in {join_names(told)}."
-        return f"NUTS ({about}) agrees with the Gaussian in every constant."
+        return f"NUTS ({about}) agrees with the Gaussian in every parameter."
 
 
 def sampler() -> ModuleType:

@@ -99,10 +99,10 @@ def describe_calibration(
         which, wide = by[PASSED], max(half[c, middle] for c in by[PASSED])
         low, high = max(0.5 - wide, 0.0), min(0.5 + wide, 1.0)
         texts.append(
-            f"{join_names([names[c] for c in which])}: {blocks} contradict no level "
-            f"from {_percent(levels[0])} to {_percent(levels[-1])} %; so few cannot "
-            f"tell a 50 % band from one that holds {_percent(low)} "
-            f"or {_percent(high)} %."
+            f"{join_names([names[c] for c in which])}: {blocks} contradict no band "
+            f"from {_percent(levels[0])} to {_percent(levels[-1])} %; with so "
+            f"few, a 50 % band that holds {_percent(low)} or {_percent(high)} % would "
+            "pass, too."
         )
     elif "failed" in by:
         texts.append(f"Judged by {blocks}.")

@@ -198,9 +198,10 @@ def _scores_by_horizon(
         "title": "Error and coverage by horizon, pooled over logs",
         "columns": columns,
         "rows": rows,
-        "note": "Root mean square error of the last sample of open-loop windows that "
-        "start every 0.1 s; held: the start predicted to stay; regression: linear, on "
-        "start and inputs; the share of samples inside the predicted bands.",
+        "note": "For each channel: the root mean square error of the model, one "
+        "horizon after each start (every 0.1 s); of holding still (held); of a linear "
+        "regression on start and inputs; and the shares of samples inside the 90 % and "
+        "the 95 % band.",
     }
 
 
@@ -234,8 +235,8 @@ def _scores_by_log(
         "title": f"Error at {horizon:g} s, log by log",
         "columns": columns,
         "rows": rows,
-        "note": "The regression sees every input of the window; recorded in closed "
-        "loop, these leak the future angle.",
+        "note": "The regression knows all inputs of the window. If a controller made "
+        "them, they depend on the angles that are to be predicted.",
     }
 
 

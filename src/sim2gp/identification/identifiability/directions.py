@@ -61,7 +61,7 @@ def _trade_off(
     others = [int(j) for j in np.flatnonzero(move) if j != pivot]
     sizes = np.asarray([abs(_in_prior_sd(spec, move, j)) for j in others])
     order = [pivot, *(others[n] for n in descending_order(sizes))]
-    text = f"{_describe_move(spec, move, order)}: the data cannot tell."
+    text = f"{_describe_move(spec, move, order)}: the data stay the same."
     return _direction_entry(text, _move_ratio(spec, move, order), 0.0)
 
 
@@ -70,7 +70,7 @@ def _weakly_seen(spec: Spectrum, k: int) -> dict[str, Any]:
     size = np.abs(u)
     order = [j for j in descending_order(size) if size[j] > _MOSTLY * size.max()]
     move = np.sign(u[order[0]]) * u * spec.prior_sd * spec.slope
-    text = f"{_describe_move(spec, move, order)}: the data hardly tell"
+    text = f"{_describe_move(spec, move, order)}: the data hardly change"
     text += f"; {_remaining_spread(spec, k)}."
     return _direction_entry(text, _move_ratio(spec, move, order), l)
 
@@ -79,7 +79,7 @@ def _describe_fixed(spec: Spectrum, k: int) -> dict[str, Any]:
     l = float(spec.eigenvalues[k])
     what = weighted_sum(combination(spec, k), spec.names)
     # With corrected spreads the data may inform and yet leave it open.
-    verb = "fix" if _spread(spec, k) <= _FLAT else "hardly tell"
+    verb = "determine" if _spread(spec, k) <= _FLAT else "hardly determine"
     return _direction_entry(
         f"The data {verb} {what}: {_remaining_spread(spec, k)}.", what, l
     )

@@ -227,7 +227,7 @@ def _times(widened: Sequence[float]) -> str:
 
 def _coloured(found: CorrectedFit, windows: int) -> str:
     return (
-        f"the errors of {windows} windows are coloured and pull the constants "
+        f"the errors of {windows} windows are coloured and pull the parameters "
         f"{digits(math.sqrt(found.inflation), 2)} times as far as white noise would"
     )
 
@@ -248,7 +248,7 @@ def _missing_physics_remark(found: CorrectedFit) -> str:
         return (
             f"The model lacks physics with a probability of {_missing_percent(found)}: "
             f"intervals allow for {len(found.effects)} effects of its library "
-            "(friction, springs, drag and the like), and constants lie where they "
+            "(friction, springs, drag and the like), and parameters lie where they "
             "would with them. sim2gp explain tries the effects one by one."
         )
     count = len(found.effects)

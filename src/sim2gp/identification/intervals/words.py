@@ -71,7 +71,7 @@ def missing_physics_table(told: Mapping[str, Any]) -> list[dict[str, Any]]:
         for name, entry in found
     ]
     note = (
-        "All at once, as the intervals of the constants allow for them. Effects that "
+        "All at once, as the intervals of the parameters allow for them. Effects that "
         "act alike share what is missing, and are uncertain for it; sim2gp explain "
         "asks for the one that explains it alone."
     )

@@ -119,15 +119,15 @@ def _split(distance: float, alarm: bool, about: Mapping[str, object]) -> str:
     halves, why = _HALVES[str(about["split"])]
     if alarm:
         return (
-            f"{halves} give constants that differ {about['times']:.1f} times as much "
+            f"{halves} give parameters that differ {about['times']:.1f} times as much "
             f"as their intervals allow: {why}, or the intervals are too narrow"
         )
-    return "Early and late, gentle and vigorous rows agree on the constants"
+    return "Early and late, gentle and vigorous rows agree on the parameters"
 
 
 _SHORT = {
     "f_test": "The residuals follow the state and the input (F test, {p})",
-    "split_half": "Two halves of the data disagree on the constants (split-half, {p})",
+    "split_half": "Two halves of the data disagree on the parameters (split-half, {p})",
     "ljung_box": "The residuals are correlated from row to row (Ljung-Box, {p})",
     "chi2": "The residuals are larger than the stated noise (chi-squared, {p})",
 }

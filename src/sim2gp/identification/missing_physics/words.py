@@ -76,7 +76,7 @@ def _verdict(
     if refit is best:
         return "missing" if found.effect else "best, but not enough"
     if refit in found.search.tied:
-        return "not told apart from the best"
+        return "not separable from the best"
     if refit.gain > found.search.threshold:
         return "behind the best" if refit.physical else "impossible sign"
     return "no evidence"
@@ -95,7 +95,7 @@ def missing_physics_headline(found: Explanation) -> str:
         return text + ", and what the fit leaves over looks like noise."
     if best is None:
         return (
-            "None of these: no effect of the library is worth its constant, and yet "
+            "None of these: no effect of the library is worth its parameter, and yet "
             f"the simulator does not fit. {reasons}"
         )
     said = _describe_candidate(best)
@@ -107,7 +107,7 @@ def missing_physics_headline(found: Explanation) -> str:
     text = f"Missing: {said}. With it what is left over looks like noise."
     if found.search.tied:
         names = join_names([r.scored.candidate.name for r in found.search.tied])
-        text += f" These data do not tell it from {names}."
+        text += f" These data cannot separate it from {names}."
     return text
 
 
@@ -149,10 +149,12 @@ def candidate_table(
     ]
     return {
         "title": "Candidates, by evidence gained over the machine as it is",
-        "columns": ["constant", "what it is", "nats", "value", "verdict"],
+        "columns": ["parameter", "what it is", "nats", "value", "verdict"],
         "rows": cells,
-        "note": "Fitted candidates first, then those that a linearisation ranked "
-        f"behind; {found.search.threshold:.1f} nats make 'nothing' improbable.",
+        "note": "Nats: the gain in log-likelihood, minus a price for one more "
+        "parameter; 3 nats are 20 times more probable than without the effect. To be "
+        f"named, an effect needs {found.search.threshold:.1f}. Fitted candidates "
+        "first, then those that a linearisation ranked behind.",
     }
 
 
