@@ -78,6 +78,7 @@ def test_worth_is_that_of_the_definition() -> None:
     np.testing.assert_allclose(ahead, expected, rtol=0.0, atol=1e-6 * size)
 
 
+@pytest.mark.nightly
 def test_the_search_keeps_its_limits_and_beats_random_motions(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -74,11 +74,16 @@ def known() -> tuple[Known, Array, Array]:
     return belief, jax.random.normal(c, (T, 3)), jnp.zeros((T, 1))
 
 
-def told(belief: Known, S: Array) -> float:
+@eqx.filter_jit
+def _information(belief: Known, S: Array) -> Array:
+    return joint(*jax.vmap(lambda s: belief.sensitivity(s, s))(S))
+
+
+def information_of(belief: Known, S: Array) -> float:
+    """Nats that the visited states give together."""
     with jax.enable_x64(True):
         exact = jax.tree.map(lambda x: jnp.asarray(x, float), (belief, S))
-        rows = jax.vmap(lambda s: exact[0].sensitivity(s, s))(exact[1])
-        return float(joint(*rows))
+        return float(_information(*exact))
 
 
 @pytest.mark.nightly
@@ -86,7 +91,7 @@ def test_what_is_done_counts_no_more() -> None:
     """Steps made, then steps planned: each adds to the log determinant of all."""
     belief, S, A = known()
     gain = InformationGain(belief)
-    expected = np.diff([0.0, *(told(belief, S[: t + 1]) for t in range(T))])
+    expected = np.diff([0.0, *(information_of(belief, S[: t + 1]) for t in range(T))])
     step, along = eqx.filter_jit(gain.step), eqx.filter_jit(gain.along)
     carry, steps = gain.init(), []
     for t in range(T):
@@ -101,9 +106,10 @@ def test_what_is_done_counts_no_more() -> None:
 def test_step_by_step_everything_is_new() -> None:
     belief, S, A = known()
     gain = InformationGain(belief, together=False)
-    alone = [told(belief, S[t : t + 1]) for t in range(T)]
-    carry, first = gain.step(gain.init(), S[0], A[0], S[0])
-    _, again = gain.step(carry, S[0], A[0], S[0])
+    alone = [information_of(belief, S[t : t + 1]) for t in range(T)]
+    step = eqx.filter_jit(gain.step)
+    carry, first = step(gain.init(), S[0], A[0], S[0])
+    _, again = step(carry, S[0], A[0], S[0])
     assert float(first) == float(again) == pytest.approx(alone[0], rel=1e-4)
     np.testing.assert_allclose(gain.along(carry, S, A, S), alone, rtol=1e-4)
 

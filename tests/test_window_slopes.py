@@ -193,7 +193,13 @@ FORCES = (
 )
 
 
-@pytest.mark.parametrize("forces", [(), FORCES], ids=["as it is", "forces on joints"])
+@pytest.mark.parametrize(
+    "forces",
+    [
+        pytest.param((), id="as it is"),
+        pytest.param(FORCES, id="forces on joints", marks=pytest.mark.nightly),
+    ],
+)
 @in_float64
 def test_the_likelihood_of_logs_has_the_slopes_of_its_own_simulation(tmp_path, forces):
     """In virtual constants and starts, one delay of all drives among the constants."""

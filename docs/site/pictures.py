@@ -48,7 +48,6 @@ CONDITIONS = {
     "cogging10": "cogging is missing: not in the library",
 }
 TERM = "SIM2GP with the term"
-LEARNERS = ["SIM2GP", "point estimate", "RES", "FS", "RES-FS", "Auto", TERM]
 EPISODES = [
     ("nominal, SIM2GP", "SIM2GP"),
     ("nominal, NLM", "NLM"),
@@ -66,7 +65,6 @@ def main() -> None:
     with mpl.rc_context(STYLE):
         drawn = {
             "intervals": intervals(read("intervals/summary.json")),
-            "mismatch": mismatch(read("mismatch/summary.json")),
             "within_episode": within_episode(read("within_episode/scores.json")),
             "session": session(read("session/arms.json")),
         }
@@ -118,29 +116,6 @@ def intervals(found: dict[str, Any]) -> "Figure":
         ax.plot([], [], mark, color="#59636e", mfc="none", ms=5, label=name)
     where = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0)}
     ax.legend(ncols=len(MARKS), frameon=False, handletextpad=0.2, **where)
-    return figure
-
-
-def mismatch(found: dict[str, Any]) -> "Figure":
-    """The score of the third episode, by missing effect and learner."""
-    table = found["tables"][0]
-    at = [table["columns"].index(name) for name in LEARNERS]
-    score = np.array([[float(r[i].split()[0]) for i in at] for r in table["rows"]])
-    figure = blank(5.6)
-    ax = figure.subplots()
-    ax.imshow(score, cmap="RdYlBu", vmin=0.2, vmax=1.4, aspect="auto")
-    for (row, column), x in np.ndenumerate(score):
-        text = f"{x:.2f}".removeprefix("0")
-        ax.text(column, row, text, ha="center", va="center", fontsize=8.5)
-    for edge in (2.5, 5.5, 8.5, 11.5):
-        ax.axhline(edge, color="white", lw=3)
-    names = [name.replace(TERM, "with the term") for name in LEARNERS]
-    ax.xaxis.tick_top()
-    ax.set_xticks(range(len(names)), names, rotation=40, ha="left")
-    rows = [row[0].replace("_", " ") for row in table["rows"]]
-    ax.set_yticks(range(len(rows)), rows)
-    ax.tick_params(length=0)
-    ax.spines[:].set_visible(False)
     return figure
 
 

@@ -24,16 +24,23 @@ def mismatch_map(
         [[_last_median(arrays[f"mismatch/{r}/{c}"]) for c in columns] for r in rows]
     )
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(7.2, 0.9 + 0.3 * len(rows)), layout="constrained")
+        figure = Figure(figsize=(5.4, 0.9 + 0.3 * len(rows)), layout="constrained")
         ax = figure.add_subplot()
-        ax.imshow(score, cmap="YlGnBu", vmin=0.0, vmax=1.2, aspect="auto")
-        for i, j in np.ndindex(score.shape):
-            color = "white" if score[i, j] > 0.75 else "#1f2328"
-            ax.text(j, i, f"{score[i, j]:.2f}", ha="center", va="center", color=color)
-        ax.set_xticks(range(len(columns)), columns, rotation=30, ha="left")
+        ax.imshow(score, cmap="RdYlBu", vmin=0.2, vmax=1.4, aspect="auto")
+        for (i, j), x in np.ndenumerate(score):
+            text = f"{x:.2f}".replace("0.", ".")
+            ink = "white" if x < 0.35 else "black"
+            ax.text(j, i, text, ha="center", va="center", fontsize=8.5, color=ink)
+        effects = [row.split()[0] for row in rows]
+        for i in range(1, len(rows)):
+            if effects[i] != effects[i - 1]:
+                ax.axhline(i - 0.5, color="white", lw=3.0)
+        names = [name.replace("SIM2GP with", "with") for name in columns]
         ax.xaxis.tick_top()
-        ax.set_yticks(range(len(rows)), [r.replace("_", " ") for r in rows])
+        ax.set_xticks(range(len(columns)), names, rotation=40, ha="left")
+        ax.set_yticks(range(len(rows)), [row.replace("_", " ") for row in rows])
         ax.tick_params(length=0)
+        ax.spines[:].set_visible(False)
     return figure
 
 
