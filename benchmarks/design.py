@@ -26,15 +26,15 @@ import numpy as np
 from sim2gp.data.logs import Log
 from sim2gp.data.split_log import cut
 from sim2gp.experiment_design import (
-    AbstractSignal,
-    Everything,
+    AbstractCommandSignal,
+    DOptimal,
     Experiment,
-    Free,
+    FreeCommands,
     LimitBox,
-    Multisine,
-    after,
-    design,
+    MultisineCommands,
     information,
+    optimise_commands,
+    posterior_scale,
     search,
     trajectory,
 )
@@ -44,7 +44,7 @@ from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.parameters import prior_from_moments
 from sim2gp.runs.cells import Cells, Old, add_options
 from sim2gp.runs.workers import cores, spread
-from sim2gp.studies.claims import of_median
+from sim2gp.studies.claims import bootstrap_median
 from sim2gp.systems import TwoLink
 from sim2gp.types import in_float64
 
@@ -114,10 +114,10 @@ def setting(seconds: float) -> tuple[Experiment, LimitBox]:
     return experiment, LimitBox.of(system, LIMITS, RATES, start=np.zeros(4))
 
 
-class Powered(AbstractSignal):
+class Powered(AbstractCommandSignal):
     """Another signal's commands, made smaller where they would take too much energy."""
 
-    inner: AbstractSignal
+    inner: AbstractCommandSignal
     limit: float = eqx.field(static=True)
 
     @property
@@ -142,18 +142,20 @@ def commands(method: str, seed: int, seconds: float) -> np.ndarray:
     """A design of that seed; of random input, what an arm of that seed is given."""
     experiment, limits = setting(seconds)
     steps, key = experiment.steps, jax.random.key(seed)
-    sine = Powered(PERIOD, steps, Multisine(PERIOD, steps), ENERGY)
-    free = Powered(PERIOD, steps, Free(PERIOD, steps), ENERGY)
+    sine = Powered(PERIOD, steps, MultisineCommands(PERIOD, steps), ENERGY)
+    free = Powered(PERIOD, steps, FreeCommands(PERIOD, steps), ENERGY)
     if method == "random":
         return random_input(experiment, limits, free, key)
     if method == "multisine":
         # Optimised at the prior's middle alone.
-        found = design(
-            experiment, Everything(), limits, sine, key=key, draws=1, starts=STARTS
+        found = optimise_commands(
+            experiment, DOptimal(), limits, sine, key=key, draws=1, starts=STARTS
         )
     else:
         family = free if method == "design free" else sine
-        found = design(experiment, Everything(), limits, family, key=key, starts=STARTS)
+        found = optimise_commands(
+            experiment, DOptimal(), limits, family, key=key, starts=STARTS
+        )
     return np.asarray(found.commands)
 
 
@@ -229,7 +231,7 @@ def motion_error(belief: Gaussian, seed: int) -> float:
     the later seconds would hang on its last digits, whatever was learned.
     """
     experiment, limits = setting(HELD * PERIOD)
-    signal = Multisine(PERIOD, HELD)
+    signal = MultisineCommands(PERIOD, HELD)
     U = signal.commands(0.06 * signal.random(jax.random.key(77), 2), limits)
     states = np.asarray(trajectory_of(experiment, experiment.belief.at(truth(seed)), U))
     second, _ = setting(AHEAD * PERIOD)
@@ -281,7 +283,7 @@ trajectory_of = eqx.filter_jit(trajectory)
 def _expected(experiment: Experiment, z: Any, U: Any) -> Any:
     states = trajectory(experiment, experiment.belief.at(z), U)
     A = information(experiment, z, U, states)
-    return jnp.sqrt(jnp.sum(after(experiment.belief, A) ** 2, axis=1))
+    return jnp.sqrt(jnp.sum(posterior_scale(experiment.belief, A) ** 2, axis=1))
 
 
 def work(job: Job) -> dict[str, Any]:
@@ -356,7 +358,9 @@ def lines(found: dict[str, list[Any]]) -> list[str]:
         for other, goal in (("random", OF_RANDOM), ("multisine", OF_MULTISINE)):
             for what in ("constants", "motion"):
                 rng = np.random.default_rng(0)
-                ratio, low, high = of_median(each(ours, what) / each(other, what), rng)
+                ratio, low, high = bootstrap_median(
+                    each(ours, what) / each(other, what), rng
+                )
                 verdict = "holds" if ratio <= goal else "does not hold"
                 out.append(
                     f"{ours}: error of the {what} at most {goal:g} of {other}'s: "

@@ -16,7 +16,11 @@ import numpy as np
 from sim2gp.data.grid import CURVE, evaluation_windows, steps_of
 from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.identification.fit import fit_windows
-from sim2gp.identification.forecasts.prediction import channels, predicted, recordings
+from sim2gp.identification.forecasts.prediction import (
+    channels,
+    forecast_grid,
+    recording_names,
+)
 from sim2gp.identification.intervals.discrepancy import corrected_windows
 from sim2gp.project import load_project
 from sim2gp.project.training_windows import cut_logs
@@ -31,7 +35,7 @@ def compare(path: Path) -> list[str]:
     """A line for each centre and horizon."""
     project = load_project(path)
     logs, system = project.load_logs(), project.system
-    files = list(dict.fromkeys(recordings(logs)))
+    files = list(dict.fromkeys(recording_names(logs)))
     first = files[: (len(files) + 1) // 2]
     known = [log for log in logs if log.source in first]
     others = [log for log in logs if log.source not in first]
@@ -44,7 +48,7 @@ def compare(path: Path) -> list[str]:
     grid = evaluation_windows(others, system, longest=CURVE[-1])
     lines = []
     for name, posterior in (("MAP", belief.posterior), ("corrected mean", wide)):
-        found = predicted(system, posterior, grid, HORIZONS[0])
+        found = forecast_grid(system, posterior, grid, HORIZONS[0])
         for horizon in HORIZONS:
             errors = found.at(np.asarray([steps_of(horizon)])).rmse()[0]
             each = zip(channels(system, windows), errors, strict=True)

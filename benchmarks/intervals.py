@@ -42,7 +42,7 @@ from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.intervals.discrepancy import corrected_windows
 from sim2gp.identification.intervals.pulls import pulls_of_windows
-from sim2gp.identification.intervals.scatter import NOTHING, Corrected
+from sim2gp.identification.intervals.scatter import NOTHING, CorrectedFit
 from sim2gp.identification.misfit.residuals import misfit_of_windows
 from sim2gp.runs.cells import Cells, add_options
 from sim2gp.runs.workers import cores, spread
@@ -160,7 +160,7 @@ def _fitted(data: Recordings, s: int, window: float, key: Any) -> tuple[Any, Any
     return WindowsLikelihood(system, windows), belief, np.asarray([k for k, _ in of])
 
 
-def _units(found: Corrected, prior_sd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _units(found: CorrectedFit, prior_sd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Centre and sd in prior sd."""
     mine = found.posterior
     return np.asarray(mine.mean) / prior_sd, np.asarray(mine.sd()) / prior_sd

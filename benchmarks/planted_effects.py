@@ -1,9 +1,9 @@
-"""Does `explain` find what was planted? Machines with known missing physics.
+"""Does the search find planted physics? Machines with known missing physics.
 
 For each machine and effect, hidden constants are drawn from the prior and two episodes
 of 5 s are flown on the task, process noise as there: one with pink noise as input, one
-that pumps the pole up and over. Neither knows any constant. `explain` then sees states
-and inputs alone.
+that pumps the pole up and over. Neither knows any constant. `find_missing_physics` then
+sees states and inputs alone.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array
 
 from sim2gp.identification.missing_physics.data import OneStepData
-from sim2gp.identification.missing_physics.explain import explain
+from sim2gp.identification.missing_physics.explain import find_missing_physics
 from sim2gp.planning.coloured_noise import coloured_noise
 from sim2gp.planning.tasks import MACHINES, Task, draw_truth
 from sim2gp.systems import (
@@ -193,7 +193,7 @@ def episodes_in(
 
 
 def data_of(machine: str, planted: AbstractPart | None, key: Key) -> OneStepData:
-    """What `explain` sees of them."""
+    """What `find_missing_physics` sees of them."""
     make, _ = MACHINES[machine]
     return OneStepData(make(), episodes_in(machine, planted, key))
 
@@ -218,7 +218,7 @@ def cells(machine: str, truths: int) -> Iterator[tuple[str, int]]:
 def cell(
     machine: str, name: str, index: int, *, seed: int = 0, strength: float = 1.0
 ) -> dict[str, Any]:
-    """What `explain` answers on one hidden machine, and what would be right."""
+    """The search's answer on one hidden machine, and the right one."""
     every = settings(machine)
     planted = every[name]
     if planted is not None:
@@ -226,7 +226,7 @@ def cell(
     key = jax.random.fold_in(jax.random.key(seed), list(MACHINES).index(machine))
     for part in (list(every).index(name), index):
         key = jax.random.fold_in(key, part)
-    found = explain(data_of(machine, planted, key))
+    found = find_missing_physics(data_of(machine, planted, key))
     ranked = [r.scored.candidate.name for r in found.search.refitted]
     scored = sorted((s for s in found.search.scored if not s.alias), key=_falling)
     inside = name in PLANTED[machine] and planted is not None

@@ -38,17 +38,22 @@ from design import (
 )
 from sim2gp.commands.design import expectation
 from sim2gp.data.logs import Log
-from sim2gp.experiment_design import Everything, Free, Multisine, design
-from sim2gp.experiment_design.verdict import Asked, verdict
+from sim2gp.experiment_design import (
+    DOptimal,
+    FreeCommands,
+    MultisineCommands,
+    optimise_commands,
+)
+from sim2gp.experiment_design.verdict import DesignOptions, experiment_verdict
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.runs.cells import Cells, Old, add_options
 from sim2gp.runs.workers import cores, spread
-from sim2gp.studies.claims import of_median
+from sim2gp.studies.claims import bootstrap_median
 from sim2gp.types import in_float64
 
 SECONDS = 10.0
 #: What `sim2gp design` asks by default.
-ASKED = Asked(SECONDS, "free", (), None, 2.0, {}, {}, {}, PERIOD)
+ASKED = DesignOptions(SECONDS, "free", (), None, 2.0, {}, {}, {}, PERIOD)
 #: Of the same motions; the session itself learns from the first.
 RECORDINGS = 5
 MULTISINE = "multisine"  # the cell of its commands
@@ -82,7 +87,7 @@ class Job(NamedTuple):
 def session(seed: int, rounds: int) -> tuple[dict[str, Any], list[np.ndarray]]:
     """Design, run, learn, until it is not worth it; what it said, and its commands."""
     experiment, limits = setting(SECONDS)
-    signal = Free(PERIOD, experiment.steps)
+    signal = FreeCommands(PERIOD, experiment.steps)
     belief: Gaussian = arm().parameters.prior()
     logs: list[Log] = []
     flown: list[np.ndarray] = []
@@ -91,8 +96,10 @@ def session(seed: int, rounds: int) -> tuple[dict[str, Any], list[np.ndarray]]:
     while not stopped and len(logs) < rounds:
         now = eqx.tree_at(lambda e: e.belief, experiment, belief)
         key = jax.random.key(100 * seed + len(logs))
-        found = design(now, Everything(), limits, signal, key=key, starts=STARTS)
-        worth, said = verdict(ASKED, expectation(now, found), found.nats)
+        found = optimise_commands(
+            now, DOptimal(), limits, signal, key=key, starts=STARTS
+        )
+        worth, said = experiment_verdict(ASKED, expectation(now, found), found.nats)
         stopped = not worth
         if worth:
             logs.append(recorded(seed, len(logs), found.commands)[0])
@@ -106,9 +113,9 @@ def session(seed: int, rounds: int) -> tuple[dict[str, Any], list[np.ndarray]]:
 def tuned() -> np.ndarray:
     """The multisine, optimised for the middle of the prior."""
     experiment, limits = setting(SECONDS)
-    signal, key = Multisine(PERIOD, experiment.steps), jax.random.key(0)
-    found = design(
-        experiment, Everything(), limits, signal, key=key, draws=1, starts=STARTS
+    signal, key = MultisineCommands(PERIOD, experiment.steps), jax.random.key(0)
+    found = optimise_commands(
+        experiment, DOptimal(), limits, signal, key=key, draws=1, starts=STARTS
     )
     return found.commands
 
@@ -183,7 +190,7 @@ def lines(rows: list[dict[str, Any]]) -> list[str]:
         errors = f"{each[0]:12.2e}{each[1]:26.2e}{each[2]:24.2e}"
         out.append(f"{i:<4d}{len(row['errors']):6d}{errors}")
     each = np.asarray([error(r, "session") / error(r, "more") for r in rows])
-    middle, low, high = of_median(each, np.random.default_rng(0))
+    middle, low, high = bootstrap_median(each, np.random.default_rng(0))
     held = "holds" if middle <= 1.0 else "does not hold"
     stopped = sum(row["stopped"] for row in rows)
     seconds = SECONDS * np.median([len(row["errors"]) for row in rows])

@@ -19,7 +19,7 @@ from sim2gp.planning.tasks import SOLVED
 from sim2gp.runs import Progress
 from sim2gp.runs.cells import add_options
 from sim2gp.runs.workers import cores
-from sim2gp.studies.claims import interval
+from sim2gp.studies.claims import bootstrap_interval
 from sim2gp.studies.study import run_cells
 from sim2gp.studies.swingup import (
     Cell,
@@ -90,7 +90,7 @@ def _lines(table: dict, every: int) -> list[str]:
                 curve = " ".join(f"{x:5.2f}" for x in np.median(best, axis=0))
                 out.append(f"{learner:21s} {name:9s} {curve}   {soon:4g}")
             difference = early[1] - early[0]
-            low, high = interval(difference, rng)
+            low, high = bootstrap_interval(difference, rng)
             out.append(
                 f"{'':21s} difference of the mean {difference.mean():+.3f} "
                 f"[{low:+.3f}, {high:+.3f}]"

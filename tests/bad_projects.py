@@ -53,16 +53,16 @@ def words(command: str, key: str, *said: str) -> Input:
 def of_two_numbers(folder: Path, patch: Patch) -> None:
     """What both environments ask before they step (test_gymnasium.py)."""
     pytest.importorskip("gymnasium")
-    from sim2gp.robot.gymnasium import checked
+    from sim2gp.robot.gymnasium import validate_action
 
-    checked(np.zeros(2), (1,))
+    validate_action(np.zeros(2), (1,))
 
 
 def without_batch(folder: Path, patch: Patch) -> None:
     pytest.importorskip("gymnasium")
-    from sim2gp.robot.gymnasium import checked
+    from sim2gp.robot.gymnasium import validate_action
 
-    checked(np.zeros(1), (8, 1))
+    validate_action(np.zeros(1), (8, 1))
 
 
 X = np.stack([GOOD["pos"], GOOD["vel"]])

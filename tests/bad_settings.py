@@ -15,10 +15,10 @@ from mass_task import GainModel, mass_task, single
 from sim2gp import checks
 from sim2gp import systems as sy
 from sim2gp.data.grid import evaluation_windows
-from sim2gp.experiment_design.goals import Everything
-from sim2gp.experiment_design.search import design
-from sim2gp.experiment_design.signals import Free
-from sim2gp.experiment_design.signals import Multisine as Sines
+from sim2gp.experiment_design.goals import DOptimal
+from sim2gp.experiment_design.search import optimise_commands
+from sim2gp.experiment_design.signals import FreeCommands
+from sim2gp.experiment_design.signals import MultisineCommands as Sines
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.linear_measurements import LinearMeasurement
 from sim2gp.inference.parameters import Parameter, Parameters, prior_from_moments
@@ -67,8 +67,8 @@ def cut(**options):
 
 def searched(**options):
     plan = experiment()
-    boxes, signal = limits(plan.system), Free(0.01, 200)
-    return design(plan, Everything(), boxes, signal, key=KEY, **options)
+    boxes, signal = limits(plan.system), FreeCommands(0.01, 200)
+    return optimise_commands(plan, DOptimal(), boxes, signal, key=KEY, **options)
 
 
 def sim(**options):
@@ -307,7 +307,7 @@ SETTINGS: tuple[Case, ...] = (
             ("steps in Experiment", lambda: replace(experiment(), steps=0)),
             ("outputs in Experiment", lambda: replace(experiment(), outputs=(0, 9))),
             ("tones in Multisine", lambda: Sines(0.02, 100, tones=0)),
-            ("spacing in Free", lambda: Free(0.02, 100, spacing=0.0)),
+            ("spacing in Free", lambda: FreeCommands(0.02, 100, spacing=0.0)),
             ("draws in design", lambda: searched(draws=0)),
             (
                 "draws in export_model",

@@ -8,7 +8,7 @@ import pytest
 
 from recordings import Channel
 from sim2gp.data.logs import Log
-from sim2gp.data.logs.alignment import misaligned
+from sim2gp.data.logs.alignment import alignment_notes
 from sim2gp.project import load_project
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -54,7 +54,7 @@ def swing() -> Log:
 
 @pytest.mark.parametrize("rows", [-7, -3, -2, -1, 3, 4, 9])
 def test_the_shift_is_found(swing: Log, rows: int) -> None:
-    (note,) = misaligned(shifted(swing, rows), JOINT)
+    (note,) = alignment_notes(shifted(swing, rows), JOINT)
     side = "late" if rows > 0 else "early"
     word = "row " if abs(rows) == 1 else "rows "
     assert note.code == "W118"
@@ -64,21 +64,21 @@ def test_the_shift_is_found(swing: Log, rows: int) -> None:
 
 
 def test_what_is_in_place_is_not_called_so(swing: Log) -> None:
-    assert misaligned(swing, JOINT) == []
+    assert alignment_notes(swing, JOINT) == []
     for rows in (-3, 3):
         units = shifted(swing, rows)
-        (note,) = misaligned(units, JOINT)
+        (note,) = alignment_notes(units, JOINT)
         scaled = replace(
             units, inputs={"u": 1e3 * units.inputs["u"]}, time=units.time + 1e6
         )
-        assert misaligned(scaled, JOINT)[0].text == note.text
+        assert alignment_notes(scaled, JOINT)[0].text == note.text
 
 
 def test_a_delay_that_the_model_has_is_its_own(swing: Log) -> None:
     late = shifted(swing, -3)
-    assert misaligned(late, JOINT, 0.03) == []
-    assert misaligned(late, JOINT, 0.01) != []
-    assert misaligned(shifted(swing, 4), JOINT, 0.1) != []
+    assert alignment_notes(late, JOINT, 0.03) == []
+    assert alignment_notes(late, JOINT, 0.01) != []
+    assert alignment_notes(shifted(swing, 4), JOINT, 0.1) != []
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-4, 1e-2])
@@ -87,19 +87,19 @@ def test_a_controller_is_no_misalignment(noise: float) -> None:
     steps = np.sign(np.sin(0.03 * np.arange(1000)))
     for target in (0.0 * steps, steps, np.sin(0.02 * np.arange(1000))):
         log = log_of(30.0 * target, gain=(30.0, 4.0), noise=noise)
-        assert misaligned(log, JOINT) == []
+        assert alignment_notes(log, JOINT) == []
 
 
 def test_nothing_is_said_of_what_tells_nothing(swing: Log) -> None:
     t = DT * np.arange(600)
     slow = log_of(4.0 * np.sin(0.5 * t))
-    assert misaligned(shifted(slow, 3), JOINT) == []
+    assert alignment_notes(shifted(slow, 3), JOINT) == []
     still = replace(swing, inputs={"u": 0.0 * swing.inputs["u"]})
-    assert misaligned(still, JOINT) == []
+    assert alignment_notes(still, JOINT) == []
     resting = replace(swing, channels={"q": 0.0 * swing.channels["q"]})
-    assert misaligned(resting, JOINT) == []
+    assert alignment_notes(resting, JOINT) == []
     rates = replace(swing, channels={"q.velocity": swing.channels["q"]})
-    assert misaligned(rates, JOINT) == []
+    assert alignment_notes(rates, JOINT) == []
     short = replace(
         swing,
         time=swing.time[:40],
@@ -107,7 +107,7 @@ def test_nothing_is_said_of_what_tells_nothing(swing: Log) -> None:
         inputs={"u": swing.inputs["u"][:40]},
         mask={"q": swing.mask["q"][:40]},
     )
-    assert misaligned(short, JOINT) == []
+    assert alignment_notes(short, JOINT) == []
 
 
 def test_recordings_of_real_machines(shared_data: Path, tmp_path: Path) -> None:
@@ -123,7 +123,7 @@ def test_recordings_of_real_machines(shared_data: Path, tmp_path: Path) -> None:
         (log,) = project.load_logs()
         assert "W118" not in [note.code for note in log.notes]
         states = project.system.physical_states
-        assert misaligned(log, states) == []
+        assert alignment_notes(log, states) == []
     for rows, words in ((-5, "5 rows early"), (12, "12 rows late")):
-        (note,) = misaligned(shifted(log, rows), states)
+        (note,) = alignment_notes(shifted(log, rows), states)
         assert words in note.text

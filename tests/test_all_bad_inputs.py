@@ -49,13 +49,13 @@ def refused(
     """The error of a command that stops at its input, and compiles nothing."""
     patch.setattr("sim2gp.commands.identify.fit_windows", compiled)
     met: list[Sim2GPError] = []
-    printed = cli._told
+    printed = cli._print_error
 
     def told(error: Sim2GPError, code: int, debug: bool) -> int:
         met.append(error)
         return printed(error, code, debug)
 
-    patch.setattr(cli, "_told", told)
+    patch.setattr(cli, "_print_error", told)
     before = contents(Path.cwd())
     assert main(words) == 2
     said = capsys.readouterr()

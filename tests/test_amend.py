@@ -8,7 +8,7 @@ import pytest
 from sim2gp import systems as sy
 from sim2gp.errors import InputError
 from sim2gp.project import load_project
-from sim2gp.project.amend import amend, amended
+from sim2gp.project.amend import amend, amend_text
 from sim2gp.systems import Candidate
 
 TEXT = """# my machine
@@ -81,13 +81,13 @@ def test_what_is_stated_is_not_overwritten(project: Path) -> None:
         InputError,
         match=r"E160.*stated already.*actuators.voltage.delay.*got 0.01.*by hand",
     ):
-        amended(stated, DELAY)
+        amend_text(stated, DELAY)
     project.write_text(stated)
     with pytest.raises(InputError, match=r"E160.*stated already"):
         amend(project, DELAY)
     assert project.read_text() == stated
     with pytest.raises(InputError, match=r"E160.*lag.*delay"):
-        amended(TEXT, Candidate(sy.Lag("voltage", 0.04)))
+        amend_text(TEXT, Candidate(sy.Lag("voltage", 0.04)))
 
 
 def test_an_inline_table_is_edited_in_place(project: Path) -> None:
@@ -116,7 +116,7 @@ def test_a_file_that_became_no_project_stays_as_it_was(
     project: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "sim2gp.project.amend.amended", lambda *given: TEXT + "[effects.x.sprng]\n"
+        "sim2gp.project.amend.amend_text", lambda *given: TEXT + "[effects.x.sprng]\n"
     )
     with pytest.raises(
         InputError, match=r"E160.*cannot be added.*\[effects\.x\.spring\]"

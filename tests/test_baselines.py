@@ -8,12 +8,12 @@ import pytest
 from sim2gp.data.grid import evaluation_windows
 from sim2gp.data.logs import Log
 from sim2gp.identification.forecasts.baselines import (
-    compared,
+    compare_baselines,
     forecast_sentence,
     loss_sentence,
     regression_errors,
 )
-from sim2gp.identification.forecasts.prediction import Judged, scores
+from sim2gp.identification.forecasts.prediction import ScoredForecasts, forecast_scores
 from sim2gp.systems import CartPole
 
 UNITS = {"q1": "rad", "q2": "rad"}
@@ -45,7 +45,9 @@ def test_the_regression_is_exact_where_the_motion_is_linear() -> None:
     assert len(train.windows) <= 254
 
 
-def judged(errors: dict[str, tuple[float, float]], regression: float) -> Judged:
+def judged(
+    errors: dict[str, tuple[float, float]], regression: float
+) -> ScoredForecasts:
     """Two logs with five windows each, after a step, .1 and .5 s.
 
     ``errors`` are the model's and that of holding still, by channel.
@@ -57,15 +59,15 @@ def judged(errors: dict[str, tuple[float, float]], regression: float) -> Judged:
     )
     valid = np.ones(shape, bool)
     log = np.repeat([0, 1], 5)
-    return Judged(
+    return ScoredForecasts(
         np.array([1, 50, 250]), valid, error, np.ones(shape), np.zeros(shape), hold,
         np.full(shape, regression), log, valid, valid,
     )  # fmt: skip
 
 
-def said(found: Judged) -> str:
+def said(found: ScoredForecasts) -> str:
     logs = [swinging(1.0, 0.0), swinging(1.0, 1.0)]
-    summary, _ = scores(found, ["q1", "q2"], logs, 0.5)
+    summary, _ = forecast_scores(found, ["q1", "q2"], logs, 0.5)
     error, against = summary["open_loop_rmse"], summary["trivial"]
     return forecast_sentence("Error", error, against, UNITS)
 
@@ -95,7 +97,7 @@ def test_both_predictors_are_in_both_tables() -> None:
     found = judged(errors, 0.5)
     found.regression[:, 1] = 0.25  # at 0.1 s
     logs = [swinging(1.0, 0.0), swinging(1.0, 1.0)]
-    summary, _ = scores(found, ["q1", "q2"], logs, 0.5)
+    summary, _ = forecast_scores(found, ["q1", "q2"], logs, 0.5)
     by_horizon, by_log = summary["tables"]
     for table, rows in ((by_horizon, ("0.25", "0.5")), (by_log, ("0.5",) * 3)):
         for name, (_, hold) in errors.items():
@@ -107,13 +109,13 @@ def test_both_predictors_are_in_both_tables() -> None:
     assert summary["losses"] is None  # q2 loses over all, and the sentence says so
     found.error[:5, :, 1] = 1e-4
     found.hold[:5, :, 1] = 0.1
-    summary, _ = scores(found, ["q1", "q2"], logs, 0.5)
+    summary, _ = forecast_scores(found, ["q1", "q2"], logs, 0.5)
     assert summary["losses"] == (
         "Logs in which holding still or a linear regression predicts better: q2 in 1 "
         "of 2 (log1.0)."
     )
     unknown = judged(errors, math.nan)
-    summary, _ = scores(unknown, ["q1", "q2"], logs, 0.5)
+    summary, _ = forecast_scores(unknown, ["q1", "q2"], logs, 0.5)
     assert "regression_rmse" not in summary
     assert "not enough windows" in summary["tables"][0]["rows"][0]
     assert summary["trivial"]["q1"]["better"] == "holding still"
@@ -121,7 +123,7 @@ def test_both_predictors_are_in_both_tables() -> None:
 
 def test_what_cannot_be_compared_is_left_out() -> None:
     nan = math.nan
-    found = compared(
+    found = compare_baselines(
         ["a", "b", "c", "d"],
         np.asarray([nan, 0.2, 0.3, 0.4]),
         np.asarray([0.1, nan, 0.0, 0.8]),

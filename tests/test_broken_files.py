@@ -14,7 +14,7 @@ import pytest
 
 import recordings as rec
 from sim2gp.data.logs import columns_of
-from sim2gp.data.logs.arrays import Entry, distinct
+from sim2gp.data.logs.arrays import LazyArray, distinct
 from sim2gp.data.logs.file import MAGIC, SUFFIXES
 from sim2gp.data.logs.hdf5 import episodes_of
 from sim2gp.errors import InputError
@@ -163,7 +163,7 @@ def wide(columns: int) -> Callable[[Path], Any]:
 
 
 def grouped(episodes: int) -> Callable[[Path], Any]:
-    entry = Entry((1,), np.dtype(float), lambda: np.zeros(1))
+    entry = LazyArray((1,), np.dtype(float), lambda: np.zeros(1))
     entries = {f"demo_{i}/q": entry for i in range(episodes)}
     return lambda folder: episodes_of(entries, {"q"})
 

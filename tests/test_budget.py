@@ -19,7 +19,7 @@ from recordings import Channel
 from sim2gp.cli import main
 from sim2gp.data.logs import Budget, Column, columns_of, read_log
 from sim2gp.data.logs.budget import Meter, readable
-from sim2gp.data.logs.unpack import inflated, lzf_pieces, pieces
+from sim2gp.data.logs.unpack import inflate, lzf_pieces, pieces
 from sim2gp.errors import InputError
 
 MIB = 2**20
@@ -208,7 +208,7 @@ def test_every_compression_is_unpacked_in_pieces(tmp_path: Path) -> None:
     for kind, content in packed.items():
         assert b"".join(pieces(content, kind, "a bag")) == whole
     assert b"".join(pieces(packed["lz4"] * 2, "lz4", "a bag")) == whole * 2
-    assert b"".join(inflated(zlib.compress(whole))) == whole
+    assert b"".join(inflate(zlib.compress(whole))) == whole
     for cut in ("lz4", "bz2"):
         with pytest.raises((EOFError, RuntimeError)):
             list(pieces(packed[cut][:-9], cut, "a bag"))

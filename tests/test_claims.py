@@ -22,7 +22,7 @@ def seeds(z: float, count: int = 20) -> np.ndarray:
 def test_a_bootstrap_interval_covers_the_mean(level: float, z: float):
     """Of normal samples: mean -+ z sd / sqrt(n), nearly."""
     sample = np.random.default_rng(1).standard_normal(200)
-    low, high = claims.interval(sample, rng(), level)
+    low, high = claims.bootstrap_interval(sample, rng(), level)
     half = z * sample.std() / np.sqrt(200)
     assert low == pytest.approx(sample.mean() - half, abs=0.02)
     assert high == pytest.approx(sample.mean() + half, abs=0.02)
@@ -38,13 +38,13 @@ def test_a_medians_interval_is_its_exact_bootstrap(lost: int):
     cumulative = np.cumsum(shares)
     low, high = (values[np.searchsorted(cumulative, t)] for t in (0.025, 0.975))
     values[count - lost :] = np.inf  # seeds that never got there
-    middle, below, above = claims.of_median(values[::-1], rng())
+    middle, below, above = claims.bootstrap_median(values[::-1], rng())
     assert (middle, below) == (11.0, low)
     assert above == (np.inf if lost else high)
 
 
 def test_every_resample_has_as_many_seeds():
-    weights = claims.resampled(7, rng())
+    weights = claims.bootstrap_weights(7, rng())
     np.testing.assert_array_equal(weights.sum(axis=1), 7.0)
     assert weights.mean(axis=0) == pytest.approx(np.ones(7), abs=0.05)
     assert weights.var(axis=0) == pytest.approx(np.full(7, 6 / 7), abs=0.08)

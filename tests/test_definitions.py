@@ -12,7 +12,7 @@ import bombs
 from recordings import Channel
 from sim2gp.data.logs import Column, read_log
 from sim2gp.data.logs.budget import Meter
-from sim2gp.data.logs.definitions import parsed
+from sim2gp.data.logs.definitions import parse_definition
 from sim2gp.errors import InputError
 
 #: Python that would leave a folder behind, in the forms that a template may be left by.
@@ -213,7 +213,7 @@ def test_every_message_of_ros_passes(name: str) -> None:
         if "/msg/" not in message:
             continue
         text, _ = store.generate_msgdef(message, version)
-        found = parsed(text, message, Meter("a.bag"))
+        found = parse_definition(text, message, Meter("a.bag"))
         read = get_types_from_msg(found.written(), message)
         assert message in read
         for other, (_, fields) in read.items():
@@ -230,10 +230,10 @@ def test_messages_that_list_messages_are_counted() -> None:
         ("float64[] numbers\nstring name", False),
         ("float64[9] numbers", False),
     ):
-        assert parsed(text, "robot/Arm", Meter("a.bag")).nested is nested
+        assert parse_definition(text, "robot/Arm", Meter("a.bag")).nested is nested
     empty = "B[] many\n" + "=" * 80 + "\nMSG: robot/B\nC[4000] c\n" + "=" * 80
     with pytest.raises(InputError, match="E136"):  # from no bytes at all
-        parsed(empty + "\nMSG: robot/C\n", "robot/Arm", Meter("a.bag"))
+        parse_definition(empty + "\nMSG: robot/C\n", "robot/Arm", Meter("a.bag"))
 
 
 def test_a_definition_is_the_recorded_one(tmp_path: Path) -> None:

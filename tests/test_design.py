@@ -26,7 +26,7 @@ from sim2gp.data.split_log import cut
 from sim2gp.data.windows_likelihood import WindowsLikelihood, information_at
 from sim2gp.errors import InputError
 from sim2gp.experiment_design import by_gradients
-from sim2gp.experiment_design.limits import excess, kept
+from sim2gp.experiment_design.limits import clip_commands, excess
 from sim2gp.inference.arrowhead import Noise
 from simulated_logs import pendulum
 
@@ -69,7 +69,7 @@ def test_it_tells_what_the_log_of_it_would(system) -> None:
     theirs = np.asarray(information_at(likelihood, fitted)(e.belief.mean))
     ours = np.asarray(INFORMATION(e, nowhere, U, states))
     np.testing.assert_allclose(ours.T @ ours, theirs.T @ theirs, rtol=1e-6)
-    scale = np.asarray(d.after(e.belief, jnp.asarray(ours)))
+    scale = np.asarray(d.posterior_scale(e.belief, jnp.asarray(ours)))
     precision = np.linalg.inv(np.asarray(e.belief.covariance()))
     S0 = np.linalg.inv(np.asarray(e.belief.scale))
     precision = precision + S0.T @ (theirs.T @ theirs) @ S0
@@ -101,20 +101,20 @@ def test_goals_are_those_of_dense_covariances() -> None:
     def volume(C: np.ndarray) -> float:
         return 0.5 * float(np.linalg.slogdet(C)[1])
 
-    assert nats(d.Everything()) == pytest.approx(volume(C0) - volume(C1), rel=1e-10)
+    assert nats(d.DOptimal()) == pytest.approx(volume(C0) - volume(C1), rel=1e-10)
     some = np.ix_([2, 0], [2, 0])
     expected = volume(C0[some]) - volume(C1[some])
-    assert nats(d.Named((2, 0))) == pytest.approx(expected, rel=1e-10)
+    assert nats(d.SubsetDOptimal((2, 0))) == pytest.approx(expected, rel=1e-10)
     G = rng.standard_normal((5, 4))
     ratio = np.trace(G @ C0 @ G.T) / np.trace(G @ C1 @ G.T)
-    goal = d.Prediction(jnp.asarray(G))
+    goal = d.VOptimal(jnp.asarray(G))
     assert nats(goal) == pytest.approx(0.5 * np.log(ratio), rel=1e-10)
 
 
 def test_goals_count_their_directions() -> None:
     """All sd smaller by one factor are worth its log, once for each direction."""
     scale = jnp.asarray(np.random.default_rng(0).standard_normal((4, 4)))
-    goals = (d.Everything(), d.Named((2, 0)), d.Prediction(scale[:3]))
+    goals = (d.DOptimal(), d.SubsetDOptimal((2, 0)), d.VOptimal(scale[:3]))
     for goal, count in zip(goals, (4, 2, 1), strict=True):
         assert goal.directions(scale) == count
         worth = float(goal.nats(scale, scale / 1.7))
@@ -146,7 +146,7 @@ def test_a_prediction_depends_on_what_moves_it() -> None:
 def test_commands_keep_their_limits_exactly(seed: int, size: float, rate: float):
     """Of value and rate, from the first step on, both families."""
     box = limits(pendulum(), {"voltage": (-2.0, 3.0)}, {"voltage": rate})
-    for family in (d.Multisine, d.Free):
+    for family in (d.MultisineCommands, d.FreeCommands):
         signal = family(PERIOD, STEPS)
         shape = (signal.coefficients, 1)
         C = np.random.default_rng(seed).uniform(-size, size, shape)
@@ -160,7 +160,7 @@ def test_commands_keep_their_limits_exactly(seed: int, size: float, rate: float)
 
 def test_a_multisine_is_scaled_not_cut() -> None:
     box = limits(pendulum(), {"voltage": (-2.0, 3.0)})
-    signal = d.Multisine(PERIOD, STEPS)
+    signal = d.MultisineCommands(PERIOD, STEPS)
     C = np.random.default_rng(0).uniform(-1.0, 1.0, (signal.coefficients, 1))
     U, V = (np.asarray(signal.commands(jnp.asarray(x), box)) for x in (C, 0.7 * C))
     assert np.abs(U).max() == pytest.approx(2.0, rel=1e-9)
@@ -186,7 +186,7 @@ def test_every_turn_beyond_the_limits_counts() -> None:
 
 
 def test_random_motions_have_sd_one() -> None:
-    for family in (d.Multisine, d.Free):
+    for family in (d.MultisineCommands, d.FreeCommands):
         signal = family(PERIOD, STEPS)
         keys = jax.random.split(jax.random.key(0), 300)
         C = np.asarray(jax.vmap(lambda k, s=signal: s.random(k, 2))(keys))
@@ -197,7 +197,7 @@ def test_random_motions_have_sd_one() -> None:
 
 def test_rates_are_followed_by_the_nearest_command() -> None:
     box = limits(pendulum(), {}, {"voltage": 100.0})
-    U = kept(box, jnp.full((4, 1), 2.5), PERIOD)
+    U = clip_commands(box, jnp.full((4, 1), 2.5), PERIOD)
     np.testing.assert_allclose(U[:, 0], [1.0, 2.0, 2.5, 2.5])
 
 

@@ -51,7 +51,7 @@ def box_of(experiment: d.Experiment, reach: float = 1.0) -> d.LimitBox:
 
 
 def commands(experiment: d.Experiment, size: float = 0.1) -> Any:
-    signal = d.Multisine(PERIOD, STEPS)
+    signal = d.MultisineCommands(PERIOD, STEPS)
     C = size * signal.random(jax.random.key(1), 1)
     return signal.commands(C, box_of(experiment))
 
@@ -66,8 +66,8 @@ def test_worth_is_that_of_the_definition() -> None:
     found = by_samples.states_of(experiment, np.asarray(U), np.asarray(tt)[None])[0]
     np.testing.assert_allclose(found, states, rtol=0.0, atol=1e-9)
     A = d.information(experiment, jnp.asarray(z), U, states)
-    scale = d.after(experiment.belief, A)
-    goal = d.Everything()
+    scale = d.posterior_scale(experiment.belief, A)
+    goal = d.DOptimal()
     nats, told = by_samples.worth_at(experiment, goal, z, np.asarray(U))
     expected = goal.nats(experiment.belief.scale, scale)
     assert nats == pytest.approx(float(expected), rel=1e-6)
@@ -85,9 +85,9 @@ def test_the_search_keeps_its_limits_and_beats_random_motions(
     for name, value in {"ROUNDS": 3, "SAMPLES": 8, "ELITES": 3, "CHECKED": 60}.items():
         monkeypatch.setattr(by_samples, name, value)
     experiment = experiment_with()
-    box, goal, key = box_of(experiment), d.Everything(), jax.random.key(0)
-    signal, p = d.Multisine(PERIOD, STEPS), experiment.belief.mean.size
-    best = d.design(experiment, goal, box, signal, key=key, draws=2)
+    box, goal, key = box_of(experiment), d.DOptimal(), jax.random.key(0)
+    signal, p = d.MultisineCommands(PERIOD, STEPS), experiment.belief.mean.size
+    best = d.optimise_commands(experiment, goal, box, signal, key=key, draws=2)
     assert best.violations <= search.ALLOWED
     assert (np.abs(best.commands) <= 3.0).all()
     assert best.checked == 60
@@ -103,7 +103,10 @@ def test_the_search_keeps_its_limits_and_beats_random_motions(
     for k in jax.random.split(jax.random.key(5), 3):
         U = signal.commands(0.3 * signal.random(k, 1), box)
         U, _, _ = search._kept(
-            lambda U: by_samples.checked(experiment, box, np.asarray(U), held_out), U
+            lambda U: by_samples.states_and_excess(
+                experiment, box, np.asarray(U), held_out
+            ),
+            U,
         )
         nats, _ = by_samples.worth_at(experiment, goal, np.zeros(p), np.asarray(U))
         random.append(nats)

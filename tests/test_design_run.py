@@ -11,8 +11,12 @@ import pytest
 from sim2gp.cli import main
 from sim2gp.commands.design import goal_of, setting
 from sim2gp.commands.identify import identify
-from sim2gp.experiment_design import Everything, LimitBox, Named, by_gradients
-from sim2gp.experiment_design.verdict import Asked, foretold, verdict
+from sim2gp.experiment_design import DOptimal, LimitBox, SubsetDOptimal, by_gradients
+from sim2gp.experiment_design.verdict import (
+    DesignOptions,
+    experiment_verdict,
+    prediction_verdict,
+)
 from sim2gp.project import load_project
 from sim2gp.runs import Progress, load_run
 from test_identify import folder, project_in
@@ -20,7 +24,7 @@ from test_identify import folder, project_in
 assert folder  # a fixture
 
 SHORT = ["--seconds", "1", "--period", "0.01"]
-ASKED = Asked(kind="multisine")
+ASKED = DesignOptions(kind="multisine")
 LIMITS = ["--limit", "theta=-1:1", "theta.velocity=-15:15", "--rate", "voltage=200"]
 
 
@@ -95,10 +99,10 @@ def test_what_is_asked_about(tmp_path: Path) -> None:
     names = experiment.system.parameters.names
     box = LimitBox.of(experiment.system, {}, {}, start=np.zeros(4))
     goal = goal_of(asked, experiment, box, jax.random.key(0))
-    assert isinstance(goal, Named)
+    assert isinstance(goal, SubsetDOptimal)
     assert [names[i] for i in goal.index] == ["pendulum_length", "arm_damping"]
     plain = goal_of(ASKED, experiment, box, jax.random.key(0))
-    assert isinstance(plain, Everything)
+    assert isinstance(plain, DOptimal)
 
 
 BAD = {
@@ -174,7 +178,7 @@ def entry(mean: float, sd: float, left: float, times: float = 1.0) -> dict[str, 
     ],
 )
 def test_when_to_stop(expected, nats, worth, words) -> None:
-    found, text = verdict(ASKED, expected, nats)
+    found, text = experiment_verdict(ASKED, expected, nats)
     assert found is worth
     assert words in text
 
@@ -191,6 +195,6 @@ def test_when_to_stop(expected, nats, worth, words) -> None:
 def test_when_a_prediction_is_good_enough(before, after, times, worth, words) -> None:
     asked = dataclasses.replace(ASKED, predict=0.5)
     ahead = {"before": before, "after": after, "corrected": times * before}
-    found, text = foretold(asked, ahead, 1.4)
+    found, text = prediction_verdict(asked, ahead, 1.4)
     assert found is worth
     assert words in text

@@ -37,7 +37,7 @@ def test_worth_has_a_gradient_in_the_commands() -> None:
     @jax.jit
     def worth(U):
         states = d.trajectory(e, e.belief.at(z), U)
-        return by_gradients._worth_at(e, d.Everything(), z, U, states)[0]
+        return by_gradients._worth_at(e, d.DOptimal(), z, U, states)[0]
 
     U = commands(2).at[: STEPS // 2].set(0.0)
     V = commands(3)
@@ -51,17 +51,17 @@ def test_worth_has_a_gradient_in_the_commands() -> None:
 def test_a_search_on_longer_periods_sees_the_same() -> None:
     """Fewer samples of as much less noise; an experiment of few periods stays whole."""
     fine = dataclasses.replace(experiment(), period=0.002, steps=500, window=50)
-    coarse, signal = by_gradients._coarser(fine, d.Multisine(0.002, 500))
+    coarse, signal = by_gradients._coarser(fine, d.MultisineCommands(0.002, 500))
     assert (coarse.period, coarse.steps, coarse.window) == (0.01, 100, 10)
     box, nowhere = limits(fine.system), jnp.zeros((1, 3))
     C = 0.1 * jax.random.normal(jax.random.key(1), (signal.coefficients, 1))
     told = [
-        float(by_gradients._worth(e, d.Everything(), nowhere, s.commands(C, box))[0])
-        for e, s in ((fine, d.Multisine(0.002, 500)), (coarse, signal))
+        float(by_gradients._worth(e, d.DOptimal(), nowhere, s.commands(C, box))[0])
+        for e, s in ((fine, d.MultisineCommands(0.002, 500)), (coarse, signal))
     ]
     assert told[1] == pytest.approx(told[0], abs=0.1)
     short = dataclasses.replace(fine, steps=3, window=3)
-    kept, _ = by_gradients._coarser(short, d.Multisine(0.002, 3))
+    kept, _ = by_gradients._coarser(short, d.MultisineCommands(0.002, 3))
     assert (kept.period, kept.steps, kept.window) == (0.002, 3, 3)
 
 
@@ -71,7 +71,7 @@ def test_commands_are_made_no_smaller_than_they_must_be() -> None:
     box, draws = limits(e.system), jax.random.normal(jax.random.key(1), (100, 3))
 
     def check(U):
-        return by_gradients._checked(e, box, U, draws)
+        return by_gradients._plausible_states(e, box, U, draws)
 
     U, states, bad = search._kept(check, commands(4, 5.0))
     share = float(jnp.max(jnp.abs(U)) / jnp.max(jnp.abs(commands(4, 5.0))))
@@ -96,15 +96,17 @@ class Away:
 @pytest.mark.nightly
 def test_a_climb_that_ends_far_outside_is_given_up(monkeypatch) -> None:
     e = experiment()
-    box, signal = limits(e.system), d.Multisine(PERIOD, STEPS)
+    box, signal = limits(e.system), d.MultisineCommands(PERIOD, STEPS)
     draws = jax.random.normal(jax.random.key(1), (50, 3))
     monkeypatch.setattr(by_gradients, "_climb", Away())
-    improve = by_gradients._climber(e, signal, d.Everything(), box, draws[:2], draws)
+    improve = by_gradients._climber(e, signal, d.DOptimal(), box, draws[:2], draws)
     start = improve(jax.random.key(3))
     assert float(jnp.max(jnp.abs(start))) < 1.0
     # It begins nearly within its limits.
     U = signal.commands(start.astype(float), box)
-    _, beyond = by_gradients._checked(e, by_gradients.narrowed(box), U, draws)
+    _, beyond = by_gradients._plausible_states(
+        e, by_gradients.narrow_limits(box), U, draws
+    )
     assert float(jnp.mean(beyond > 0.0)) <= by_gradients.LEAVING + 0.05
 
 
@@ -116,10 +118,13 @@ def found():
             patch.setattr(by_gradients, name, value)
         e = experiment()
         box = limits(e.system, LIMITS, {"voltage": 100.0})
-        signal = d.Multisine(PERIOD, STEPS)
-        key, goal = jax.random.key(0), d.Everything()
-        best = d.design(e, goal, box, signal, key=key)
-        assert d.design(e, goal, box, signal, key=key, starts=3).nats > best.nats
+        signal = d.MultisineCommands(PERIOD, STEPS)
+        key, goal = jax.random.key(0), d.DOptimal()
+        best = d.optimise_commands(e, goal, box, signal, key=key)
+        assert (
+            d.optimise_commands(e, goal, box, signal, key=key, starts=3).nats
+            > best.nats
+        )
         return e, box, signal, best
 
 
@@ -135,8 +140,8 @@ def test_a_designed_experiment_beats_random_ones(found) -> None:
     def random(c):
         U = signal.commands(0.05 * c, box)
         states = d.trajectory(e, e.belief.mean, U)
-        scale = d.after(e.belief, d.information(e, nowhere, U, states))
-        return d.Everything().nats(e.belief.scale, scale), excess(box, states)
+        scale = d.posterior_scale(e.belief, d.information(e, nowhere, U, states))
+        return d.DOptimal().nats(e.belief.scale, scale), excess(box, states)
 
     told = [random(c) for c in draws]
     nats = [float(n) for n, beyond in told if float(beyond) <= 0.0]
@@ -147,7 +152,9 @@ def test_a_designed_experiment_beats_random_ones(found) -> None:
     states = eqx.filter_jit(d.trajectory)(e, e.belief.mean, U)
     A = np.asarray(eqx.filter_jit(d.information)(e, nowhere, U, states))
     np.testing.assert_allclose(best.states, states, atol=1e-9)
-    np.testing.assert_allclose(best.scale, d.after(e.belief, jnp.asarray(A)), rtol=1e-9)
+    np.testing.assert_allclose(
+        best.scale, d.posterior_scale(e.belief, jnp.asarray(A)), rtol=1e-9
+    )
 
 
 @pytest.mark.nightly
@@ -166,7 +173,7 @@ def test_a_refused_start_does_not_end_the_search(found, monkeypatch) -> None:
 
     monkeypatch.setattr(search, "_kept", refused_once)
     key = jax.random.key(0)
-    second = d.design(e, d.Everything(), box, signal, key=key, starts=2)
+    second = d.optimise_commands(e, d.DOptimal(), box, signal, key=key, starts=2)
     assert len(calls) == 2
     assert second.violations <= search.ALLOWED
 
@@ -180,17 +187,17 @@ def test_no_commands_keep_limits_that_nothing_can(found) -> None:
         for name, value in QUICK.items():
             patch.setattr(by_gradients, name, value)
         with pytest.raises(InputError, match="E150 no commands keep the limits"):
-            d.design(e, d.Everything(), box, signal, key=jax.random.key(0))
+            d.optimise_commands(e, d.DOptimal(), box, signal, key=jax.random.key(0))
 
 
 def test_limits_hold_for_the_corrected_posterior_and_nats_are_of_the_plain() -> None:
     """Machines, their extent and the middle against single simulations."""
-    e, goal = experiment(), d.Everything()
+    e, goal = experiment(), d.DOptimal()
     shifted = Gaussian(e.belief.mean + 0.3, 3.0 * e.belief.scale[:, ::-1])
     wide = dataclasses.replace(e, corrected=shifted)
     box, U = limits(e.system), commands()
     draws = jax.random.normal(jax.random.key(2), (5, 3))
-    states, beyond = by_gradients._checked(wide, box, U, draws)
+    states, beyond = by_gradients._plausible_states(wide, box, U, draws)
     one = eqx.filter_jit(d.trajectory)
     for z, S, far in zip(draws, states, beyond, strict=True):
         tt = shifted.mean + shifted.scale @ z

@@ -17,15 +17,18 @@ from sim2gp.data.split_log import cut
 from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.intervals import scatter as intervals
-from sim2gp.identification.intervals.discrepancy import _with, corrected_windows
+from sim2gp.identification.intervals.discrepancy import (
+    _with_effects_at_zero,
+    corrected_windows,
+)
 from sim2gp.identification.intervals.pulls import Pulls
 from sim2gp.identification.intervals.scatter import (
     NOTHING,
     SHARES,
-    Corrected,
-    corrected,
+    CorrectedFit,
+    correct_posterior,
 )
-from sim2gp.identification.intervals.words import lacking_table, told_intervals
+from sim2gp.identification.intervals.words import interval_entry, missing_physics_table
 from sim2gp.inference.arrowhead import Noise
 from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
@@ -75,7 +78,7 @@ def test_the_average_over_shares_is_bayes() -> None:
     np.testing.assert_allclose(scale @ scale.T, cov, rtol=1e-8, atol=1e-12)
 
 
-def told(model: Linear, y: np.ndarray, allowed: bool) -> Corrected:
+def told(model: Linear, y: np.ndarray, allowed: bool) -> CorrectedFit:
     """The intervals of a fit of the constants alone; effects stand at nothing."""
     H = model.H[:OWN, :OWN]
     z = np.zeros(ALL)
@@ -83,10 +86,10 @@ def told(model: Linear, y: np.ndarray, allowed: bool) -> Corrected:
     scores = np.einsum("wlp,wl->wp", model.J, model.J @ z - y)
     pulls = Pulls(model.J, scores, model.group)
     if allowed:
-        return corrected(model.prior, gaussian(z, np.eye(ALL)), pulls, EFFECTS)
+        return correct_posterior(model.prior, gaussian(z, np.eye(ALL)), pulls, EFFECTS)
     first = np.arange(OWN)
     prior = gaussian(np.zeros(OWN), np.eye(OWN))
-    return corrected(prior, gaussian(z[:OWN], np.eye(OWN)), pulls.of(first))
+    return correct_posterior(prior, gaussian(z[:OWN], np.eye(OWN)), pulls.of(first))
 
 
 def covered(lacks: float, rho: float, allowed: bool) -> tuple[float, float, float]:
@@ -130,7 +133,9 @@ def test_it_does_not_matter_where_a_linear_machine_is_linearised() -> None:
     z = rng.standard_normal(ALL)
     scores = np.einsum("wlp,wl->wp", model.J, model.J @ z - y)
     there = gaussian(z, np.eye(ALL))
-    again = corrected(model.prior, there, Pulls(model.J, scores, model.group), EFFECTS)
+    again = correct_posterior(
+        model.prior, there, Pulls(model.J, scores, model.group), EFFECTS
+    )
     one, other = Plain(again.posterior), Plain(found.posterior)
     np.testing.assert_allclose(one.mean, other.mean, atol=1e-9)
     np.testing.assert_allclose(one.C, other.C, atol=1e-9)
@@ -188,13 +193,13 @@ def test_friction_that_the_simulator_lacks_is_in_the_intervals(
     assert not any("back_emf" in name for name in found.effects)  # a damping, again
     assert found.posterior.scale.shape == (4, 4)
     assert away(truth, found.posterior).max() < 2.0
-    about = told_intervals(UniformRodArm(), found, {}, 50)
+    about = interval_entry(UniformRodArm(), found, {}, 50)
     for q in "q1", "q2":
         friction = about["allowed_for"][f"{q}.coulomb"]
         assert abs(friction["mean"] - 0.02) < 3.0 * friction["sd"]
         assert friction["unit"] == "N m"
     assert about["missing"] == found.missing
-    (table,) = lacking_table(about)
+    (table,) = missing_physics_table(about)
     assert [row[0] for row in table["rows"][:1]] in (["q1.coulomb"], ["q2.coulomb"])
     assert len(table["rows"]) == len(found.effects)
     # Where a fit without effects stands is of no account.
@@ -214,9 +219,9 @@ def test_a_sound_simulator_is_believed(arms: ModuleType) -> None:
     found = corrected_windows(likelihood, belief, one)
     alone = corrected_windows(likelihood, belief, one, ())
     assert found.missing < 0.3
-    assert lacking_table(told_intervals(UniformRodArm(), found, {}, 50)) == []
-    assert told_intervals(UniformRodArm(), alone, {}, 50)["missing"] is None
-    assert told_intervals(UniformRodArm(), alone, {}, 50)["allowed_for"] == {}
+    assert missing_physics_table(interval_entry(UniformRodArm(), found, {}, 50)) == []
+    assert interval_entry(UniformRodArm(), alone, {}, 50)["missing"] is None
+    assert interval_entry(UniformRodArm(), alone, {}, 50)["allowed_for"] == {}
     assert np.max(Plain(found.posterior).sd / Plain(alone.posterior).sd) < 1.3
     assert away(truth, found.posterior).max() < 3.0
 
@@ -233,7 +238,7 @@ def test_a_belief_keeps_its_constants_among_effects() -> None:
     posterior = Gaussian(jnp.linspace(-1.0, -2.0, p), scale)
     none = jnp.zeros(1)
     belief = estimate_of(prior, posterior, Noise(none, none), none[None])
-    wider, whole, own = _with(system, belief, smooth_effects(system))
+    wider, whole, own = _with_effects_at_zero(system, belief, smooth_effects(system))
     names = wider.parameters.names
     assert len(names) > p + 6
     assert tuple(names[k] for k in own) == system.parameters.names
@@ -247,33 +252,38 @@ def test_a_belief_keeps_its_constants_among_effects() -> None:
 
 def test_the_words_say_whether_physics_is_missing() -> None:
     posterior = gaussian(np.zeros(1), np.eye(1))
-    found = Corrected(posterior, 1.0, 1, 30.0, True, 0.97, ("q1.coulomb", "q1.drag"))
-    text = intervals.words(found, [1.0, 4.0], 40)
+    found = CorrectedFit(posterior, 1.0, 1, 30.0, True, 0.97, ("q1.coulomb", "q1.drag"))
+    text = intervals.describe_intervals(found, [1.0, 4.0], 40)
     assert text.startswith("Intervals are 1 to 4 times as wide as if every sample were")
     assert "coloured" not in text
     assert "lacks physics with a probability of 97 %: intervals allow for 2" in text
     assert "sim2gp explain" in text
-    sound = Corrected(posterior, 9.0, 1, 30.0, True, 0.04, ("q1.coulomb",))
-    text = intervals.words(sound, [3.0], 40)
+    sound = CorrectedFit(posterior, 9.0, 1, 30.0, True, 0.04, ("q1.coulomb",))
+    text = intervals.describe_intervals(sound, [3.0], 40)
     assert "coloured and pull the parameters 3 times" in text
     assert "missing, which has a probability of 4 %" in text
-    none = Corrected(posterior, 9.0, 1, 30.0, True)
-    assert "not physics that the model lacks" in intervals.words(none, [3.0], 40)
+    none = CorrectedFit(posterior, 9.0, 1, 30.0, True)
+    assert "not physics that the model lacks" in intervals.describe_intervals(
+        none, [3.0], 40
+    )
 
 
 def test_a_wide_interval_says_why_in_one_sentence() -> None:
     """Where the two sd differ by more than a factor of 3, and only there."""
     flat = Gaussian(jnp.zeros(1), jnp.ones((1, 1)))
-    coloured = Corrected(flat, 81.0, 1, 40.0, True)
-    assert intervals.why(coloured, [0.9, 3.0], 340) is None
-    assert intervals.why(Corrected(flat, 81.0, 1, 2.0, False), [9.0], 3) is None
-    text = intervals.why(coloured, [12.0, 41.0], 340)
+    coloured = CorrectedFit(flat, 81.0, 1, 40.0, True)
+    assert intervals.explain_widening(coloured, [0.9, 3.0], 340) is None
+    assert (
+        intervals.explain_widening(CorrectedFit(flat, 81.0, 1, 2.0, False), [9.0], 3)
+        is None
+    )
+    text = intervals.explain_widening(coloured, [12.0, 41.0], 340)
     assert text is not None
     assert "12 to 41 times" in text
     assert "9 times as far" in text
     assert "physics" not in text
-    missing = Corrected(flat, 1.0, 1, 40.0, True, 0.93, ("spring",), flat)
-    text = intervals.why(missing, [1.0, 5.0], 340)
+    missing = CorrectedFit(flat, 1.0, 1, 40.0, True, 0.93, ("spring",), flat)
+    text = intervals.explain_widening(missing, [1.0, 5.0], 340)
     assert text is not None
     assert "93 %" in text
     assert "white noise" not in text

@@ -21,7 +21,7 @@ import pytest
 from house_rules import LAYERS
 from sim2gp import cli
 from sim2gp.cli.commands import COMMANDS
-from sim2gp.data.logs.arrays import missing
+from sim2gp.data.logs.arrays import missing_column
 from sim2gp.errors import catalogue
 from sim2gp.project.project import SYSTEMS, system_class
 from sim2gp.project.schema import ProjectSpec
@@ -135,7 +135,7 @@ def test_every_exit_code_is_told() -> None:
 
 
 def test_the_example_of_an_error_is_what_is_printed() -> None:
-    error = missing("tau1", ["time", "pos1", "tau_1"], "runs/a.csv")
+    error = missing_column("tau1", ["time", "pos1", "tau_1"], "runs/a.csv")
     assert str(error) in (DOCS / "codes.md").read_text(encoding="utf-8")
 
 

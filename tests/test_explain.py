@@ -12,16 +12,24 @@ import planted_effects as study
 from descents import estimate_of
 from sim2gp import systems as sy
 from sim2gp.identification.missing_physics.data import OneStepData
-from sim2gp.identification.missing_physics.explain import explain
+from sim2gp.identification.missing_physics.explain import find_missing_physics
 from sim2gp.identification.missing_physics.score import (
-    Scored,
-    inflation_of,
-    score,
-    tempered,
-    widened,
+    ScoredCandidate,
+    sandwich_inflation,
+    score_candidates,
+    sd_widening,
+    tempered_gain,
 )
-from sim2gp.identification.missing_physics.search import Refitted, Search, search
-from sim2gp.identification.missing_physics.words import candidate_rows, headline, table
+from sim2gp.identification.missing_physics.search import (
+    CandidateSearch,
+    FittedCandidate,
+    search_candidates,
+)
+from sim2gp.identification.missing_physics.words import (
+    candidate_rows,
+    candidate_table,
+    missing_physics_headline,
+)
 from sim2gp.inference.arrowhead import Noise
 from sim2gp.planning.tasks import MACHINES
 from sim2gp.types import in_float64
@@ -42,42 +50,44 @@ def flown(planted: Any, seed: int = 5) -> OneStepData:
 @pytest.mark.nightly
 def test_an_effect_is_found() -> None:
     """The study in small, on machines with constants of their own."""
-    spring = explain(flown(sy.Spring("theta", 4.5e-3), 6), FEW)
+    spring = find_missing_physics(flown(sy.Spring("theta", 4.5e-3), 6), FEW)
     assert (spring.answer, spring.effect) == ("missing", "theta.spring")
     best = spring.search.refitted[0]
     assert abs(best.value - 4.5e-3) < 4.0 * best.sd
-    assert "stiffness of a cable (theta.spring = 0.0" in headline(spring)
+    assert "stiffness of a cable (theta.spring = 0.0" in missing_physics_headline(
+        spring
+    )
     rows = candidate_rows(spring)
     assert (rows[0]["effect"], rows[0]["verdict"]) == ("spring", "missing")
     assert rows[-1]["parameter"] == "theta.back_emf"
     assert rows[-1]["evidence_gain"] is None
     assert rows[-1]["verdict"] == "not distinguishable from arm_damping"
-    assert table(spring, rows)["rows"][0][0] == "theta.spring"
+    assert candidate_table(spring, rows)["rows"][0][0] == "theta.spring"
 
 
 @pytest.mark.nightly
 def test_nothing_and_none_of_these() -> None:
     """The other two answers."""
-    nothing = explain(flown(None), FEW)
+    nothing = find_missing_physics(flown(None), FEW)
     assert nothing.answer == "nothing missing"
     assert nothing.effect is None
-    assert "Nothing is missing" in headline(nothing)
+    assert "Nothing is missing" in missing_physics_headline(nothing)
 
-    other = explain(flown(sy.Spring("theta", -1e-3), 7), FEW)
+    other = find_missing_physics(flown(sy.Spring("theta", -1e-3), 7), FEW)
     assert other.answer == "none of these"  # it would fit, but no cable pushes
     assert candidate_rows(other)[0]["verdict"] == "impossible sign"
 
-    outside = explain(flown(study.OUTSIDE["furuta"]["saturation"], 8), FEW)
+    outside = find_missing_physics(flown(study.OUTSIDE["furuta"]["saturation"], 8), FEW)
     assert outside.answer == "none of these"
     assert outside.effect is None
-    assert headline(outside).startswith("None of these")
+    assert missing_physics_headline(outside).startswith("None of these")
 
 
 @pytest.mark.nightly  # `test_explain_run` finds what a score ranks first
 def test_a_score_is_the_evidence_of_a_weak_effect() -> None:
     """Close to nothing one linearisation is as good as a fit; far away it ranks."""
     data = flown(sy.Spring("theta", 1e-4), 6)
-    found = search(data, FEW)
+    found = search_candidates(data, FEW)
     scored = {s.candidate.name: s for s in found.scored}
     (refit,) = found.refitted
     assert refit.scored is scored["theta.spring"]
@@ -92,7 +102,7 @@ def test_a_score_is_the_evidence_of_a_weak_effect() -> None:
 def test_a_dead_zone_is_found_though_its_slope_at_nothing_is_not() -> None:
     data = flown(sy.DeadZone("voltage", 0.9), 9)
     bare = data.fit()
-    (one,) = score(data, bare, some("voltage.dead_zone"))
+    (one,) = score_candidates(data, bare, some("voltage.dead_zone"))
     assert one.gain > 50.0
     assert one.starts.shape == (6, 9)
 
@@ -103,7 +113,7 @@ def test_payload_of_a_cartpole_is_a_pole_of_another_size() -> None:
     kinds = ("theta.payload", "theta.geometry", "x.spring")
     few = [c for c in sy.candidates(sy.CartPole()) if c.name in kinds]
     bare = data.fit()
-    found = {s.candidate.name: s for s in score(data, bare, few)}
+    found = {s.candidate.name: s for s in score_candidates(data, bare, few)}
     assert not found["x.spring"].alias
     for name in ("theta.payload", "theta.geometry"):
         assert found[name].alias
@@ -114,24 +124,24 @@ def test_repeated_rows_of_a_cluster_say_nothing_new() -> None:
     rng = np.random.default_rng(0)
     scores, cluster = rng.standard_normal((40, 3)), np.arange(40) // 2
     row = np.array([0.01, -0.02, 0.5])
-    once = inflation_of(20.0 * scores, cluster, row, 2)
+    once = sandwich_inflation(20.0 * scores, cluster, row, 2)
     assert once > 1.0
     for m in (2, 5):
         more = np.repeat(20.0 * scores, m, axis=0)
-        same = inflation_of(more, np.repeat(cluster, m), row / m, 2)
+        same = sandwich_inflation(more, np.repeat(cluster, m), row / m, 2)
         assert same == pytest.approx(m * once)
     # The scores sum to the prior's pull, which is no error of any cluster.
-    pulled = inflation_of(20.0 * scores + 3.0, cluster, row, 2)
+    pulled = sandwich_inflation(20.0 * scores + 3.0, cluster, row, 2)
     assert pulled == pytest.approx(once)
-    assert inflation_of(scores, np.zeros(40, int), row, 2) == 1.0
-    assert inflation_of(1e-3 * scores, cluster, row, 2) == 1.0  # never below 1
+    assert sandwich_inflation(scores, np.zeros(40, int), row, 2) == 1.0
+    assert sandwich_inflation(1e-3 * scores, cluster, row, 2) == 1.0  # never below 1
 
 
 def test_independent_scores_are_not_inflated() -> None:
     """Of the mean of many rows: the sandwich agrees with the model's variance."""
     rng = np.random.default_rng(1)
     scores = rng.standard_normal((4000, 1))
-    found = inflation_of(scores, np.arange(4000) // 10, np.array([1.0 / 4000]), 0)
+    found = sandwich_inflation(scores, np.arange(4000) // 10, np.array([1.0 / 4000]), 0)
     assert found == pytest.approx(1.0, abs=0.2)
 
 
@@ -145,13 +155,13 @@ def test_tempered_gain_is_that_of_so_many_rows(m: float, k: float) -> None:
 
     N = 300.0
     sd = 1.0 / math.sqrt(N + 1.0)
-    assert tempered(gain(N), k, sd) == pytest.approx(gain(N / k), rel=1e-12)
-    assert widened(k, sd) * sd == pytest.approx(1.0 / math.sqrt(N / k + 1.0))
-    assert tempered(math.nan, k, sd) == -math.inf
+    assert tempered_gain(gain(N), k, sd) == pytest.approx(gain(N / k), rel=1e-12)
+    assert sd_widening(k, sd) * sd == pytest.approx(1.0 / math.sqrt(N / k + 1.0))
+    assert tempered_gain(math.nan, k, sd) == -math.inf
 
 
 @in_float64
-def found_with(*refits: tuple[str, float, float, int]) -> Search:
+def found_with(*refits: tuple[str, float, float, int]) -> CandidateSearch:
     """A search that ended with (channel, gain, value, sign) of springs."""
     system = sy.Furuta()
     prior = system.parameters.prior()
@@ -160,9 +170,9 @@ def found_with(*refits: tuple[str, float, float, int]) -> Search:
     made = []
     for where, gain, value, sign in refits:
         candidate = sy.Candidate(sy.Spring(where, 1.0), sign=sign)
-        scored = Scored(candidate, system, gain, 1.0, (), np.zeros((1, 8)))
-        made.append(Refitted(scored, bare, gain, value, 0.1, 1.0))
-    return Search(bare, tuple(r.scored for r in made), tuple(made))
+        scored = ScoredCandidate(candidate, system, gain, 1.0, (), np.zeros((1, 8)))
+        made.append(FittedCandidate(scored, bare, gain, value, 0.1, 1.0))
+    return CandidateSearch(bare, tuple(r.scored for r in made), tuple(made))
 
 
 def test_who_is_best_and_who_is_tied() -> None:
@@ -188,7 +198,7 @@ def test_a_fit_that_fails_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
         raise NotConverged("E201", "no")
 
     monkeypatch.setattr(data, "refit", refused)
-    found = explain(data, FEW, refits=1)
+    found = find_missing_physics(data, FEW, refits=1)
     assert found.search.failed == ("theta.spring",)
     assert found.answer == "none of these"
     assert candidate_rows(found)[0]["verdict"] == "no fit"

@@ -12,7 +12,7 @@ import planted_effects as study
 import stub_commands
 from sim2gp import systems as sy
 from sim2gp.cli import main
-from sim2gp.commands.explain import explain, explainable, project_file, window_data
+from sim2gp.commands.explain import explain, load_explainable, project_file, window_data
 from sim2gp.commands.identify import identify
 from sim2gp.errors import InputError
 from sim2gp.project import load_project
@@ -55,7 +55,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def explained(run: Path, out: Path, *, add: bool) -> dict[str, Any]:
     """The command line's summary; an error of the input is raised."""
-    found = explainable(run)
+    found = load_explainable(run)
     file = project_file(found) if add else None
     missing = explain(found, progress=QUIET)
     missing = missing.add_to(file) if file else missing
@@ -73,7 +73,7 @@ def test_processes_find_the_same(run: Path, monkeypatch: pytest.MonkeyPatch) -> 
         return spread(work, groups, workers)
 
     monkeypatch.setattr("sim2gp.commands.explain.spread", counted)
-    found = explainable(run)
+    found = load_explainable(run)
     one, two = (explain(found, workers=n, progress=QUIET) for n in (1, 2))
     ((jobs, processes),) = asked
     assert jobs > 1
@@ -108,7 +108,7 @@ def test_a_spring_is_found_in_logs_and_added(run: Path, tmp_path: Path) -> None:
 
 
 def test_windows_of_a_second_share_an_error(run: Path) -> None:
-    found = explainable(run)
+    found = load_explainable(run)
     assert found.project is not None
     data = window_data(found.project, found.project.load_logs())
     assert data.cluster.tolist() == [0] * 5 + [1] + [2] * 5 + [3]

@@ -12,7 +12,7 @@ from sim2gp.runs import Progress, load_run
 from sim2gp.studies import figure1, two_link
 from sim2gp.studies.figure1 import TwoLinkArm
 from sim2gp.studies.study import run_cells
-from sim2gp.studies.two_link import DT, NOISE, Learned
+from sim2gp.studies.two_link import DT, NOISE, LearnedArm
 from sim2gp.systems import UniformRodArm
 
 QUIET = Progress(quiet=True)
@@ -22,7 +22,7 @@ LOW, HIGH = np.array([0.32, 0.02]), np.array([1.6, 0.3])
 
 
 @pytest.fixture(scope="module")
-def study() -> Learned:
+def study() -> LearnedArm:
     return two_link.learn(two_link.nominal_truth(), key=jax.random.key(3))
 
 
@@ -114,14 +114,14 @@ def test_truth_is_not_the_prior_mean():
     [(50, (0.385, 0.615)), (90, (0.825, 0.960)), (95, (0.895, 0.990))],
 )
 def test_bands_at_200_are_the_stated_ones(level, expected):
-    assert two_link.band(level, 200) == pytest.approx(expected, abs=1e-9)
+    assert two_link.coverage_band(level, 200) == pytest.approx(expected, abs=1e-9)
 
 
 def test_covered_counts_the_central_interval():
     z = np.array([[0.0, 0.7], [-0.6, 1.7], [1.6, -np.inf], [-1.9, 0.1]])
-    assert two_link.covered(z, 50).tolist() == [0.5, 0.25]
-    assert two_link.covered(z, 90).tolist() == [0.75, 0.5]
-    assert two_link.covered(z, 95).tolist() == [1.0, 0.75]
+    assert two_link.coverage(z, 50).tolist() == [0.5, 0.25]
+    assert two_link.coverage(z, 90).tolist() == [0.75, 0.5]
+    assert two_link.coverage(z, 95).tolist() == [1.0, 0.75]
 
 
 def test_a_failed_fit_is_counted_and_covers_nothing(monkeypatch, study, tmp_path):

@@ -53,7 +53,7 @@ def planted(fast: str = "", slow: str = "") -> Table:
 
 
 def holds(table: Table, name: str) -> bool:
-    return figure2.claims(table, np.random.default_rng(1))[name]["holds"]
+    return figure2.swing_up_claims(table, np.random.default_rng(1))[name]["holds"]
 
 
 def test_claims_see_what_was_planted():
@@ -69,7 +69,7 @@ def test_claims_see_what_was_planted():
     assert holds(table, "cartpole_RES_FS_solves_mismatch_in_three")
     assert not holds(table, "cartpole_literal_function_space_is_best_under_mismatch")
     assert not holds(table, "cartpole_physics_alone_fails_under_mismatch")
-    for claim in figure2.claims(table, np.random.default_rng(1)).values():
+    for claim in figure2.swing_up_claims(table, np.random.default_rng(1)).values():
         assert claim["figure"]
         json.dumps(claim, allow_nan=False)
 

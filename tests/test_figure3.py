@@ -31,12 +31,12 @@ def test_transitions_needed_by_hand():
     rmse = 10.0 / (250.0 * np.arange(1, 4))
     for count in (30.0, 100.0, 180.0, 250.0, 600.0, 750.0):
         error = 10.0 / count * (1.0 + 1e-12)
-        assert figure3.needed(early, rmse, error) == pytest.approx(count)
-    assert figure3.needed(early, rmse, 1.0) == 25.0
-    assert figure3.needed(early, rmse, 1e-3) == np.inf
+        assert figure3.transitions_needed(early, rmse, error) == pytest.approx(count)
+    assert figure3.transitions_needed(early, rmse, 1.0) == 25.0
+    assert figure3.transitions_needed(early, rmse, 1e-3) == np.inf
     # A look that failed is passed over.
     early[1, 1] = np.nan
-    assert figure3.needed(early, rmse, 0.1) == pytest.approx(100.0)
+    assert figure3.transitions_needed(early, rmse, 0.1) == pytest.approx(100.0)
 
 
 def planted(best: str, times: float):
@@ -63,7 +63,9 @@ def planted(best: str, times: float):
 
 def test_claims_see_what_was_planted():
     def claims(best: str, times: float):
-        return figure3.claims(*planted(best, times), np.random.default_rng(1))
+        return figure3.exploration_claims(
+            *planted(best, times), np.random.default_rng(1)
+        )
 
     found = claims("RES-FS", 4.0)
     assert found["furuta_exploring_halves_the_data"]["holds"]
@@ -85,7 +87,7 @@ def test_a_seed_that_random_input_lost_tells_nothing():
     table, early = planted("FS", 4.0)
     for machine, lost in (("furuta", slice(0, 1)), ("cartpole", slice(None))):
         table[machine, "nominal", "SIM2GP, random"]["rmse"][lost] = np.nan
-    found = figure3.claims(table, early, np.random.default_rng(1))
+    found = figure3.exploration_claims(table, early, np.random.default_rng(1))
     assert found["furuta_exploring_halves_the_data"]["figure"].startswith("0.25 of")
     none = found["cartpole_exploring_halves_the_data"]
     assert not none["holds"]

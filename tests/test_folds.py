@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from sim2gp.commands import folds
-from sim2gp.commands.folds import fold, held_out
+from sim2gp.commands.folds import fit_fold, split_held_out
 from sim2gp.data.grid import evaluation_windows
 from sim2gp.data.logs import Log
 from sim2gp.data.split_log import cut
 from sim2gp.identification.forecasts.forecast import Band, Forecast
 from sim2gp.identification.forecasts.prediction import (
-    drawn,
-    predicted,
-    rows_for,
+    forecast_grid,
+    forecast_traces,
+    scored_rows,
     trace_arrays,
 )
 from sim2gp.project import load_project
@@ -36,10 +36,10 @@ def log(source: str, seconds: float, start: float = 0.0) -> Log:
 
 
 def parts(*logs: Log):
-    """What `held_out` makes of them, with windows and grid."""
+    """What `split_held_out` makes of them, with windows and grid."""
     windows, places = cut(logs, CartPole(), window=0.2)
     grid = evaluation_windows(logs, CartPole(), longest=1.0)
-    return held_out(logs, windows, places, grid), places, grid
+    return split_held_out(logs, windows, places, grid), places, grid
 
 
 def test_the_last_recording_is_left_out_with_all_its_pieces() -> None:
@@ -78,7 +78,7 @@ def test_neither_fit_nor_band_sees_what_is_held_out(
     logs = (log("a.csv", 8.0),)
     windows, places = cut(logs, CartPole(), window=0.2)
     grid = evaluation_windows(logs, CartPole(), longest=1.0)
-    part = held_out(logs, windows, places, grid)
+    part = split_held_out(logs, windows, places, grid)
     assert part is not None
 
     def fitted(system: Any, kept: Any, **_: Any) -> Any:
@@ -86,7 +86,7 @@ def test_neither_fit_nor_band_sees_what_is_held_out(
         return SimpleNamespace(posterior=None)
 
     def forecasts(system: Any, posterior: Any, grid: Any, horizon: float) -> Any:
-        rows = rows_for(horizon)
+        rows = scored_rows(horizon)
         valid = np.asarray(grid.windows.mask)[:, rows]
         none = np.zeros(valid.shape)
         slopes = [np.zeros((*valid.shape, k)) for k in (4, 1)]
@@ -97,14 +97,14 @@ def test_neither_fit_nor_band_sees_what_is_held_out(
         one = np.ones(2)
         return Band(np.ones(4), np.ones(1), one, np.array([0.0]), one[None], 1.0)
 
-    for name, stub in (("fit_windows", fitted), ("predicted", forecasts)):
+    for name, stub in (("fit_windows", fitted), ("forecast_grid", forecasts)):
         monkeypatch.setattr(folds, name, stub)
     monkeypatch.setattr(folds, "fit_band", band)
     path = tmp_path / "cart.toml"
     path.write_text('system = "cartpole"\n[[logs]]\nfiles = ["a.csv"]\n'
                     '[logs.columns]\nx = "x"\ntheta = "theta"\n'
                     'voltage = "u"\n')  # fmt: skip
-    found = fold(
+    found = fit_fold(
         load_project(path), windows, grid, part, 0.5, key=jax.random.key(0), starts=2
     )
     assert len(given["kept"]) == len(windows)  # masked, not removed
@@ -129,7 +129,7 @@ def test_windows_too_short_to_be_drawn_are_not() -> None:
     one = np.ones(2)
     band = Band(np.ones(4), np.ones(1), one, np.array([0.0]), one[None], 1.0)
     prior = CartPole().parameters.prior()
-    found = predicted(CartPole(), prior, grid, 0.1)
-    picture = drawn(found, band, grid)
+    found = forecast_grid(CartPole(), prior, grid, 0.1)
+    picture = forecast_traces(found, band, grid)
     assert trace_arrays(picture, grid, short, ["x", "theta"]) == {}
     assert film(CartPole(), prior, picture, grid, short, "none") == ({}, {})

@@ -10,14 +10,14 @@ import pytest
 
 from oracles import log_protocol as protocol
 from oracles import plain_least_squares as plain
-from sim2gp.data.grid import CURVE, evaluation_windows, slopes, steps_of
+from sim2gp.data.grid import CURVE, evaluation_windows, parabola_slopes, steps_of
 from sim2gp.data.logs import Log
 from sim2gp.identification.forecasts.forecast import (
     Band,
-    _forecast,
+    _forecast_batch,
     compile_forecast,
     fit_band,
-    forecast,
+    forecast_windows,
 )
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.systems import TwoLink
@@ -99,7 +99,7 @@ def test_errors_are_the_protocols() -> None:
     system = arm(NUMBERS)
     log = moved(0, noise=2e-4, disturbance=0.1)
     grid = evaluation_windows([log], system, longest=CURVE[-1])
-    found = forecast(system, certain(system, NUMBERS[5]), grid, ROWS)
+    found = forecast_windows(system, certain(system, NUMBERS[5]), grid, ROWS)
     gridded = protocol.on_grid(recording(log))
     model = plain.bound(plain.arm_acceleration, np.asarray(NUMBERS))
     for i, horizon in enumerate(CURVE):
@@ -114,13 +114,15 @@ def test_errors_are_the_protocols() -> None:
 def test_slopes_know_the_past_alone() -> None:
     rng = np.random.default_rng(1)
     y = rng.standard_normal((80, 2))
-    _, causal = slopes(y, causal=True)
+    _, causal = parabola_slopes(y, causal=True)
     np.testing.assert_allclose(causal, protocol.causal_velocity(y), rtol=1e-9)
     changed = y.copy()
     changed[51:] += 1.0
-    np.testing.assert_array_equal(slopes(changed, causal=True)[1][:51], causal[:51])
+    np.testing.assert_array_equal(
+        parabola_slopes(changed, causal=True)[1][:51], causal[:51]
+    )
     t = 0.002 * np.arange(80)[:, None]
-    _, centred = slopes(1.0 + 3.0 * t - 4.0 * t**2, causal=False)
+    _, centred = parabola_slopes(1.0 + 3.0 * t - 4.0 * t**2, causal=False)
     np.testing.assert_allclose(centred[12:-12], 3.0 - 8.0 * t[12:-12], rtol=1e-9)
 
 
@@ -130,11 +132,13 @@ def test_a_forecast_compiled_in_advance_is_the_same(
     system = arm(NUMBERS)
     grid = evaluation_windows([moved(2)], system, longest=0.2)
     belief, rows = certain(system, NUMBERS[5]), np.asarray([50])
-    plain = forecast(system, belief, grid, rows)
+    plain = forecast_windows(system, belief, grid, rows)
     compile_forecast(system, grid)
-    forecast(system, belief, grid, rows)
-    monkeypatch.setattr(_forecast, "_jitted", None)  # nothing is left to compile with
-    again = forecast(system, belief, grid, rows)
+    forecast_windows(system, belief, grid, rows)
+    monkeypatch.setattr(
+        _forecast_batch, "_jitted", None
+    )  # nothing is left to compile with
+    again = forecast_windows(system, belief, grid, rows)
     np.testing.assert_array_equal(again.mean, plain.mean)
     np.testing.assert_array_equal(again.by_constants, plain.by_constants)
 
@@ -144,14 +148,14 @@ def test_sensitivities_are_differences() -> None:
     grid = evaluation_windows([moved(2)], system, longest=0.3)
     rows = np.asarray([50, 150])
     belief = certain(system, NUMBERS[5])
-    found = forecast(system, belief, grid, rows)
+    found = forecast_windows(system, belief, grid, rows)
     h = 1e-5
 
     def shifted(**changes: np.ndarray) -> np.ndarray:
         windows = grid.windows
         fields = {f: getattr(windows, f) for f in windows.__dataclass_fields__}
         other = replace(grid, windows=type(windows)(**fields | changes))
-        return forecast(system, belief, other, rows).mean
+        return forecast_windows(system, belief, other, rows).mean
 
     for i in range(4):
         unit = h * np.eye(4)[i]
@@ -196,18 +200,18 @@ def test_a_simulator_is_stepped_as_in_a_fit() -> None:
     assert evaluation_windows([swing(1)], box, longest=0.5).every == 1
     tt = TABLE_OF.unconstrain(jnp.asarray(list(TRUTH.values())))
     belief = Gaussian(tt, 0.1 * jnp.eye(2))
-    found = forecast(box, belief, grid, rows)
+    found = forecast_windows(box, belief, grid, rows)
     assert spans == {2e-3, 8e-3, 1e-2}  # the first sample is one of all forecasts
     fine = evaluation_windows([log], EXACT, longest=0.5)
     assert fine.every == 1
-    exact = forecast(EXACT, belief, fine, rows)
+    exact = forecast_windows(EXACT, belief, fine, rows)
     np.testing.assert_array_equal(found.valid, exact.valid)
     for mine, right in zip(jax.tree.leaves(found), jax.tree.leaves(exact), strict=True):
         np.testing.assert_allclose(mine, right, rtol=1e-5, atol=1e-6)
     assert np.abs(found.error[found.valid]).max() < 2e-2  # starts are differences
-    one = forecast(box, belief, grid, np.asarray([1])).mean
+    one = forecast_windows(box, belief, grid, np.asarray([1])).mean
     np.testing.assert_allclose(
-        one, forecast(EXACT, belief, fine, np.asarray([1])).mean, atol=1e-9
+        one, forecast_windows(EXACT, belief, fine, np.asarray([1])).mean, atol=1e-9
     )
 
 
@@ -231,7 +235,7 @@ def disturbed():
     # Gentle: a band is a linearisation, and an arm that turns over is not.
     logs = [moved(s, torque=0.4, disturbance=0.05, noise=2e-4) for s in range(10, 40)]
     grid = evaluation_windows(logs, system, longest=CURVE[-1])
-    return grid, forecast(system, certain(system, NUMBERS[5]), grid, ROWS)
+    return grid, forecast_windows(system, certain(system, NUMBERS[5]), grid, ROWS)
 
 
 def some_logs(grid, which):
@@ -312,6 +316,6 @@ def test_published_models_score_as_known(
     ]
     grid = evaluation_windows(logs, system, longest=0.2)
     rows = np.asarray([100])
-    found = forecast(system, certain(system, numbers[5]), grid, rows)
+    found = forecast_windows(system, certain(system, numbers[5]), grid, rows)
     np.testing.assert_allclose(found.rmse()[0], pooled, rtol=0.01)
     assert not jax.config.jax_enable_x64

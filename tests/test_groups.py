@@ -10,13 +10,13 @@ import pytest
 from sim2gp.commands.apply import apply
 from sim2gp.commands.design import setting as setting_of
 from sim2gp.commands.evaluate import evaluate
-from sim2gp.commands.explain import explainable
-from sim2gp.commands.identification import restored
+from sim2gp.commands.explain import load_explainable
+from sim2gp.commands.identification import restore_identification
 from sim2gp.commands.identify import identify
 from sim2gp.data.logs import Log
 from sim2gp.errors import InputError
-from sim2gp.experiment_design.verdict import Asked
-from sim2gp.identification.configurations import told
+from sim2gp.experiment_design.verdict import DesignOptions
+from sim2gp.identification.configurations import configuration_entries
 from sim2gp.project import load_project
 from sim2gp.runs import Progress, load_run
 from sim2gp.systems import Furuta, Variant
@@ -115,7 +115,7 @@ def test_a_table_says_what_each_configuration_has(tmp_path: Path) -> None:
         Log("x", source, t, none, none, none, group=group)
         for source, group in (("a", 0), ("a", 0), ("b", 1), ("c", 1))
     ]
-    found = told(system, logs, entries)
+    found = configuration_entries(system, logs, entries)
     assert found["configurations"] == {
         "bare": {"recordings": 1, "fixed": {"alpha.payload": 0.0}, "own": []},
         "loaded": {"recordings": 2, "fixed": {}, "own": ["alpha.payload"]},
@@ -125,7 +125,7 @@ def test_a_table_says_what_each_configuration_has(tmp_path: Path) -> None:
         ["recordings", "1", "2"],
         ["alpha.payload", "0 (known)", "0.0061 kg +- 0.0002"],
     ]
-    assert told(Furuta(), logs, entries) == {}
+    assert configuration_entries(Furuta(), logs, entries) == {}
 
 
 # A model of MuJoCo's: an arm whose hand weighs 0.1 kg, or some more.
@@ -237,7 +237,7 @@ def test_held_out_logs_are_of_one_configuration(
     run: Path, folder: Path, tmp_path: Path
 ) -> None:
     def error(name: str | None) -> dict[str, Any]:
-        fit = restored(run)
+        fit = restore_identification(run)
         logs = fit.read_logs([folder / "held.csv"], name)
         return evaluate(fit, logs, progress=QUIET).summary
 
@@ -255,8 +255,8 @@ def test_held_out_logs_are_of_one_configuration(
 @pytest.mark.nightly
 def test_an_experiment_is_for_the_machine_as_it_stands(run: Path) -> None:
     def setting(name: str | None) -> Any:
-        asked = Asked(seconds=1.0, configuration=name)
-        return setting_of(restored(run), asked)[1]
+        asked = DesignOptions(seconds=1.0, configuration=name)
+        return setting_of(restore_identification(run), asked)[1]
 
     x = load_run(run).arrays
     bare, loaded = setting("bare"), setting("loaded")
@@ -275,7 +275,7 @@ def test_an_experiment_is_for_the_machine_as_it_stands(run: Path) -> None:
 @pytest.mark.nightly
 def test_a_models_file_gets_the_constants_of_one(run: Path, tmp_path: Path) -> None:
     def applied(name: str | None) -> Any:
-        found = apply(restored(run), progress=QUIET, configuration=name)
+        found = apply(restore_identification(run), progress=QUIET, configuration=name)
         return found.save_model(tmp_path / f"{name}.xml").constants
 
     found = load_run(run).summary["parameters"]
@@ -293,7 +293,7 @@ def test_commands_for_one_configuration_say_so(run: Path, folder: Path) -> None:
     with pytest.raises(InputError, match=one):
         load_project(path).load_logs(alike=True)
     with pytest.raises(InputError, match=one):
-        explainable(run)
+        load_explainable(run)
 
 
 @pytest.mark.nightly

@@ -18,7 +18,13 @@ from sim2gp.planning import AbstractPlanner, World
 from sim2gp.planning.episode import Purpose, key_for, oracle_world, run_episode
 from sim2gp.planning.mpc import from_unit
 from sim2gp.planning.tasks import MACHINES, Task, draw_truth, furuta_swingup
-from sim2gp.robot.gymnasium import NAMES, _kind, after, environment, register
+from sim2gp.robot.gymnasium import (
+    NAMES,
+    _environment_class,
+    make_environment,
+    register,
+    step_task,
+)
 from sim2gp.systems import Delay, Furuta
 from sim2gp.types import Key, State
 
@@ -192,7 +198,7 @@ def test_one_program_steps_every_machine_of_a_kind(
     """Other constants, seeds and times are other data."""
     env.reset(seed=1)
     env.step(shares[0])
-    before = after._cached._cache_size()
+    before = step_task._cached._cache_size()
     other = gymnasium.make(
         "sim2gp/Furuta-v0", params={"arm_mass": 0.1}, truth="2sd", **WRONG
     )
@@ -200,7 +206,7 @@ def test_one_program_steps_every_machine_of_a_kind(
         each.reset(seed=2)
         flown(each, shares[:3])
     assert before > 0
-    assert after._cached._cache_size() == before
+    assert step_task._cached._cache_size() == before
 
 
 def test_constants_can_be_set() -> None:
@@ -266,7 +272,7 @@ def test_a_machine_that_cannot_be_followed_is_an_error() -> None:
 
 
 def test_without_gymnasium_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    _kind.cache_clear()
+    _environment_class.cache_clear()
     monkeypatch.setitem(sys.modules, "gymnasium", None)
     with pytest.raises(InputError, match=r"E135.*sim2gp\[gym\]"):
-        environment("furuta")
+        make_environment("furuta")

@@ -10,7 +10,7 @@ import pytest
 from sim2gp.cli import main
 from sim2gp.commands import longer
 from sim2gp.commands.evaluate import evaluate
-from sim2gp.commands.identification import restored
+from sim2gp.commands.identification import restore_identification
 from sim2gp.commands.longer import Longer
 from sim2gp.data.logs import Log
 from sim2gp.errors import InputError
@@ -70,7 +70,7 @@ def run(folder: Path) -> Path:
     words = ["identify", str(path), "--check", "--longer", "--quiet"]
     with pytest.MonkeyPatch.context() as patch:  # that fit is test_longer's
         found = Longer(1.0, {"viscous": 0.25})
-        patch.setattr(longer, "lengthened", lambda *given, **how: found)
+        patch.setattr(longer, "fit_longer_windows", lambda *given, **how: found)
         assert main([*words, "--out", str(out)]) == 0
     return out
 
@@ -188,7 +188,7 @@ def test_a_film_shows_what_was_recorded_and_forecast(run: Path) -> None:
 
 
 def _evaluated(run: Path, folder: Path, *, horizon: float) -> Any:
-    fit = restored(run)
+    fit = restore_identification(run)
     logs = fit.read_logs([folder / "held" / "log3.csv"])
     return evaluate(fit, logs, horizon=horizon, progress=QUIET)
 

@@ -13,11 +13,11 @@ from scipy.stats import t as student
 from descents import standard
 from sim2gp.identification.exact_posterior.importance import (
     DRAWS,
-    Checked,
+    ImportanceCheck,
     _log_posterior,
-    checked,
+    check_weights,
     pareto,
-    smoothed,
+    pareto_smooth,
 )
 from sim2gp.inference.arrowhead import Blocks, Noise
 from sim2gp.inference.least_squares import factor
@@ -41,7 +41,7 @@ def test_few_values_are_drawn_to_one_half() -> None:
 
 def test_the_right_gaussian_has_equal_weights() -> None:
     draws = np.random.default_rng(0).standard_normal((DRAWS, 2))
-    found = checked(np.full(DRAWS, 7.0), draws)
+    found = check_weights(np.full(DRAWS, 7.0), draws)
     assert found.verdict == "fine"
     assert found.k == -math.inf
     assert found.draws == pytest.approx(DRAWS)
@@ -55,14 +55,14 @@ def test_weights_of_a_known_tail() -> None:
     """``p(w > x) ~ x^-1/k``."""
     for k in (0.3, 0.6, 1.0):
         w = (1.0 - (np.arange(4000) + 0.5) / 4000) ** -k
-        assert smoothed(np.log(w))[1] == pytest.approx(k, abs=0.04)
+        assert pareto_smooth(np.log(w))[1] == pytest.approx(k, abs=0.04)
 
 
 def test_moments_of_another_gaussian() -> None:
     """A posterior moved by .3 sd and .8 as wide: inside what the draws reach."""
     x = norm.ppf((np.arange(4000) + 0.5) / 4000)
     log_weights = norm.logpdf(x, 0.3, 0.8) - norm.logpdf(x)
-    found = checked(log_weights + 50.0, x[:, None])
+    found = check_weights(log_weights + 50.0, x[:, None])
     assert found.k < 0.5
     assert found.verdict == "fine"
     assert found.shift[0] == pytest.approx(0.3, abs=0.01)
@@ -73,17 +73,17 @@ def test_a_posterior_with_heavier_tails_is_not_trusted() -> None:
     """Student's t with two degrees of freedom: the ratio to a Gaussian has no mean."""
     x = np.random.default_rng(1).standard_normal((DRAWS, 1))
     wide = 3.0 * x  # draws of q = N(0, 1) of a posterior three times as wide
-    found = checked(norm.logpdf(x[:, 0], 0.0, 3.0) - norm.logpdf(x[:, 0]), x)
+    found = check_weights(norm.logpdf(x[:, 0], 0.0, 3.0) - norm.logpdf(x[:, 0]), x)
     assert found.k > 0.7
     assert found.verdict == "not to be trusted"
-    right = checked(student.logpdf(wide[:, 0], 30) - norm.logpdf(x[:, 0]), x)
-    assert right.k > checked(np.zeros(DRAWS), x).k
+    right = check_weights(student.logpdf(wide[:, 0], 30) - norm.logpdf(x[:, 0]), x)
+    assert right.k > check_weights(np.zeros(DRAWS), x).k
 
 
 def test_a_gaussian_that_is_too_wide_is_strained() -> None:
     """As along a curved ridge: light tails, and another spread."""
     x = np.random.default_rng(2).standard_normal((DRAWS, 2))
-    found = checked(norm.logpdf(x[:, 0], 0.0, 0.4) - norm.logpdf(x[:, 0]), x)
+    found = check_weights(norm.logpdf(x[:, 0], 0.0, 0.4) - norm.logpdf(x[:, 0]), x)
     assert found.k < 0.5
     assert found.verdict == "strained"
     assert found.far().tolist() == [True, False]
@@ -94,9 +94,9 @@ def test_a_draw_that_fails_has_no_weight() -> None:
     x = np.random.default_rng(3).standard_normal((DRAWS, 1))
     log_weights = np.zeros(DRAWS)
     log_weights[x[:, 0] > 1.0] = np.nan
-    found = checked(log_weights, x)
+    found = check_weights(log_weights, x)
     assert found.shift[0] < -0.1
-    nothing = checked(np.full(DRAWS, np.nan), x)
+    nothing = check_weights(np.full(DRAWS, np.nan), x)
     assert nothing.verdict == "not to be trusted"
     assert nothing.as_dict(("a",))["constants"]["a"] == {
         "shift": None,
@@ -111,7 +111,7 @@ def test_a_draw_that_fails_has_no_weight() -> None:
      (math.inf, "not to be trusted"), (math.nan, "not to be trusted")],
 )  # fmt: skip
 def test_words_follow_the_shape(k: float, verdict: str) -> None:
-    assert Checked(k, 200.0, np.zeros(1), np.ones(1)).verdict == verdict
+    assert ImportanceCheck(k, 200.0, np.zeros(1), np.ones(1)).verdict == verdict
 
 
 class Product(AbstractLikelihood):

@@ -26,7 +26,7 @@ from sim2gp.identification.intervals.pulls import (
     pulls_of_windows,
     rows_of,
 )
-from sim2gp.identification.intervals.scatter import corrected
+from sim2gp.identification.intervals.scatter import correct_posterior
 from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.parameters import Parameter, Parameters
@@ -63,8 +63,8 @@ class Linear:
 
     def corrected(self, y: np.ndarray) -> tuple["Plain", "Plain"]:
         """Plain and corrected, in numpy."""
-        plain, pulls = self.fit(y)
-        return Plain(plain), Plain(corrected(self.prior, plain, pulls).posterior)
+        p, pulls = self.fit(y)
+        return Plain(p), Plain(correct_posterior(self.prior, p, pulls).posterior)
 
 
 class Plain:
@@ -170,13 +170,13 @@ def test_units_of_the_constants_do_not_matter() -> None:
     rng = np.random.default_rng(7)
     model = Linear(smooth(rng))
     plain, pulls = model.fit(model.J @ np.ones(P) + ar1(rng, 0.9))
-    found = Plain(corrected(model.prior, plain, pulls).posterior)
+    found = Plain(correct_posterior(model.prior, plain, pulls).posterior)
     turn = np.linalg.qr(rng.standard_normal((P, P)))[0]
     A = rng.standard_normal((P, P))  # tt = A turn z' + 5: whitened coordinates z'
     prior = gaussian(np.full(P, 5.0), A @ turn)
     other = gaussian(A @ np.asarray(plain.mean) + 5.0, A @ np.asarray(plain.scale))
     turned = Pulls(pulls.factors @ turn, pulls.scores @ turn, pulls.group)
-    same = Plain(corrected(prior, other, turned).posterior)
+    same = Plain(correct_posterior(prior, other, turned).posterior)
     np.testing.assert_allclose(same.mean, A @ found.mean + 5.0, rtol=1e-9)
     np.testing.assert_allclose(same.C, A @ found.C @ A.T, rtol=1e-8, atol=1e-12)
 
@@ -221,7 +221,7 @@ def test_too_few_windows_say_nothing() -> None:
     rng = np.random.default_rng(11)
     model = Linear(smooth(rng)[:3])
     plain, pulls = model.fit(rng.standard_normal((3, L)))
-    found = corrected(model.prior, plain, pulls)
+    found = correct_posterior(model.prior, plain, pulls)
     assert not found.enough
     assert found.posterior is plain
 
@@ -236,7 +236,7 @@ def test_what_is_not_a_number_is_refused() -> None:
         }
         broken[what][3] = np.nan
         with pytest.raises(NotFinite, match="pulls of windows"):
-            corrected(model.prior, plain, Pulls(**broken))
+            correct_posterior(model.prior, plain, Pulls(**broken))
 
 
 def test_a_corrected_posterior_changes_spreads_and_not_the_structure() -> None:
@@ -272,16 +272,16 @@ def test_a_corrected_posterior_changes_spreads_and_not_the_structure() -> None:
 
 
 def test_the_words_say_which_intervals_these_are() -> None:
-    found = intervals.Corrected(gaussian(np.zeros(1), np.eye(1)), 9.0, 2, 30.0, True)
-    text = intervals.words(found, [1.0, 2.96, 3.31], 40)
+    found = intervals.CorrectedFit(gaussian(np.zeros(1), np.eye(1)), 9.0, 2, 30.0, True)
+    text = intervals.describe_intervals(found, [1.0, 2.96, 3.31], 40)
     assert text.startswith("Intervals are 1 to 3.3 times as wide")
     assert "40 windows are coloured and pull the parameters 3 times" in text
-    assert "are 3 times as wide" in intervals.words(found, [3.0, 3.0], 40)
+    assert "are 3 times as wide" in intervals.describe_intervals(found, [3.0, 3.0], 40)
     white = dataclasses.replace(found, inflation=1.0)
-    text = intervals.words(white, [1.02, 1.1], 40)
+    text = intervals.describe_intervals(white, [1.02, 1.1], 40)
     assert "at most 1.1 times those of independent samples" in text
     few = dataclasses.replace(found, enough=False)
-    assert "3 windows are too few" in intervals.words(few, [1.0], 3)
+    assert "3 windows are too few" in intervals.describe_intervals(few, [1.0], 3)
 
 
 def recorded(system: Machine, rows: int, rate: list[float], error: np.ndarray) -> Log:
@@ -331,7 +331,7 @@ def test_a_linear_machines_centre_is_where_the_gaussian_says(
         )
     assert there - here == pytest.approx(told, rel=1e-6)
     ours = corrected_windows(likelihood, belief, of)
-    plain = corrected(belief.prior, belief.posterior, pulls)
+    plain = correct_posterior(belief.prior, belief.posterior, pulls)
     np.testing.assert_allclose(ours.posterior.mean, plain.posterior.mean, atol=1e-12)
 
 
@@ -348,7 +348,7 @@ def test_a_constant_at_its_bound_stays_where_the_data_are() -> None:
     likelihood = WindowsLikelihood(system, windows)
     of = np.zeros(len(windows), int)
     pulls = pulls_of_windows(likelihood, belief, of)
-    naive = corrected(belief.prior, belief.posterior, pulls)
+    naive = correct_posterior(belief.prior, belief.posterior, pulls)
     ours = corrected_windows(likelihood, belief, of)
     with jax.enable_x64(True):
         best, bad, good = (

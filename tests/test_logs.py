@@ -18,7 +18,7 @@ from sim2gp.data.logs import (
     read_log,
     shared_rows,
 )
-from sim2gp.data.logs.units import UNITS, factor
+from sim2gp.data.logs.units import UNITS, unit_factor
 from sim2gp.errors import InputError
 
 STATES = (
@@ -122,11 +122,11 @@ def test_sign_scale_offset_unit_and_time(tmp_path: Path) -> None:
 @given(st.sampled_from(sorted(UNITS)), st.sampled_from(sorted(UNITS)))
 def test_units_convert_there_and_back_or_refuse(one: str, other: str) -> None:
     if UNITS[one][0] == UNITS[other][0]:
-        there, back = factor(one, other, "here"), factor(other, one, "here")
+        there, back = unit_factor(one, other, "here"), unit_factor(other, one, "here")
         assert there * back == pytest.approx(1.0, rel=1e-15)
     else:
         with pytest.raises(InputError, match="E107"):
-            factor(one, other, "here")
+            unit_factor(one, other, "here")
 
 
 def test_wrapped_angles_are_unwrapped_and_it_is_said(tmp_path: Path) -> None:

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from linear_system import linear
-from sim2gp.commands.longer import TIMES, Longer, advice, lengthened
+from sim2gp.commands.longer import TIMES, Longer, advice, fit_longer_windows
 from sim2gp.data.logs import Log
 from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.intervals.discrepancy import corrected_windows
-from sim2gp.identification.intervals.scatter import Corrected
+from sim2gp.identification.intervals.scatter import CorrectedFit
 from sim2gp.identification.misfit.residuals import misfit_of_windows
 from sim2gp.project import Project, load_project
 from sim2gp.project.training_windows import cut_logs
@@ -42,7 +42,7 @@ def recording(drift: float = 0.0, rows: int = ROWS) -> Log:
     )
 
 
-def fitted(folder: Path, log: Log) -> tuple[Project, list[Log], Corrected]:
+def fitted(folder: Path, log: Log) -> tuple[Project, list[Log], CorrectedFit]:
     """A project, its log, and the intervals of windows that nothing contradicts."""
     path = folder / "project.toml"
     path.write_text(f"{PROJECT}[likelihood]\nwindow = {WINDOW}\n")
@@ -55,7 +55,7 @@ def fitted(folder: Path, log: Log) -> tuple[Project, list[Log], Corrected]:
 
 
 def asked(folder: Path, log: Log, *, alarm: bool = False) -> Longer:
-    return lengthened(*fitted(folder, log), alarm=alarm, key=KEY)
+    return fit_longer_windows(*fitted(folder, log), alarm=alarm, key=KEY)
 
 
 def dense_sd(log: Log, window: float) -> np.ndarray:
@@ -100,7 +100,7 @@ def test_logs_must_be_long_enough(tmp_path: Path) -> None:
 
     def refused(rows: int) -> str:
         short = [recording(rows=rows)]
-        return lengthened(project, short, honest, alarm=False, key=KEY).refused
+        return fit_longer_windows(project, short, honest, alarm=False, key=KEY).refused
 
     assert "too few" in refused(60)
     assert "E116" in refused(11)

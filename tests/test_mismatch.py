@@ -86,7 +86,9 @@ def test_auto_is_held_against_the_best_fixed_model(auto, holds):
     lost = dict.fromkeys(METHODS, 0.5) | {"RES": 0.2, WITH_TERM: 0.01}
     lost["Auto"] = 0.2 * auto
     table = {("spring mild", m): np.full((2, 3), 1.0 - x) for m, x in lost.items()}
-    claim = mismatch.claims(table, np.random.default_rng(0))["choosing_costs_little"]
+    claim = mismatch.mismatch_claims(table, np.random.default_rng(0))[
+        "choosing_costs_little"
+    ]
     assert claim["holds"] is holds
     same = f"[{auto:.2f}, {auto:.2f}]"  # both seeds lost alike
     assert claim["figure"] == f"{auto:.2f} {same} times the regret of RES"
@@ -99,7 +101,7 @@ def test_the_ratio_of_regrets_knows_its_seeds():
     noisy = bad * rng.uniform(0.7, 1.3, (30, 1))
     table = {("drag mild", m): 1.0 - bad for m in METHODS}
     table["drag mild", "Auto"] = 1.0 - noisy
-    figure = mismatch.claims(table, rng)["choosing_costs_little"]["figure"]
+    figure = mismatch.mismatch_claims(table, rng)["choosing_costs_little"]["figure"]
     low, high = map(float, figure[figure.index("[") + 1 : figure.index("]")].split(","))
     ratio = noisy[:, 0] / bad[:, 0]
     # The delta method, for the ratio of two means.
@@ -114,9 +116,9 @@ def test_the_ratio_of_regrets_knows_its_seeds():
 def test_sampling_is_looked_for_all_over_the_map():
     table = {(c, m): np.full((5, 3), 0.5) for c in ("drag mild", "x") for m in METHODS}
     name = "sampling_beats_the_point_estimate_somewhere"
-    assert not mismatch.claims(table, np.random.default_rng(0))[name]["holds"]
+    assert not mismatch.mismatch_claims(table, np.random.default_rng(0))[name]["holds"]
     table["drag mild", "SIM2GP"] = np.full((5, 3), 0.6)
-    claim = mismatch.claims(table, np.random.default_rng(0))[name]
+    claim = mismatch.mismatch_claims(table, np.random.default_rng(0))[name]
     assert claim["holds"]
     assert claim["figure"].startswith("drag mild: +0.100")
 

@@ -143,7 +143,7 @@ def test_limits_are_set_where_they_can_be_and_never_raised(tmp_path, monkeypatch
     ):
         monkeypatch.setitem(sys.modules, "resource", fake)
         mjcf_child.limit("RLIMIT_AS", 8 << 30)
-        mjcf_child.seal()
+        mjcf_child.forbid_files()
     asked = []
     low = SimpleNamespace(
         RLIMIT_AS=5,

@@ -12,12 +12,17 @@ from scipy.stats import norm
 
 from descents import minimise, standard
 from sim2gp.errors import InputError
-from sim2gp.identification.exact_posterior.nuts import Sampled, judged, sampled, sampler
+from sim2gp.identification.exact_posterior.nuts import (
+    ChainSummary,
+    sample_posterior,
+    sampler,
+    summarise_chains,
+)
 from sim2gp.inference.arrowhead import Blocks, Noise
 from sim2gp.inference.least_squares import factor
 from sim2gp.inference.likelihood import AbstractLikelihood
 
-GOOD = Sampled(np.zeros(2), np.ones(2), 1.001, 900.0, 0)
+GOOD = ChainSummary(np.zeros(2), np.ones(2), 1.001, 900.0, 0)
 
 
 class Bent(AbstractLikelihood):
@@ -65,10 +70,12 @@ def test_moments_are_those_of_the_marginal_posterior() -> None:
         # About a point that is not the mode: coordinates alone rest on it.
         e = minimise(likelihood, jnp.zeros(1), jnp.zeros((len(y), 1)), noise).e
         z = jnp.full(1, 0.2)
-        found, lost = sampled(likelihood, standard(1), z, e, noise, jax.random.key(1))
+        found, lost = sample_posterior(
+            likelihood, standard(1), z, e, noise, jax.random.key(1)
+        )
         R = _precision(z, e, sd)
     unit = np.full((1, 1), 1.0 / R)
-    result = judged(np.asarray(found), np.asarray(lost), unit)
+    result = summarise_chains(np.asarray(found), np.asarray(lost), unit)
     assert result.r_hat < 1.05
     error = 5.0 * spread / np.sqrt(result.draws)
     assert 0.2 + result.shift[0] == pytest.approx(mean, abs=error)
@@ -89,16 +96,16 @@ def test_chains_that_do_not_meet_say_nothing() -> None:
     rng = np.random.default_rng(0)
     draws = rng.standard_normal((4, 250, 2))
     lost = np.zeros((4, 250), bool)
-    fine = judged(draws, lost, np.eye(2))
+    fine = summarise_chains(draws, lost, np.eye(2))
     assert fine.mixed
     assert not fine.far().any()
     assert "agrees" in fine.words(("a", "b"))
     draws[0, :, 1] += 2.0
-    apart = judged(draws, lost, np.eye(2))
+    apart = summarise_chains(draws, lost, np.eye(2))
     assert apart.r_hat > 1.1
     assert not apart.mixed
     assert "did not settle" in apart.words(("a", "b"))
-    drift = judged(
+    drift = summarise_chains(
         rng.standard_normal((4, 250, 1)) + np.linspace(-2, 2, 250)[:, None],
         lost,
         np.eye(1),
@@ -109,7 +116,7 @@ def test_chains_that_do_not_meet_say_nothing() -> None:
 def test_a_constant_is_a_direction_of_the_standardised_ones() -> None:
     draws = np.random.default_rng(1).standard_normal((4, 250, 2)) * [1.0, 3.0]
     unit = np.asarray([[0.6, 0.8], [1.0, 0.0]])
-    found = judged(draws, np.zeros((4, 250), bool), unit)
+    found = summarise_chains(draws, np.zeros((4, 250), bool), unit)
     np.testing.assert_allclose(found.ratio, [np.hypot(0.6, 2.4), 1.0], rtol=0.1)
 
 

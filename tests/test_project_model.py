@@ -12,9 +12,9 @@ import pytest
 from sim2gp.cli import main
 from sim2gp.commands import apply
 from sim2gp.commands.design import setting
-from sim2gp.commands.identification import restored
+from sim2gp.commands.identification import restore_identification
 from sim2gp.errors import InputError
-from sim2gp.experiment_design.verdict import Asked
+from sim2gp.experiment_design.verdict import DesignOptions
 from sim2gp.project import load_project
 from sim2gp.runs import load_run, new_run
 from sim2gp.systems.mujoco.load import compiled_all
@@ -294,7 +294,7 @@ def test_what_leaves_a_run_is_as_wide_as_its_report(
     Of a run whose corrected posterior is far from the plain one, by copying it so.
     """
     stored, run = load_run(identified), identified.parent / "wide"
-    table = restored(identified).project.system.parameters
+    table = restore_identification(identified).project.system.parameters
     x = dict(stored.arrays)
     rng = np.random.default_rng(0)
     x["intervals/scale"] = (
@@ -312,7 +312,7 @@ def test_what_leaves_a_run_is_as_wide_as_its_report(
         writer.write_summary(stored.summary)
         writer.write_text("project.toml", (identified / "project.toml").read_text())
 
-    fit, eps = restored(run), []
+    fit, eps = restore_identification(run), []
     for prefix, known in (("intervals", fit.posterior), ("belief", fit.plain)):
         np.testing.assert_array_equal(known.mean, x[f"{prefix}/mean"])
         np.testing.assert_array_equal(known.scale, x[f"{prefix}/scale"])
@@ -341,7 +341,7 @@ def test_what_leaves_a_run_is_as_wide_as_its_report(
     # Of one seed they are the same standard normal numbers, each in its own posterior.
     np.testing.assert_allclose(eps[0], eps[1], atol=1e-6)
     assert 0.5 < eps[0].std() < 1.6
-    question = Asked(seconds=1.0)
+    question = DesignOptions(seconds=1.0)
     _, experiment, _ = setting(fit, question)
     np.testing.assert_array_equal(experiment.belief.scale, x["belief/scale"])
     np.testing.assert_array_equal(experiment.plausible.mean, x["intervals/mean"])
@@ -364,10 +364,12 @@ def test_a_file_that_was_changed_in_place_is_no_longer_the_one_fitted(
     machine.write_bytes(other.read_bytes())
     try:
         with pytest.raises(InputError, match=r"E170 another machine than was fitted"):
-            restored(identified)
+            restore_identification(identified)
     finally:
         machine.write_text(MODEL)
-    assert restored(identified).project.system.states[0].name == "shoulder"
+    assert (
+        restore_identification(identified).project.system.states[0].name == "shoulder"
+    )
     assert list(tmp_path.iterdir()) == [other]
 
 

@@ -343,15 +343,15 @@ def test_means_are_rounded_by_their_uncertainty(
     ],
 )  # fmt: skip
 def test_numbers_have_three_digits(value: object, text: str) -> None:
-    assert numbers.number(value) == text
+    assert numbers.format_number(value) == text
 
 
 def test_other_words_for_numbers() -> None:
-    assert numbers.interval(8.3123, 8.5123) == "8.312 to 8.512"
-    assert numbers.interval(1e-6, 3e-3) == "1.0 × 10⁻⁶ to 0.0030"
-    assert numbers.duration(21.37) == "21.4 s"
-    assert numbers.duration(754.0) == "12 min 34 s"
-    assert numbers.duration(7500) == "2 h 05 min"
+    assert numbers.format_interval(8.3123, 8.5123) == "8.312 to 8.512"
+    assert numbers.format_interval(1e-6, 3e-3) == "1.0 × 10⁻⁶ to 0.0030"
+    assert numbers.format_duration(21.37) == "21.4 s"
+    assert numbers.format_duration(754.0) == "12 min 34 s"
+    assert numbers.format_duration(7500) == "2 h 05 min"
     assert numbers.unit_text("kg m^2 s^-1") == "kg m² s⁻¹"
 
 
@@ -370,7 +370,7 @@ def test_redraw_gives_the_same_bytes_from_the_files_alone(
     path = report.redraw(target)
     assert path.read_bytes() == first == text.encode()
     assert sorted(p.name for p in target.iterdir()) == sorted([*before, "report.html"])
-    summary, arrays = report.load_run(target)
+    summary, arrays = report.load_summary(target)
     assert summary["headline"] == run[0]["headline"]
     assert set(arrays) == set(run[1])
 

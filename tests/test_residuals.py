@@ -20,7 +20,7 @@ from sim2gp.data.windows_likelihood import (
 )
 from sim2gp.identification.misfit.residuals import (
     earlier,
-    encoded,
+    encode_angles,
     misfit_of_transitions,
     misfit_of_windows,
 )
@@ -71,7 +71,7 @@ def test_inputs_of_the_tests() -> None:
     np.testing.assert_array_equal(past[1], [0.0, 0.0, 0.0])
     np.testing.assert_array_equal(past[5], [4.0, 4.0, 4.0])
     channels = (Channel("q", "rad", angle=True), Channel("v", "rad/s"))
-    columns = encoded(np.array([[0.3, 2.0]]), channels)
+    columns = encode_angles(np.array([[0.3, 2.0]]), channels)
     np.testing.assert_allclose(columns, [[np.sin(0.3), np.cos(0.3), 2.0]])
 
 

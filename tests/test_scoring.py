@@ -9,7 +9,7 @@ import scipy.stats
 
 from sim2gp.commands import compare
 from sim2gp.identification.forecasts import scoring
-from sim2gp.identification.forecasts.scoring import Paired
+from sim2gp.identification.forecasts.scoring import PairedComparison
 
 
 @pytest.mark.parametrize("error", [-2.0, -0.1, 0.0, 0.7, 9.0])
@@ -66,10 +66,10 @@ def test_spread_covers_the_known_errors() -> None:
     known = np.ones((W, 1, 2), bool)
     known[2000:] = False
     error[2000:] *= 100.0  # what was left out must not be looked at
-    sd = scoring.spread(error, draws, known, np.zeros(2), 1.0)
+    sd = scoring.predicted_spread(error, draws, known, np.zeros(2), 1.0)
     inside = np.abs(error[:2000]) <= 1.96 * sd[:2000]
     np.testing.assert_allclose(inside.mean(axis=(0, 1)), 0.95, atol=0.02)
-    wide = scoring.spread(error, draws, known, np.zeros(2), 4.0)
+    wide = scoring.predicted_spread(error, draws, known, np.zeros(2), 4.0)
     np.testing.assert_allclose(wide, 2.0 * sd, rtol=1e-12)
 
 
@@ -79,7 +79,7 @@ def test_units_add_up_to_one_for_the_simulator() -> None:
     valid = rng.uniform(size=(20, 2, 2)) < 0.9
     score[1] = 0.5 * score[0]
     unit = np.repeat([7, 3], 10)
-    sums = scoring.by_unit(score, valid, unit)
+    sums = scoring.crps_by_unit(score, valid, unit)
     assert sums.shape == (3, 2)
     # Each of the two steps and two channels weighs the same.
     assert sums[0].sum() == pytest.approx(4.0)
@@ -91,12 +91,12 @@ RNG = np.random.default_rng
 
 def test_a_pair_is_compared_unit_by_unit() -> None:
     old = np.asarray([1.0, 2.0, 3.0, 4.0, 5.0])
-    found = scoring.paired(0.9 * old, old, RNG(0))
+    found = scoring.compare_paired(0.9 * old, old, RNG(0))
     for value in (found.change, found.low, found.high):
         assert value == pytest.approx(-0.1)
     assert (found.better, found.units) == (5, 5)
     assert found.wins
-    mixed = scoring.paired(old * [0.5, 1.2, 0.9, 1.1, 1.02], old, RNG(0))
+    mixed = scoring.compare_paired(old * [0.5, 1.2, 0.9, 1.1, 1.02], old, RNG(0))
     assert mixed.low < mixed.change < mixed.high
     assert mixed.better == 2
     assert not mixed.wins
@@ -107,7 +107,7 @@ def test_the_interval_is_the_bootstraps() -> None:
     rng = RNG(3)
     old = rng.uniform(0.5, 1.5, 400)
     new = old * (0.97 + 0.2 * rng.standard_normal(400))
-    found = scoring.paired(new, old, RNG(4))
+    found = scoring.compare_paired(new, old, RNG(4))
     ratio = new.sum() / old.sum()
     error = np.std(new - ratio * old) / old.mean() / math.sqrt(400)
     assert found.high - found.low == pytest.approx(2 * 1.96 * error, rel=0.08)
@@ -128,11 +128,11 @@ def test_ties_keep_the_simpler_and_runaways_lose() -> None:
         ([old, np.full(6, math.nan)], 0),
     ]
     for sums, kept in cases:
-        assert scoring.supported(np.stack(sums), RNG(0)) == kept
+        assert scoring.select_model(np.stack(sums), RNG(0)) == kept
 
 
 WHAT = {name: compare.MODELS[name].what for name in ("SIM2GP", "RES", "NLM")}
-SAME = Paired(0.0, 0.0, 0.0, 0, 6)
+SAME = PairedComparison(0.0, 0.0, 0.0, 0, 6)
 
 
 @pytest.mark.parametrize(
@@ -148,8 +148,8 @@ SAME = Paired(0.0, 0.0, 0.0, 0, 6)
 def test_the_verdict_in_words(
     res: float, nlm: float, kept: int, words: list[str]
 ) -> None:
-    pairs = [SAME, *(Paired(x, x - 0.03, x + 0.03, 5, 6) for x in (res, nlm))]
-    said = scoring.sentence(WHAT, pairs, kept, "logs")
+    pairs = [SAME, *(PairedComparison(x, x - 0.03, x + 0.03, 5, 6) for x in (res, nlm))]
+    said = scoring.selection_sentence(WHAT, pairs, kept, "logs")
     for word in words:
         assert word in said
     assert "nan" not in said
@@ -158,10 +158,10 @@ def test_the_verdict_in_words(
 
 def test_every_learner_that_is_compared_has_words() -> None:
     """A learner of one's own is one entry of the table; the verdict says it."""
-    own = compare.Learner(lambda sim, reach: sim, "a table of numbers")
+    own = compare.ModelFactory(lambda sim, reach: sim, "a table of numbers")
     known = {**compare.MODELS, "OWN": own}
     what = {name: learner.what for name, learner in known.items()}
-    pairs = [SAME, *[Paired(-0.1, -0.2, -0.05, 5, 6)] * (len(what) - 1)]
+    pairs = [SAME, *[PairedComparison(-0.1, -0.2, -0.05, 5, 6)] * (len(what) - 1)]
     for kept, (name, words) in list(enumerate(what.items()))[1:]:
-        said = scoring.sentence(what, pairs, kept, "logs")
+        said = scoring.selection_sentence(what, pairs, kept, "logs")
         assert f"support {words} ({name})" in said

@@ -49,7 +49,7 @@ def test_rational_arithmetic_by_hand():
 
 def spoilt(mean=1.0, scale=1.0, evidence=0.0):
     """A solver whose answers are off by a little."""
-    solve = checks._solve
+    solve = checks._solve_batch
 
     def wrong(*problems):
         m, S, e = solve(*problems)
@@ -72,14 +72,14 @@ def spoilt(mean=1.0, scale=1.0, evidence=0.0):
     ],
 )
 def test_a_wrong_posterior_is_noticed(monkeypatch, name, fault):
-    monkeypatch.setattr(checks, "_solve", spoilt(**fault))
+    monkeypatch.setattr(checks, "_solve_batch", spoilt(**fault))
     assert not figure(name) <= CHECKS[name].limit
 
 
 def test_jitter_is_noticed_by_the_units(monkeypatch):
-    solve = checks._solve
+    solve = checks._solve_batch
     monkeypatch.setattr(
-        checks, "_solve", lambda *p: (solve(*p)[0], solve(*p)[1] + 1e-6, 0.0)
+        checks, "_solve_batch", lambda *p: (solve(*p)[0], solve(*p)[1] + 1e-6, 0.0)
     )
     assert figure("units") > CHECKS["units"].limit
 
@@ -101,8 +101,8 @@ def test_friction_is_noticed_by_the_energy(monkeypatch):
 
 @pytest.mark.nightly
 def test_intervals_too_narrow_are_noticed_by_the_arm(monkeypatch):
-    right = checks.covered
-    monkeypatch.setattr(checks, "covered", lambda z, level: right(3.0 * z, level))
+    right = checks.coverage
+    monkeypatch.setattr(checks, "coverage", lambda z, level: right(3.0 * z, level))
     assert figure("arm") > CHECKS["arm"].limit
 
 

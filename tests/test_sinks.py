@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim2gp.commands.demo import _told
+from sim2gp.commands.demo import _episode_listener
 from sim2gp.errors import InputError
 from sim2gp.models import PointEstimate, Sim2GP
 from sim2gp.planning.episode import Trajectory
@@ -189,7 +189,7 @@ def test_the_demo_tells_its_bar_and_the_sink() -> None:
         np.ones(1, bool),
     )
     belief = PointEstimate(Sim2GP(CartPole())).init(jax.random.key(0))
-    _told(said.append, sink, 7, "prior mean")(Episode(2, flown, belief))
+    _episode_listener(said.append, sink, 7, "prior mean")(Episode(2, flown, belief))
     assert said == ["prior mean, episode 2: return 4"]
     name = "seed 7/prior mean"
     assert sink.seen == [(2, {f"{name}/return": 3.5, f"{name}/failed_plans": 1.0})]

@@ -11,7 +11,7 @@ from PIL import Image
 from report_example import a_film
 from sim2gp import reports as report
 from sim2gp.reports import scenes
-from sim2gp.reports.skeleton import camera_for, figure_entry, overlaid, skeleton
+from sim2gp.reports.skeleton import camera_for, figure_entry, overlay_motion, skeleton
 
 ARM = """
 <mujoco><worldbody>
@@ -151,7 +151,7 @@ def test_the_recorded_machine_is_a_pale_shadow_of_its_own_points() -> None:
     about = summary["animation"]["figure"]
     about = about | {"rods": [*about["rods"], [0, 2, "link"]]}  # from the base
     scene = skeleton(about, arrays["animation/points"])
-    both = overlaid(scene, arrays["animation/recorded_points"])
+    both = overlay_motion(scene, arrays["animation/recorded_points"])
     assert both.moving.shape[1] == 6
     ghosts = [shape for shape in both.shapes if shape.colour == "ghost"]
     rods, balls = {(4, 5), (5, 6), (0, 5)}, {(4,), (5,), (6,)}
@@ -168,7 +168,7 @@ def test_bundled_machines_have_a_shadow_too(system: str) -> None:
     state = np.concatenate([swing(), swing()], axis=1)
     scene = scenes.scene_of({"system": system}, state)
     other = scenes.scene_of({"system": system}, state + 0.1)
-    both = overlaid(scene, other.moving)
+    both = overlay_motion(scene, other.moving)
     count = scene.moving.shape[1]
     first = len(scene.fixed) + count
     ghosts = [shape for shape in both.shapes if shape.colour == "ghost"]
@@ -234,7 +234,7 @@ def test_no_back_end_is_no_picture_and_no_noise(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is absent")
-    from sim2gp.systems.mujoco.film import backends, rendered
+    from sim2gp.systems.mujoco.film import backends, render_motion
 
     assert backends({}, "linux") == ["egl", "osmesa"]
     assert backends({}, "darwin") == [""]
@@ -243,7 +243,7 @@ def test_no_back_end_is_no_picture_and_no_noise(
     model = mujoco.MjModel.from_xml_string(CART)
     for name in ("disable", "nonsense"):  # nothing is tried; a child that fails
         monkeypatch.setenv("MUJOCO_GL", name)
-        found = rendered(
+        found = render_motion(
             model, swing(2), swing(2), lookat=np.zeros(3),
             view=(90.0, 0.0, 3.0, 45.0), size=(64, 48),
         )  # fmt: skip
@@ -256,14 +256,14 @@ def test_no_back_end_is_no_picture_and_no_noise(
 def test_mujoco_sees_the_machine_where_the_figure_is(text: str) -> None:
     """Every joint of the figure lies on the machine that MuJoCo drew."""
     mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is absent")
-    from sim2gp.reports.motion import _frames
+    from sim2gp.reports.motion import _rendered_frames
     from sim2gp.systems.mujoco.figure import figure_of
 
     model = mujoco.MjModel.from_xml_string(text)
     q = swing(33)
     figure = figure_of(model, q)
     scene = skeleton(figure_entry(figure), figure.moving)
-    about, arrays = _frames(model, [q + 0.3, q], scene, 8)
+    about, arrays = _rendered_frames(model, [q + 0.3, q], scene, 8)
     if not about:
         pytest.skip("MuJoCo has no graphics back end here")
     every, size = (

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import recordings as rec
 from recordings import Channel
 from sim2gp.data.logs import Column, Log, Resample, read_log
-from sim2gp.data.logs.resample import Track, joined
+from sim2gp.data.logs.resample import Track, join_tracks
 from sim2gp.data.logs.table import Rows
 from sim2gp.errors import InputError
 
@@ -131,13 +131,13 @@ def test_a_gap_between_two_rows_cuts_too() -> None:
     """A fast stream that pauses for less than the rows' period."""
     fast = np.concatenate([np.arange(50), np.arange(58, 100)]) * 1e-3
     slow = np.arange(0, 10) * 1e-2 + 5e-4
-    whole, _ = joined(
+    whole, _ = join_tracks(
         [track("fast", fast, "x"), track("slow", slow, "q")], None, "a.bag"
     )
     # 49 ms is the last before the pause, 58 ms the first after it.
     assert whole.time[whole.cuts].tolist() == [slow[6]]
     assert slow[5] not in whole.time
-    closer, _ = joined(
+    closer, _ = join_tracks(
         [track("slow", slow - 2e-3, "q"), track("fast", fast, "x")],
         Resample(stamps="slow"),
         "a.bag",
@@ -197,9 +197,9 @@ def test_each_row_by_its_definition(a: list[float], b: list[float], bad: int) ->
             expected[k] = (*expected[k][:2], False, expected[k][3])
     if len(expected) < 2:
         with pytest.raises(InputError, match="E116"):
-            joined(tracks, Resample(stamps="one"), "a.bag")
+            join_tracks(tracks, Resample(stamps="one"), "a.bag")
         return
-    whole, _ = joined(tracks, Resample(stamps="one"), "a.bag")
+    whole, _ = join_tracks(tracks, Resample(stamps="one"), "a.bag")
     times, x, counts, u = map(np.asarray, zip(*expected, strict=True))
     np.testing.assert_array_equal(whole.time, times)
     np.testing.assert_allclose(whole.channels["x"], x, atol=1e-12)

@@ -17,7 +17,7 @@ import pytest
 
 import servo_arm
 from sim2gp.data.split_log import cut
-from sim2gp.data.window_slopes import Asked, HostRun, about
+from sim2gp.data.window_slopes import HostRun, SlopeInputs, about
 from sim2gp.project import load_project
 from sim2gp.systems import Coulomb, Drag, MuJoCo, Spring, Viscous
 from sim2gp.systems.assemble import free_parts
@@ -234,7 +234,7 @@ def test_forces_on_joints_act_on_the_host_as_in_jax(tmp_path):
     system = free_parts(plain, FORCES)
     prior = system.parameters.prior()
     tt = prior.mean + 0.5 * jnp.diag(prior.scale)
-    asked = Asked.at(np.asarray(tt), cuts.start)
+    asked = SlopeInputs.at(np.asarray(tt), cuts.start)
     run = HostRun(simulator_of(system), system, cuts, asked)
     params = system.record(system.values(tt))
     expected = cuts.each(lambda one: simulate(system, params, one, one.start))

@@ -24,7 +24,7 @@ from sim2gp.data.windows_likelihood import (
 from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.intervals.discrepancy import corrected_windows
 from sim2gp.identification.missing_physics.data import WindowData
-from sim2gp.identification.missing_physics.score import score
+from sim2gp.identification.missing_physics.score import score_candidates
 from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.likelihood import AbstractLikelihood
@@ -158,7 +158,7 @@ def gains(machine: Any, logs: Sequence[Any]) -> dict[str, float]:
     _, places = cut(logs, machine, window=0.2)
     of = np.asarray([k for k, _ in places])
     data = WindowData(machine, lambda m: cut(logs, m, window=0.2)[0], of)
-    scored = score(data, data.fit(), sy.candidates(machine, windows=True))
+    scored = score_candidates(data, data.fit(), sy.candidates(machine, windows=True))
     names = {one.candidate.name: one.gain for one in scored}
     return {n.replace("viscous", "back_emf"): gain for n, gain in names.items()}
 

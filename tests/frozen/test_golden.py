@@ -14,7 +14,7 @@ import pytest
 import sim2gp as sg
 from frozen.recordings import check_same, figures
 from sim2gp.cli import main
-from sim2gp.commands.identification import restored
+from sim2gp.commands.identification import restore_identification
 
 GOLDEN = Path(__file__).parent / "golden"
 pytestmark = pytest.mark.skipif(
@@ -37,7 +37,7 @@ def test_a_run_still_has_its_posterior(name: str) -> None:
     if name == "arm":
         pytest.importorskip("mujoco")
     run = sg.load_run(GOLDEN / "runs" / name)
-    fit = restored(GOLDEN / "runs" / name)
+    fit = restore_identification(GOLDEN / "runs" / name)
     for gaussian, prefix in ((fit.posterior, "intervals"), (fit.plain, "belief")):
         np.testing.assert_array_equal(gaussian.mean, run.arrays[f"{prefix}/mean"])
         np.testing.assert_array_equal(gaussian.scale, run.arrays[f"{prefix}/scale"])

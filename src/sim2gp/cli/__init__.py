@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from sim2gp.cli.arguments import parsed
+from sim2gp.cli.arguments import parse_command
 from sim2gp.cli.commands import COMMANDS
 from sim2gp.cli.interrupts import DONE, interruptible, leave
 from sim2gp.cli.late import Call
@@ -47,7 +47,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     debug = "--debug" in args
     with interruptible(entry=argv is None) as signals:
         try:
-            code = _run(args)
+            code = _run_command(args)
             sys.stdout.flush()  # here a reader that has gone is no fault, at exit it is
             return code
         except BaseException as error:
@@ -66,23 +66,23 @@ def _failed(caught: BaseException, debug: bool) -> int:
             os.dup2(nowhere.fileno(), sys.stdout.fileno())
         return OK
     if isinstance(caught, Sim2GPError):
-        return _told(caught, _code(caught), debug)
+        return _print_error(caught, _exit_code(caught), debug)
     if isinstance(caught, OSError):
         typed = disk_error(Path(caught.filename or "."), caught)
-        return _told(typed, _code(typed), debug)
+        return _print_error(typed, _exit_code(typed), debug)
     if isinstance(caught, Exception):
         what = f"{type(caught).__name__}: {caught}".split("\n")[0][:200]
-        return _told(error("fault_of_sim2gp", Sim2GPError, got=what), BUG, debug)
+        return _print_error(error("fault_of_sim2gp", Sim2GPError, got=what), BUG, debug)
     raise caught
 
 
-def _run(args: list[str]) -> int:
+def _run_command(args: list[str]) -> int:
     if args == ["--version"]:
         from sim2gp import __version__
 
         print(f"sim2gp {__version__}")
         return OK
-    command = parsed(args or ["--help"], COMMANDS)
+    command = parse_command(args or ["--help"], COMMANDS)
     if command is None:
         return OK if args else INPUT
     progress = Progress(quiet=command.quiet)
@@ -133,7 +133,7 @@ def _warner(progress: Progress, other: Callable[..., None]) -> Callable[..., Non
     return show
 
 
-def _code(error: Sim2GPError) -> int:
+def _exit_code(error: Sim2GPError) -> int:
     if isinstance(error, RunOwned):
         return OWNED
     if isinstance(error, DiskError):
@@ -141,7 +141,7 @@ def _code(error: Sim2GPError) -> int:
     return INPUT if isinstance(error, InputError) or error.code == "E146" else BUG
 
 
-def _told(error: Exception, code: int, debug: bool) -> int:
+def _print_error(error: Exception, code: int, debug: bool) -> int:
     if debug:
         traceback.print_exc()
     print(str(error), file=sys.stderr)

@@ -17,7 +17,9 @@ PROGRAM = "sim2gp"
 _NAMES = re.compile(r"--[a-z][\w-]*|(?<=')[\w.-]+(?=')")
 
 
-def parsed(args: Sequence[str], commands: dict[str, type[Common]]) -> Common | None:
+def parse_command(
+    args: Sequence[str], commands: dict[str, type[Common]]
+) -> Common | None:
     """The command that the words are; None where a help page was printed.
 
     Raises `InputError` E148 for a number out of range, E149 for a seed, E160 otherwise.
@@ -107,16 +109,19 @@ def usage_error(
     return InputError(code, what, where=where, got=got, expected=expected, fix=fix)
 
 
-def numbers(option: str, words: Iterable[str]) -> dict[str, float]:
+def parse_numbers(option: str, words: Iterable[str]) -> dict[str, float]:
     """``NAME=NUMBER`` words by name (E160 for another form, or a name twice)."""
-    return {name: _number(option, word, v) for name, v, word in _named(option, words)}
+    return {
+        name: _parse_number(option, word, v)
+        for name, v, word in _named_values(option, words)
+    }
 
 
 def pairs(option: str, words: Iterable[str]) -> dict[str, tuple[float, float]]:
     """``NAME=LOW:HIGH`` words by name (E141 where low is not below high, E160)."""
     found = {}
-    for name, value, word in _named(option, words):
-        ends = [_number(option, word, end) for end in value.split(":")]
+    for name, value, word in _named_values(option, words):
+        ends = [_parse_number(option, word, end) for end in value.split(":")]
         if len(ends) != 2:
             raise usage_error(option, word, f"{name}=LOW:HIGH", "write both ends")
         if not ends[0] < ends[1]:
@@ -125,7 +130,7 @@ def pairs(option: str, words: Iterable[str]) -> dict[str, tuple[float, float]]:
     return found
 
 
-def _named(option: str, words: Iterable[str]) -> Iterator[tuple[str, str, str]]:
+def _named_values(option: str, words: Iterable[str]) -> Iterator[tuple[str, str, str]]:
     seen: set[str] = set()
     for word in words:
         name, _, value = word.partition("=")
@@ -137,7 +142,7 @@ def _named(option: str, words: Iterable[str]) -> Iterator[tuple[str, str, str]]:
         yield name, value, word
 
 
-def _number(option: str, word: str, text: str) -> float:
+def _parse_number(option: str, word: str, text: str) -> float:
     try:
         value = float(text)
     except ValueError:

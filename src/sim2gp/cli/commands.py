@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from sim2gp.cli.arguments import numbers, pairs, usage_error
+from sim2gp.cli.arguments import pairs, parse_numbers, usage_error
 from sim2gp.cli.late import (
     Call,
     command,
@@ -116,9 +116,9 @@ class Design(Writes, Chosen):
         names = "seconds kind about predict within period starts configuration seed"
         asked = {name: getattr(self, name) for name in names.split()} | {
             "limits": limits(
-                pairs("--limit", self.limit), rates=numbers("--rate", self.rate)
+                pairs("--limit", self.limit), rates=parse_numbers("--rate", self.rate)
             ),
-            "start": numbers("--start", self.start),
+            "start": parse_numbers("--start", self.start),
             "progress": call.progress,
         }
         return call.saved(out, lambda: command("design")(source, **asked))

@@ -76,7 +76,7 @@ def interruptible(*, entry: bool) -> Iterator[Signals]:
     before = {s: signal.getsignal(s) for s in taken if signal.getsignal(s) in ours}
     for number in before:
         signal.signal(number, signals.handle)
-    watch = _Watch() if entry else None
+    watch = _SignalWatch() if entry else None
     try:
         yield signals
     finally:
@@ -89,7 +89,7 @@ def interruptible(*, entry: bool) -> Iterator[Signals]:
             signal.signal(number, handler)
 
 
-class _Watch:
+class _SignalWatch:
     """The thread that ends the process where the main thread does not in time."""
 
     def __init__(self) -> None:
@@ -120,7 +120,7 @@ class _Watch:
         # Not by `sys.stderr`: the main thread may hold its lock.
         with suppress(OSError):
             os.write(2, f"{DONE if done else NOT_DONE}\n".encode())
-        _end(128 + first)
+        _end_process(128 + first)
 
     def _next(self, seconds: float | None) -> int | None:
         """The next signal's number, or `_STOP`; None where none comes in time."""
@@ -144,10 +144,10 @@ def leave(code: int) -> NoReturn:
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError, ValueError):
             stream.flush()
-    _end(code)
+    _end_process(code)
 
 
-def _end(code: int) -> NoReturn:
+def _end_process(code: int) -> NoReturn:
     """End the process here and now, from whichever thread.
 
     Nothing milder does: `sys.exit` ends the thread alone, and the interpreter joins

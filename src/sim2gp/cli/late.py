@@ -79,7 +79,7 @@ def read_project(path: Path, given: Reads, *, alike: bool = False) -> tuple[Any,
 def identification(path: Path) -> Any:
     """An identification read back; what is no run fails before the heavy imports."""
     read_run(path)
-    return function("commands.identification", "restored")(path)
+    return function("commands.identification", "restore_identification")(path)
 
 
 def budget(factor: float) -> Any:

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from sim2gp.cli.arguments import numbers, usage_error
+from sim2gp.cli.arguments import parse_numbers, usage_error
 from sim2gp.cli.late import (
     Call,
     FirstFolder,
@@ -78,7 +78,7 @@ class Init(Common):
             out=self.out,
             root=self.root,
             period=self.period,
-            constant=numbers("--constant", self.constant),
+            constant=parse_numbers("--constant", self.constant),
             readings=not self.no_readings,
             seconds=self.budget,
             seed=self.seed,
@@ -173,7 +173,7 @@ class Explain(Reads):
     def run(self, call: Call) -> dict[str, Any]:
         out = run_directory(self.out, f"explain-{self.path.name}")
         module = "commands.explain"
-        run = function(module, "explainable")(
+        run = function(module, "load_explainable")(
             self.path, budget(self.budget), strict=self.strict
         )
         file = function(module, "project_file")(run) if self.add else None

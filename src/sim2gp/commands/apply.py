@@ -17,8 +17,8 @@ from sim2gp.commands.identification import (
     Width,
     check_identified,
     modes,
+    posterior_entries,
     project_of,
-    used,
 )
 from sim2gp.commands.result import AbstractResult
 from sim2gp.errors import error
@@ -59,7 +59,7 @@ class AppliedModel(AbstractResult):
         assert self.edited is not None
         out = Path(out)
         check_absent(out)
-        written = [str(path) for path in _written(self.file, self.edited, out)]
+        written = [str(path) for path in _write_models(self.file, self.edited, out)]
         diff = _diff(self.file, self.edited, out)
         return self.with_entries(written=written, diff=diff)
 
@@ -89,19 +89,19 @@ def apply(
     project = _with_model(found)
     system = plant_of(project.system)
     assert isinstance(system, MuJoCo)
-    values, apart = _values(found, project, system, configuration, posterior)
+    values, apart = _model_values(found, project, system, configuration, posterior)
     (progress or Progress()).say(f"editing {system.source}")
     file = system.file()
     edited = file.edited(system.by_path(values))
     with temporary_folder() as folder:
-        _written(file, edited, Path(folder, f"model{file.suffix}"))
+        _write_models(file, edited, Path(folder, f"model{file.suffix}"))
     summary = {
         "command": "apply",
         "title": f"{found.name}: its parameters in {file.source.name}",
         "model": str(file.source),
-        **used(found.summary, posterior),
+        **posterior_entries(found.summary, posterior),
         "written": [],
-        "constants": _table(file, edited),
+        "constants": _changes_by_path(file, edited),
         "not_written": apart | edited.unsaid,
         "diff": _diff(file, edited, None),
     }
@@ -126,7 +126,7 @@ def _with_model(found: Identification) -> Project:
     return project
 
 
-def _values(
+def _model_values(
     found: Identification,
     project: Project,
     system: MuJoCo,
@@ -156,7 +156,7 @@ def _neutral(name: str) -> float:
     return 1.0 if name.endswith(".gain") else 0.0
 
 
-def _written(file: ModelFile, edited: Edited, out: Path) -> list[Path]:
+def _write_models(file: ModelFile, edited: Edited, out: Path) -> list[Path]:
     """New files, compiled and compared; none of them is left where that fails."""
     made: list[Path] = []
     try:
@@ -172,7 +172,7 @@ def _written(file: ModelFile, edited: Edited, out: Path) -> list[Path]:
     return made
 
 
-def _table(file: ModelFile, edited: Edited) -> dict[str, dict[str, Any]]:
+def _changes_by_path(file: ModelFile, edited: Edited) -> dict[str, dict[str, Any]]:
     """What each changed constant was and is."""
     table = {}
     for path, constant in file.constants.items():

@@ -19,8 +19,8 @@ import jax
 import numpy as np
 
 from sim2gp.belief import AbstractModel
-from sim2gp.commands.compare_setup import Setup, prepare
-from sim2gp.commands.compare_summary import Held, summarise
+from sim2gp.commands.compare_setup import Setup, prepare_comparison
+from sim2gp.commands.compare_summary import FoldForecasts, summarise
 from sim2gp.commands.result import AbstractResult
 from sim2gp.data.logs import Log, note_lines
 from sim2gp.data.one_step_log import (
@@ -31,8 +31,8 @@ from sim2gp.data.one_step_log import (
 from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.forecasts import scoring
 from sim2gp.identification.forecasts.baselines import regression_errors
-from sim2gp.identification.forecasts.forecast import inflation_of
-from sim2gp.identification.forecasts.prediction import channels, recordings, subset
+from sim2gp.identification.forecasts.forecast import new_log_inflation
+from sim2gp.identification.forecasts.prediction import channels, recording_names, subset
 from sim2gp.inference.estimate import Estimate
 from sim2gp.models import NLM, FunctionSpace, Residual, ResidualFunctionSpace, Sim2GP
 from sim2gp.models.auto import log_scores
@@ -49,27 +49,27 @@ HORIZONS = (0.2, 0.5)  # s
 DRAWS = 32
 
 
-class Learner(NamedTuple):
+class ModelFactory(NamedTuple):
     """How a model is made of the simulator and a reach, and what it is in words."""
 
     make: Callable[[Sim2GP, dict[str, float]], AbstractModel]
     what: str
 
 
-Learners = Mapping[str, Learner]
+Learners = Mapping[str, ModelFactory]
 WITH_RESIDUAL = "the simulator plus a learned residual"
 #: From simple to complex; each from the simulator with its constants given.
 MODELS: Learners = {
-    "SIM2GP": Learner(lambda sim, reach: sim, "the simulator alone"),
-    "RES": Learner(lambda sim, reach: Residual(sim, reach=reach), WITH_RESIDUAL),
-    "RES-FS": Learner(
+    "SIM2GP": ModelFactory(lambda sim, reach: sim, "the simulator alone"),
+    "RES": ModelFactory(lambda sim, reach: Residual(sim, reach=reach), WITH_RESIDUAL),
+    "RES-FS": ModelFactory(
         lambda sim, reach: ResidualFunctionSpace(sim, reach=reach), WITH_RESIDUAL
     ),
-    "FS": Learner(
+    "FS": ModelFactory(
         lambda sim, reach: FunctionSpace(sim, reach=reach),
         "a network that starts from the simulator",
     ),
-    "NLM": Learner(
+    "NLM": ModelFactory(
         lambda sim, reach: NLM(sim.system, reach=reach),
         "a black box rather than the simulator",
     ),
@@ -113,18 +113,18 @@ def compare(
     """
     started = time.perf_counter()
     project, logs = project_and_logs(machine, logs, alike=True)
-    setup, folds = prepare(project, logs, horizons)
+    setup, folds = prepare_comparison(project, logs, horizons)
     jobs = [
-        FoldJob(project.path, logs, tuple(horizons), seed, k, left)
+        CompareJob(project.path, logs, tuple(horizons), seed, k, left)
         for k, left in enumerate(folds)
     ]
     total = len(folds) * len(models) + 1
     with (progress or Progress()).task("compare", total) as task:
         if workers > 1 and models is MODELS and project.can_be_loaded:
-            parts = _in_processes(jobs, workers, task)
+            parts = _folds_in_processes(jobs, workers, task)
         else:
-            parts = [_fold(setup, job, models, task.advance) for job in jobs]
-        whole = _fit(setup, [], _key(seed, len(folds)))
+            parts = [_run_fold(setup, job, models, task.advance) for job in jobs]
+        whole = _fit_without(setup, [], _fold_key(seed, len(folds)))
         task.advance("evidence")
     names = channels(project.system, setup.windows)
     units = {c.name: c.unit for c in project.system.physical_states}
@@ -145,7 +145,7 @@ def compare(
         "seed": seed,
         "period": setup.period,
         "folds": len(folds),
-        "n_logs": len(set(recordings(setup.logs))),
+        "n_logs": len(set(recording_names(setup.logs))),
         "n_transitions": len(setup.samples.first),
         "units": units,
     }
@@ -153,7 +153,7 @@ def compare(
     return Comparison(summary | provenance(started), arrays)
 
 
-class FoldJob(NamedTuple):
+class CompareJob(NamedTuple):
     """One fold of a comparison, as another process needs it; ``left`` are its logs."""
 
     path: Path
@@ -164,44 +164,46 @@ class FoldJob(NamedTuple):
     left: list[int]
 
 
-def _in_processes(jobs: Sequence[FoldJob], workers: int, task: Task) -> list[Held]:
+def _folds_in_processes(
+    jobs: Sequence[CompareJob], workers: int, task: Task
+) -> list[FoldForecasts]:
     """The folds, computed as processes are free."""
 
-    def done(job: FoldJob) -> None:
+    def done(job: CompareJob) -> None:
         task.advance(f"without {job.logs[job.left[0]].name}", len(MODELS))
 
-    return in_order(_fold_of, jobs, workers, done)
+    return in_order(_fold_in_process, jobs, workers, done)
 
 
-def _fold(
-    setup: Setup, job: FoldJob, models: Learners, done: Callable[[str], None]
-) -> Held:
-    return fold(setup, job.left, models, _key(job.seed, job.number), done)
+def _run_fold(
+    setup: Setup, job: CompareJob, models: Learners, done: Callable[[str], None]
+) -> FoldForecasts:
+    return compare_fold(setup, job.left, models, _fold_key(job.seed, job.number), done)
 
 
-def _key(seed: int, number: int) -> jax.Array:
+def _fold_key(seed: int, number: int) -> jax.Array:
     return jax.random.fold_in(jax.random.key(seed), number)
 
 
-def _fold_of(job: FoldJob) -> Held:
+def _fold_in_process(job: CompareJob) -> FoldForecasts:
     """The same in a process of its own."""
-    setup, _ = prepare(load_project(job.path), job.logs, job.horizons)
-    return _fold(setup, job, MODELS, lambda done: None)
+    setup, _ = prepare_comparison(load_project(job.path), job.logs, job.horizons)
+    return _run_fold(setup, job, MODELS, lambda done: None)
 
 
-def fold(
+def compare_fold(
     setup: Setup,
     left: Sequence[int],
     models: Learners,
     key: jax.Array,
     done: Callable[[str], None],
-) -> Held:
+) -> FoldForecasts:
     """All models without the logs ``left``, judged on them.
 
     What is left out is masked, not removed, so that folds share their compilations.
     """
     first, *keys = jax.random.split(key, 1 + len(models))
-    belief = _fit(setup, left, first)
+    belief = _fit_without(setup, left, first)
     out = np.isin(setup.samples.step_log(), left)
     test = np.isin(setup.steps.log, left)
     tt = belief.posterior.mean
@@ -213,8 +215,8 @@ def fold(
     sim = Sim2GP(setup.stepper, dt=setup.period, prior=belief.posterior, frozen=True)
     start_sd = _start_sd(setup.grid.lag[~test])
     resolution = np.asarray(setup.windows.floor)
-    training = set(recordings(setup.logs)) - {setup.logs[k].source for k in left}
-    inflation = inflation_of(len(training))
+    training = set(recording_names(setup.logs)) - {setup.logs[k].source for k in left}
+    inflation = new_log_inflation(len(training))
     error, sd, steps = [], [], []
     for (name, learner), key in zip(models.items(), keys, strict=True):
         begin, learn, roll = jax.random.split(key, 3)
@@ -224,14 +226,16 @@ def fold(
         off = found.point - setup.steps.y
         if found.finite():
             counts = setup.steps.valid & ~test[:, None, None]
-            wide = scoring.spread(off, found.draws, counts, resolution, inflation)
+            wide = scoring.predicted_spread(
+                off, found.draws, counts, resolution, inflation
+            )
         else:  # an infinite error: such a model loses, and has no numbers
             off, wide = np.full_like(off, math.inf), np.ones_like(off)
         error.append(off[test])
         sd.append(wide[test])
         steps.append(float(np.mean(np.asarray(log_scores(fitted, held))[out])))
         done(f"{name} without {setup.logs[left[0]].name}")
-    return Held(
+    return FoldForecasts(
         np.stack(error),
         np.stack(sd),
         _trivial(setup, test),
@@ -252,7 +256,7 @@ def _trivial(setup: Setup, test: np.ndarray) -> np.ndarray:
     return np.stack([hold, regression_errors(train, tested, rows)])
 
 
-def _fit(setup: Setup, left: Sequence[int], key: jax.Array) -> Estimate:
+def _fit_without(setup: Setup, left: Sequence[int], key: jax.Array) -> Estimate:
     """The simulator's constants from the windows of all logs but ``left``."""
     mask = np.asarray(setup.windows.mask) & ~np.isin(setup.of, left)[:, None, None]
     kept = eqx.tree_at(lambda w: w.mask, setup.windows, mask)

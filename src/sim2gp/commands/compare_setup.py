@@ -19,7 +19,7 @@ from sim2gp.data.one_step_log import (
 from sim2gp.data.split_log import measured_states
 from sim2gp.data.windows import Windows
 from sim2gp.errors import error
-from sim2gp.identification.forecasts.prediction import recordings
+from sim2gp.identification.forecasts.prediction import recording_names
 from sim2gp.project import Project
 from sim2gp.project.training_windows import cut_logs
 from sim2gp.systems.assemble import carrying_inputs
@@ -48,7 +48,7 @@ class Setup:
     reach: dict[str, float]
 
 
-def prepare(
+def prepare_comparison(
     project: Project, logs: Sequence[Log], horizons: Sequence[float]
 ) -> tuple[Setup, list[list[int]]]:
     """Windows, one-step data and folds (each the indices of the logs left out)."""
@@ -101,7 +101,7 @@ def _folds(logs: Sequence[Log]) -> tuple[tuple[Log, ...], list[list[int]]]:
     Pieces of one recording go together. A single recording is split in time, and its
     last quarter is the only one left out.
     """
-    files = list(dict.fromkeys(recordings(logs)))
+    files = list(dict.fromkeys(recording_names(logs)))
     if len(files) == 1:
         first, last = logs[0].time[0], logs[-1].time[-1]
         split = last - LAST * (last - first)

@@ -10,16 +10,20 @@ from jaxtyping import Bool, Float, Int
 
 from sim2gp.data.logs import Log
 from sim2gp.identification.forecasts import scoring
-from sim2gp.identification.forecasts.baselines import compared, forecast_sentence
-from sim2gp.identification.forecasts.prediction import recordings
-from sim2gp.identification.forecasts.scoring import Paired
+from sim2gp.identification.forecasts.baselines import (
+    compare_baselines,
+    forecast_sentence,
+)
+from sim2gp.identification.forecasts.prediction import recording_names
+from sim2gp.identification.forecasts.scoring import PairedComparison
+from sim2gp.identification.words import finite_or_none
 
 FEWEST = 4  # recordings that a bootstrap can draw from; of fewer, seconds are drawn
 STRETCH = 1.0  # s
 
 
 @dataclass(frozen=True)
-class Held:
+class FoldForecasts:
     """Forecasts of what a fold left out, by all models."""
 
     error: Float[np.ndarray, "models W R c"]  # prediction minus measurement
@@ -32,7 +36,7 @@ class Held:
     steps: int  # smoothed steps behind it
 
     @classmethod
-    def joined(cls, parts: Sequence["Held"]) -> "Held":
+    def joined(cls, parts: Sequence["FoldForecasts"]) -> "FoldForecasts":
         """All folds as one; step scores are averaged over steps."""
         count = np.asarray([part.steps for part in parts])
         scores = np.stack([part.step_score for part in parts])
@@ -49,7 +53,7 @@ class Held:
 
 
 @dataclass(frozen=True)
-class Table:
+class PooledScores:
     """Pooled scores: of every model, at every step judged, of every channel."""
 
     rmse: Float[np.ndarray, "models R c"]
@@ -59,7 +63,7 @@ class Table:
 
 
 def summarise(
-    parts: Sequence[Held],
+    parts: Sequence[FoldForecasts],
     what: Mapping[str, str],
     channels: Sequence[str],
     logs: Sequence[Log],
@@ -74,30 +78,34 @@ def summarise(
     were judged; ``horizons`` are some of them.
     """
     models = list(what)
-    held = Held.joined(parts)
+    held = FoldForecasts.joined(parts)
     crps = scoring.crps(held.error, held.sd)
-    table = _table(held, crps)
+    table = _pool_scores(held, crps)
     at = [int(np.argmin(np.abs(seconds - h))) for h in horizons]
     unit, words = units_of(held, logs)
-    sums = scoring.by_unit(crps[:, :, at], held.valid[:, at], unit)
-    against = [scoring.paired(row, sums[0], rng) for row in sums]
-    kept = scoring.supported(sums, rng)
+    sums = scoring.crps_by_unit(crps[:, :, at], held.valid[:, at], unit)
+    against = [scoring.compare_paired(row, sums[0], rng) for row in sums]
+    kept = scoring.select_model(sums, rng)
     entries = {}
     for k, name in enumerate(models):
-        entries[name] = _entry(table, k, at, horizons, channels)
-        entries[name] |= _relative(against[k])
-        entries[name]["step_log_score"] = _plain(held.step_score[k])
+        entries[name] = _model_scores(table, k, at, horizons, channels)
+        entries[name] |= _paired_entries(against[k])
+        entries[name]["step_log_score"] = finite_or_none(held.step_score[k])
     tables = [
-        _by_horizon(held, crps, table, i, f"{h:g}", models, channels, unit, words, rng)
+        _horizon_table(
+            held, crps, table, i, f"{h:g}", models, channels, unit, words, rng
+        )
         for i, h in zip(at, horizons, strict=True)
     ]
-    tables.append(_by_log(crps[:, :, at], held, at, models, logs))
+    tables.append(_log_table(crps[:, :, at], held, at, models, logs))
     away = [n for n, entry in entries.items() if entry["crps_change"] is None]
     said = _against_trivial(
         held, table.rmse[kept], models[kept], channels, at, horizons, units
     )
     summary = {
-        "headline": " ".join([scoring.sentence(what, against, kept, words), *said]),
+        "headline": " ".join(
+            [scoring.selection_sentence(what, against, kept, words), *said]
+        ),
         "best": models[kept],
         "horizons": list(horizons),
         "windows": int(held.valid[:, at].any(axis=(1, 2)).sum()),
@@ -114,7 +122,7 @@ def summarise(
 
 
 def _against_trivial(
-    held: Held,
+    held: FoldForecasts,
     rmse: Float[np.ndarray, "R c"],
     model: str,
     channels: Sequence[str],
@@ -128,16 +136,16 @@ def _against_trivial(
     said = []
     for i, h in zip(at, horizons, strict=True):
         error = np.where(measured[i], rmse[i], np.nan)
-        against = compared(channels, error, trivial[0, i], trivial[1, i])
+        against = compare_baselines(channels, error, trivial[0, i], trivial[1, i])
         named = dict(zip(channels, error.tolist(), strict=True))
         about = f"Error of {model} at {h:g} s"
         said.append(forecast_sentence(about, named, against, units))
     return said
 
 
-def units_of(held: Held, logs: Sequence[Log]) -> tuple[np.ndarray, str]:
+def units_of(held: FoldForecasts, logs: Sequence[Log]) -> tuple[np.ndarray, str]:
     """What a bootstrap draws: recordings, or of few recordings their seconds."""
-    files = list(dict.fromkeys(recordings(logs)))
+    files = list(dict.fromkeys(recording_names(logs)))
     number = np.asarray([files.index(log.source) for log in logs])
     if len(np.unique(number[held.log])) >= FEWEST:
         return number[held.log], "logs"
@@ -146,11 +154,11 @@ def units_of(held: Held, logs: Sequence[Log]) -> tuple[np.ndarray, str]:
     return np.unique(pairs, axis=0, return_inverse=True)[1].ravel(), "seconds"
 
 
-def _table(held: Held, crps: np.ndarray) -> Table:
+def _pool_scores(held: FoldForecasts, crps: np.ndarray) -> PooledScores:
     nll = scoring.nll(held.error, held.sd)
     inside = (np.abs(held.error) <= 1.6448536 * held.sd).astype(float)
     each = [_pooled(x, held.valid) for x in (held.error**2, nll, crps, inside)]
-    return Table(np.sqrt(each[0]), *each[1:])
+    return PooledScores(np.sqrt(each[0]), *each[1:])
 
 
 def _pooled(x: np.ndarray, valid: np.ndarray) -> np.ndarray:
@@ -159,8 +167,8 @@ def _pooled(x: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return np.asarray(total / np.maximum(valid.sum(axis=0), 1)[None])
 
 
-def _entry(
-    table: Table,
+def _model_scores(
+    table: PooledScores,
     k: int,
     at: Sequence[int],
     horizons: Sequence[float],
@@ -169,7 +177,7 @@ def _entry(
     """Scores of one model: at the first horizon on top, and at all."""
 
     def named(values: np.ndarray) -> dict[str, float | None]:
-        return dict(zip(channels, map(_plain, values), strict=True))
+        return dict(zip(channels, map(finite_or_none, values), strict=True))
 
     return {
         "log_evidence": None,
@@ -188,20 +196,20 @@ def _entry(
     }
 
 
-def _relative(found: Paired) -> dict[str, Any]:
+def _paired_entries(found: PairedComparison) -> dict[str, Any]:
     return {
-        "crps_change": _plain(found.change),
-        "crps_change_low": _plain(found.low),
-        "crps_change_high": _plain(found.high),
+        "crps_change": finite_or_none(found.change),
+        "crps_change_low": finite_or_none(found.low),
+        "crps_change_high": finite_or_none(found.high),
         "better_in": found.better,
         "of": found.units,
     }
 
 
-def _by_horizon(
-    held: Held,
+def _horizon_table(
+    held: FoldForecasts,
     crps: np.ndarray,
-    table: Table,
+    table: PooledScores,
     i: int,
     horizon: str,
     models: Sequence[str],
@@ -215,17 +223,17 @@ def _by_horizon(
     columns += [f"{what} {c}" for c in channels for what in ("rmse", "CRPS", "nll")]
     columns += [f"{c} in 90 %" for c in channels]
     columns += ["CRPS against SIM2GP", f"better in {words}"]
-    sums = scoring.by_unit(crps[:, :, [i]], held.valid[:, [i]], unit)
+    sums = scoring.crps_by_unit(crps[:, :, [i]], held.valid[:, [i]], unit)
     rows = []
     for k, name in enumerate(models):
         row = [name]
         for c in range(len(channels)):
             values = (table.rmse[k, i, c], table.crps[k, i, c])
-            row += [_figure(x, ".4f") for x in values]
-            row.append(_figure(table.nll[k, i, c], ".2f"))
-        row += [_figure(x, ".3f") for x in table.inside[k, i]]
-        found = scoring.paired(sums[k], sums[0], rng)
-        row += [scoring.percent(found), f"{found.better} of {found.units}"]
+            row += [_format_score(x, ".4f") for x in values]
+            row.append(_format_score(table.nll[k, i, c], ".2f"))
+        row += [_format_score(x, ".3f") for x in table.inside[k, i]]
+        found = scoring.compare_paired(sums[k], sums[0], rng)
+        row += [scoring.format_change(found), f"{found.better} of {found.units}"]
         rows.append(row if k else [*row[:-2], "", ""])
     for name, off in zip(("holding still", "regression"), held.trivial, strict=True):
         off, counts = off[None, :, [i]], held.valid[:, [i]]
@@ -233,7 +241,7 @@ def _by_horizon(
         row = [name]
         for c in range(len(channels)):
             values = (rmse[0, 0, c], size[0, 0, c])
-            row += [*(_figure(x, ".4f", "too few windows") for x in values), ""]
+            row += [*(_format_score(x, ".4f", "too few windows") for x in values), ""]
         rows.append([*row, *[""] * (len(channels) + 2)])
     return {
         "title": f"Forecasts of what was left out, {horizon} s ahead",
@@ -246,9 +254,9 @@ def _by_horizon(
     }
 
 
-def _by_log(
+def _log_table(
     crps: np.ndarray,
-    held: Held,
+    held: FoldForecasts,
     at: Sequence[int],
     models: Sequence[str],
     logs: Sequence[Log],
@@ -257,7 +265,7 @@ def _by_log(
     names = list(dict.fromkeys(log.name for log in logs))
     number = np.asarray([names.index(log.name) for log in logs])[held.log]
     valid = held.valid[:, at]
-    sums = scoring.by_unit(crps, valid, number)
+    sums = scoring.crps_by_unit(crps, valid, number)
     # In shares of windows, so that the simulator's mean over windows is one.
     share = np.asarray([np.mean(number == u) for u in np.unique(number)])
     mean = sums / sums[0].sum() / share[None]
@@ -265,16 +273,12 @@ def _by_log(
         "title": "CRPS log by log, all horizons, in the simulator's mean",
         "columns": ["log", *models],
         "rows": [
-            [names[u], *(_figure(x, ".3f") for x in mean[:, j])]
+            [names[u], *(_format_score(x, ".3f") for x in mean[:, j])]
             for j, u in enumerate(np.unique(number))
         ],
         "note": "Below the simulator's column: the model foretold this log better.",
     }
 
 
-def _plain(x: float) -> float | None:
-    return float(x) if math.isfinite(x) else None
-
-
-def _figure(x: float, how: str, missing: str = "ran away") -> str:
+def _format_score(x: float, how: str, missing: str = "ran away") -> str:
     return format(x, how) if math.isfinite(x) else missing

@@ -102,10 +102,10 @@ def demo(
             oracle = accepted.oracle.oracle_return
             task.advance(f"seed {s}: oracle {oracle:.0f}")
             sink.scalars(0, {f"seed {s}/oracle/return": oracle})
-            told = partial(_told, task.advance, sink, s)
+            told = partial(_episode_listener, task.advance, sink, s)
             histories = _race(accepted.task, learners, episodes, key, told)
             runs.append(SeedRun(accepted, hanging_return(accepted.task), histories))
-    summary, arrays = _summarise(system, machine, runs, seed, episodes)
+    summary, arrays = _demo_summary(system, machine, runs, seed, episodes)
     summary["truth"] = truth
     return Demonstration(summary | provenance(started), arrays)
 
@@ -126,7 +126,7 @@ def _race(
     }
 
 
-def _told(
+def _episode_listener(
     advance: Callable[[str], None], sink: Sink, seed: int, name: str
 ) -> Callable[[Episode], None]:
     """Who hears of a learner's episodes: the bar, and wherever numbers go."""
@@ -140,7 +140,7 @@ def _told(
     return tell
 
 
-def _summarise(
+def _demo_summary(
     system: AbstractSystem,
     machine: str,
     runs: list[SeedRun],
@@ -166,7 +166,7 @@ def _summarise(
         "seed": seed,
         "seeds": len(runs),
         "episodes": episodes,
-        "headline": _headline(runs, seconds),
+        "headline": _demo_headline(runs, seconds),
         "returns": {m: _squeeze(returns[m].tolist()) for m in methods},
         "oracle_return": _squeeze([r.oracle for r in runs]),
         "hang_return": _squeeze([r.hang for r in runs]),
@@ -221,7 +221,7 @@ def _animation(task: Task, machine: str, scores: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _headline(runs: list[SeedRun], seconds: float) -> str:
+def _demo_headline(runs: list[SeedRun], seconds: float) -> str:
     counts = [r.solved(LEARNER) for r in runs]
     done = sorted(n for n in counts if n is not None)
     if not done:

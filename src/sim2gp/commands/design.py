@@ -16,32 +16,32 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sim2gp.commands.identification import Identification, used
+from sim2gp.commands.identification import Identification, posterior_entries
 from sim2gp.commands.result import AbstractResult
 from sim2gp.errors import error
 from sim2gp.experiment_design import (
+    AbstractCommandSignal,
     AbstractGoal,
-    AbstractSignal,
-    Designed,
-    Everything,
+    DesignResult,
+    DOptimal,
     Experiment,
-    Free,
+    FreeCommands,
     LimitBox,
-    Multisine,
-    Named,
-    Prediction,
+    MultisineCommands,
+    SubsetDOptimal,
+    VOptimal,
     prediction_rows,
 )
-from sim2gp.experiment_design import design as search
+from sim2gp.experiment_design import optimise_commands as search
 from sim2gp.experiment_design.limits import SLOW, servo_rates
 from sim2gp.experiment_design.verdict import (
-    Asked,
+    DesignOptions,
     Limits,
     expected_table,
-    foretold,
-    verdict,
+    experiment_verdict,
+    prediction_verdict,
 )
-from sim2gp.identification.forecasts.prediction import units
+from sim2gp.identification.forecasts.prediction import channel_units
 from sim2gp.identification.identifiability.table import physical_moments
 from sim2gp.inference.parameters import unknown_parameter
 from sim2gp.inference.prior import ParameterPrior
@@ -120,13 +120,13 @@ def design(
     where the limits admit no motion, E151 for a duration shorter than a step.
     """
     began = time.perf_counter()
-    asked = Asked(
+    asked = DesignOptions(
         seconds, kind, tuple(about), predict, within, limits or Limits(),
         start or {}, period, starts, configuration,
     )  # fmt: skip
     with (progress or Progress()).task("design", 2) as task:
         project, experiment, notes = setting(source, asked)
-        box = _box(project, experiment, asked.limits, notes)
+        box = _limit_box(project, experiment, asked.limits, notes)
         key = jax.random.key(seed)
         signal = signal_of(asked.kind, experiment)
         goal = goal_of(asked, experiment, box, jax.random.fold_in(key, 1))
@@ -134,18 +134,18 @@ def design(
         found = search(experiment, goal, box, signal, key=key, starts=asked.starts)
         task.advance(f"{found.nats:.1f} nats")
     name = source.name
-    summary = _summarise(name, asked, experiment, goal, found, seed)
+    summary = _design_summary(name, asked, experiment, goal, found, seed)
     summary["warnings"] = notes
     if isinstance(source, Identification):
         summary |= widths(source)
     return NextExperiment(
         summary | provenance(began),
-        _arrays(experiment, box, found),
+        _design_arrays(experiment, box, found),
         {FILE: as_csv(experiment, found)},
     )
 
 
-def _box(
+def _limit_box(
     project: Project, experiment: Experiment, limits: Limits, notes: list[str]
 ) -> LimitBox:
     """The project's limits and those asked for; ``notes`` gets what is not stated."""
@@ -170,7 +170,7 @@ def _box(
 
 @in_float64
 def setting(
-    source: Project | Identification, asked: Asked
+    source: Project | Identification, asked: DesignOptions
 ) -> tuple[Project, Experiment, list[str]]:
     """The machine and what is believed of it; what the user should know of both."""
     notes: list[str] = []
@@ -178,7 +178,7 @@ def setting(
     if isinstance(source, Project):
         project, joint = source, source.system
         prior = ParameterPrior(joint.parameters.prior(), joint.parameters)
-        belief, names = prior.at_mode(), _measured(project)
+        belief, names = prior.at_mode(), _measured_channels_of(project)
         noise, period = _stated_noise(project, names), PERIOD
         notes.append("no log was used: what is believed is the project's priors")
     else:
@@ -202,7 +202,7 @@ def setting(
         system,
         belief,
         jnp.asarray(noise, float),
-        _start(asked.start, system),
+        _start_state(asked.start, system),
         jnp.asarray([each.get(name, LOOSE) for name in states], float),
         tuple(states.index(name) for name in names),
         period,
@@ -216,20 +216,20 @@ def setting(
 
 def widths(fit: Identification) -> dict[str, Any]:
     """Which of an identification's two posteriors was used for what."""
-    return used(fit.summary, "corrected") | {
+    return posterior_entries(fit.summary, "corrected") | {
         "posterior": "Limits of the states and the expected motion are those of the "
         "corrected posterior, information and expected sd those of the plain one"
     }
 
 
-def signal_of(kind: str, experiment: Experiment) -> AbstractSignal:
+def signal_of(kind: str, experiment: Experiment) -> AbstractCommandSignal:
     """The family that the commands are chosen from."""
-    family = {"multisine": Multisine, "free": Free}[kind]
+    family = {"multisine": MultisineCommands, "free": FreeCommands}[kind]
     return family(experiment.period, experiment.steps)
 
 
 def goal_of(
-    asked: Asked, experiment: Experiment, limits: LimitBox, key: jax.Array
+    asked: DesignOptions, experiment: Experiment, limits: LimitBox, key: jax.Array
 ) -> AbstractGoal:
     """What is asked about: all constants, some, or a prediction."""
     names = experiment.system.parameters.names
@@ -237,13 +237,13 @@ def goal_of(
         if name not in names:
             raise unknown_parameter(name, names)
     if asked.predict:
-        return Prediction(prediction_rows(experiment, limits, asked.predict, key))
+        return VOptimal(prediction_rows(experiment, limits, asked.predict, key))
     if asked.about:
-        return Named(tuple(names.index(name) for name in asked.about))
-    return Everything()
+        return SubsetDOptimal(tuple(names.index(name) for name in asked.about))
+    return DOptimal()
 
 
-def _measured(project: Project) -> list[str]:
+def _measured_channels_of(project: Project) -> list[str]:
     """Channels that the logs of a project measure; all positions where it has none."""
     states = [channel.name for channel in project.system.physical_states]
     named = {name for group in project.spec.logs for name in group.columns}
@@ -261,7 +261,7 @@ def _stated_noise(project: Project, names: list[str]) -> list[float]:
     return [each.get(name, guess[name]) for name in names]
 
 
-def _start(given: Mapping[str, float], system: AbstractSystem) -> Any:
+def _start_state(given: Mapping[str, float], system: AbstractSystem) -> Any:
     states = system.physical_states
     for name in given:
         index_of(name, states, where="--start")
@@ -269,7 +269,9 @@ def _start(given: Mapping[str, float], system: AbstractSystem) -> Any:
 
 
 @in_float64
-def expectation(experiment: Experiment, found: Designed) -> dict[str, dict[str, Any]]:
+def expectation(
+    experiment: Experiment, found: DesignResult
+) -> dict[str, dict[str, Any]]:
     """Of each constant: unit, mean and sd now, sd expected after, and their ratio.
 
     All plain but ``corrected_sd``, today's with the model's errors allowed for.
@@ -295,18 +297,18 @@ def expectation(experiment: Experiment, found: Designed) -> dict[str, dict[str, 
 
 
 @in_float64
-def _summarise(
+def _design_summary(
     name: str,
-    asked: Asked,
+    asked: DesignOptions,
     experiment: Experiment,
     goal: AbstractGoal,
-    found: Designed,
+    found: DesignResult,
     seed: int,
 ) -> dict[str, Any]:
     expected = expectation(experiment, found)
     ahead: dict[str, float] = {}
-    if not isinstance(goal, Prediction):
-        worth, reason = verdict(asked, expected, found.nats)
+    if not isinstance(goal, VOptimal):
+        worth, reason = experiment_verdict(asked, expected, found.nats)
     else:
         before, after = experiment.belief.scale, jnp.asarray(found.scale)
         ahead = {
@@ -314,7 +316,7 @@ def _summarise(
             "after": float(goal.deviation(after)),
             "corrected": float(goal.deviation(experiment.plausible.scale)),
         }
-        worth, reason = foretold(asked, ahead, found.nats)
+        worth, reason = prediction_verdict(asked, ahead, found.nats)
     return {
         "command": "design",
         "title": f"{name}: the next experiment",
@@ -329,13 +331,13 @@ def _summarise(
         "prediction_sd": ahead,
         "violations": found.violations,
         "draws_checked": found.checked,
-        "units": units(experiment.system),
+        "units": channel_units(experiment.system),
         "tables": [expected_table(expected)],
     }
 
 
-def _arrays(
-    experiment: Experiment, limits: LimitBox, found: Designed
+def _design_arrays(
+    experiment: Experiment, limits: LimitBox, found: DesignResult
 ) -> dict[str, np.ndarray]:
     system = experiment.system
     arrays = {
@@ -345,7 +347,9 @@ def _arrays(
     }
     for i, channel in enumerate(system.actions):
         arrays[f"design/command/{channel.name}"] = found.commands[:, i]
-        arrays[f"design/limit/{channel.name}"] = _pair(limits.low, limits.high, i)
+        arrays[f"design/limit/{channel.name}"] = _column_bounds(
+            limits.low, limits.high, i
+        )
     for i, channel in enumerate(system.physical_states):
         for name, values in (
             ("state", found.states),
@@ -353,16 +357,16 @@ def _arrays(
             ("high", found.high),
         ):
             arrays[f"design/{name}/{channel.name}"] = values[:, i]
-        box = _pair(limits.state_low, limits.state_high, i)
+        box = _column_bounds(limits.state_low, limits.state_high, i)
         arrays[f"design/limit/{channel.name}"] = box
     return arrays
 
 
-def _pair(low: np.ndarray, high: np.ndarray, i: int) -> np.ndarray:
+def _column_bounds(low: np.ndarray, high: np.ndarray, i: int) -> np.ndarray:
     return np.asarray([low[i], high[i]], float)
 
 
-def as_csv(experiment: Experiment, found: Designed) -> str:
+def as_csv(experiment: Experiment, found: DesignResult) -> str:
     """A row for each period: its time, its commands, and the states expected then.
 
     Numbers are written in full: what is read back keeps the limits as well.

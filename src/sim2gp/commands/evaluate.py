@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from sim2gp.commands.folds import fold, without
+from sim2gp.commands.folds import fit_fold, leave_out
 from sim2gp.commands.identification import Identification
-from sim2gp.commands.result import AbstractResult, numbers
+from sim2gp.commands.result import AbstractResult, numeric_entries
 from sim2gp.data.grid import CURVE, Grid, evaluation_windows, steps_of
 from sim2gp.data.logs import Log, Note, note_lines, shared_rows
 from sim2gp.data.windows import Windows
@@ -27,19 +27,19 @@ from sim2gp.identification.forecasts.baselines import (
     forecast_sentence,
     regression_errors,
 )
-from sim2gp.identification.forecasts.calibration import calibration
+from sim2gp.identification.forecasts.calibration import calibrate_forecasts
 from sim2gp.identification.forecasts.prediction import (
-    Judged,
+    ScoredForecasts,
+    channel_units,
     channels,
-    drawn,
-    joined,
-    judged,
-    predicted,
-    recordings,
-    rows_for,
-    scores,
+    forecast_grid,
+    forecast_scores,
+    forecast_traces,
+    join_folds,
+    recording_names,
+    score_forecasts,
+    scored_rows,
     trace_arrays,
-    units,
 )
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.project import Project, load_project
@@ -60,22 +60,22 @@ class Evaluation(AbstractResult):
     @property
     def rmse(self) -> dict[str, float]:
         """Root mean square error of open-loop forecasts, by channel in its unit."""
-        return numbers(self.summary["open_loop_rmse"])
+        return numeric_entries(self.summary["open_loop_rmse"])
 
     @property
     def hold_rmse(self) -> dict[str, float]:
         """The same of the measured start, predicted to stay."""
-        return numbers(self.summary["hold_rmse"])
+        return numeric_entries(self.summary["hold_rmse"])
 
     @property
     def regression_rmse(self) -> dict[str, float]:
         """The same of a linear regression; empty if it had too few windows."""
-        return numbers(self.summary.get("regression_rmse"))
+        return numeric_entries(self.summary.get("regression_rmse"))
 
     @property
     def coverage90(self) -> dict[str, float]:
         """The share of samples inside 90 % bands, by channel."""
-        return numbers(self.summary["coverage90"])
+        return numeric_entries(self.summary["coverage90"])
 
 
 def evaluate(
@@ -102,10 +102,10 @@ def evaluate(
         got = "an identification alone"
         raise error("no_logs_to_evaluate", where="logs", got=got)
     assert fit.project is not None
-    return _forecast(fit, as_logs(fit.project, logs), horizon, progress)
+    return _forecast_logs(fit, as_logs(fit.project, logs), horizon, progress)
 
 
-def _forecast(
+def _forecast_logs(
     fit: Identification, tested: Sequence[Log], horizon: float, progress: Progress
 ) -> Evaluation:
     """Logs predicted by a fit of others."""
@@ -114,9 +114,9 @@ def _forecast(
     assert found is not None
     system = found.system
     with progress.task("evaluate", 1) as task:
-        rows, longest = rows_for(horizon), max(horizon, CURVE[-1])
+        rows, longest = scored_rows(horizon), max(horizon, CURVE[-1])
         grid = windows_for(tested, found, longest, horizon)
-        result = predicted(system, fit.plain, grid, horizon)
+        result = forecast_grid(system, fit.plain, grid, horizon)
         train = _training(fit)
         linear = np.full((len(grid.windows), len(rows), len(result.mean[0, 0])), np.nan)
         if train is not None:
@@ -124,10 +124,10 @@ def _forecast(
             linear = regression_errors(known, grid, rows)
         task.advance("forecasts")
     names = channels(system, grid.windows)
-    whole = judged(rows, grid, result, fit.band, linear)
-    summary, arrays = scores(whole, names, tested, horizon)
-    summary["calibration"], shares = calibration(whole, names, tested, horizon)
-    picture = drawn(result, fit.band, grid)
+    whole = score_forecasts(rows, grid, result, fit.band, linear)
+    summary, arrays = forecast_scores(whole, names, tested, horizon)
+    summary["calibration"], shares = calibrate_forecasts(whole, names, tested, horizon)
+    picture = forecast_traces(result, fit.band, grid)
     arrays |= shares | trace_arrays(picture, grid, tested, names)
     notes = note_lines(tested, shared_rows(train or (), tested))
     if train is None:
@@ -153,7 +153,7 @@ class Cut(NamedTuple):
     grid: Grid
 
 
-class FoldJob(NamedTuple):
+class EvaluateJob(NamedTuple):
     """One fold of a leave-one-out, as another process needs it."""
 
     path: Path
@@ -171,18 +171,18 @@ def _leave_one_out(
 ) -> Evaluation:
     """Each recording predicted by a fit of the others."""
     started = time.perf_counter()
-    files = list(dict.fromkeys(recordings(logs)))
+    files = list(dict.fromkeys(recording_names(logs)))
     if len(files) < 2:
         where, got = project.source.where("logs"), f"{len(files)} file"
         raise error("one_recording", where=where, got=got)
     of_file = (
-        tuple(k for k, source in enumerate(recordings(logs)) if source == file)
+        tuple(k for k, source in enumerate(recording_names(logs)) if source == file)
         for file in files
     )
-    jobs = [FoldJob(project.path, logs, horizon, left) for left in of_file]
+    jobs = [EvaluateJob(project.path, logs, horizon, left) for left in of_file]
     apart = workers if project.can_be_loaded else 1
-    cut = _cut(project, jobs[0])
-    work = _fold_of if apart > 1 else partial(_fold, project, cut)
+    cut = _cut_for_fold(project, jobs[0])
+    work = _forecast_in_process if apart > 1 else partial(_forecast_fold, project, cut)
     with progress.task("logs", len(jobs)) as task:
         found = in_order(
             work,
@@ -195,9 +195,9 @@ def _leave_one_out(
     for each in traced:
         arrays |= each
     names = channels(project.system, cut.windows)
-    whole = joined(list(parts))
-    summary, curves = scores(whole, names, logs, horizon)
-    summary["calibration"], shares = calibration(whole, names, logs, horizon)
+    whole = join_folds(list(parts))
+    summary, curves = forecast_scores(whole, names, logs, horizon)
+    summary["calibration"], shares = calibrate_forecasts(whole, names, logs, horizon)
     arrays |= shares
     summary["tables"].append(_constants_table(project, files, logs, list(constants)))
     summary |= {
@@ -209,33 +209,33 @@ def _leave_one_out(
     return _evaluation(summary, curves | arrays, project, started)
 
 
-def _cut(project: Project, job: FoldJob) -> Cut:
+def _cut_for_fold(project: Project, job: EvaluateJob) -> Cut:
     windows, of = cut_logs(project, job.logs)
     longest = max(job.horizon, CURVE[-1])
     return Cut(windows, of, windows_for(job.logs, project, longest, job.horizon))
 
 
-def _fold(
-    project: Project, cut: Cut, job: FoldJob
-) -> tuple[Judged, dict[str, np.ndarray], np.ndarray]:
+def _forecast_fold(
+    project: Project, cut: Cut, job: EvaluateJob
+) -> tuple[ScoredForecasts, dict[str, np.ndarray], np.ndarray]:
     """Forecasts, traces and parameters of the fit without the logs ``job.left``."""
     windows, of, grid = cut
-    part = without(job.left, job.logs, of, grid)
+    part = leave_out(job.left, job.logs, of, grid)
     # One start: the folds are small changes of one problem.
     key = jax.random.key(0)
-    found = fold(project, windows, grid, part, job.horizon, key=key, starts=1)
-    picture = drawn(found.forecast, found.band, found.tested)
+    found = fit_fold(project, windows, grid, part, job.horizon, key=key, starts=1)
+    picture = forecast_traces(found.forecast, found.band, found.tested)
     names = channels(project.system, windows)
     traced = trace_arrays(picture, found.tested, job.logs, names)
     return found.judged, traced, _constrain(project.system, found.posterior)
 
 
-def _fold_of(
-    job: FoldJob,
-) -> tuple[Judged, dict[str, np.ndarray], np.ndarray]:
+def _forecast_in_process(
+    job: EvaluateJob,
+) -> tuple[ScoredForecasts, dict[str, np.ndarray], np.ndarray]:
     """The same in a process of its own."""
     project = load_project(job.path)
-    return _fold(project, _cut(project, job), job)
+    return _forecast_fold(project, _cut_for_fold(project, job), job)
 
 
 @in_float64
@@ -305,7 +305,7 @@ def _evaluation(
     started: float,
 ) -> Evaluation:
     """The result with its headline."""
-    unit = units(project.system)
+    unit = channel_units(project.system)
     summary["headline"] = forecast_sentence(
         f"Open-loop error at {summary['horizon']:g} s",
         summary["open_loop_rmse"],

@@ -126,18 +126,18 @@ def example(folder: Path | str, *, progress: Progress | None = None) -> Path:
         "README.md": README.format(truth=truth),
     }
     for number, name in enumerate(("first.csv", "second.csv")):
-        texts[name] = _table(_recorded(number))
+        texts[name] = _csv_text(_recorded(number))
     try:
         folder.mkdir()  # ours alone from here on: whatever fails, nothing of it is left
         with cleanup.registered(lambda: shutil.rmtree(folder, ignore_errors=True)):
-            _write(folder, texts)
+            _write_texts(folder, texts)
     except OSError as caught:
         raise disk_error(folder, caught) from caught
     (progress or Progress()).say(f"next: sim2gp identify {folder / 'arm.toml'}")
     return folder / "arm.toml"
 
 
-def _write(folder: Path, texts: Mapping[str, str]) -> None:
+def _write_texts(folder: Path, texts: Mapping[str, str]) -> None:
     try:
         for name, text in texts.items():
             (folder / name).write_text(text, encoding="utf-8")
@@ -173,7 +173,7 @@ def _swung(torque: Float[Array, "T 2"]) -> Float[Array, "T 2"]:
     return jax.lax.scan(step, jnp.zeros(4), torque)[1]
 
 
-def _table(rows: Float[np.ndarray, "T 5"]) -> str:
+def _csv_text(rows: Float[np.ndarray, "T 5"]) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["time", "q1", "q2", "torque1", "torque2"])

@@ -27,10 +27,16 @@ from sim2gp.identification.missing_physics.data import (
     OneStepData,
     WindowData,
 )
-from sim2gp.identification.missing_physics.explain import explain as search_missing
-from sim2gp.identification.missing_physics.score import Scored
-from sim2gp.identification.missing_physics.search import REFITS, Refitted, refit
-from sim2gp.identification.missing_physics.words import candidate_rows, headline, table
+from sim2gp.identification.missing_physics.explain import (
+    find_missing_physics as search_missing,
+)
+from sim2gp.identification.missing_physics.score import ScoredCandidate
+from sim2gp.identification.missing_physics.search import REFITS, FittedCandidate, refit
+from sim2gp.identification.missing_physics.words import (
+    candidate_rows,
+    candidate_table,
+    missing_physics_headline,
+)
 from sim2gp.inference.estimate import Estimate
 from sim2gp.planning.tasks import MACHINES
 from sim2gp.project import Project, load_project
@@ -50,7 +56,7 @@ SHARED_SECOND = 1.0  # s of windows whose errors may be correlated
 class MissingPhysics(AbstractResult):
     """What a simulator lacks: nothing, an effect of the library, or none of these."""
 
-    winner: Refitted | None = field(default=None)
+    winner: FittedCandidate | None = field(default=None)
 
     @property
     def answer(self) -> str:
@@ -99,7 +105,7 @@ def explain(
     logs = run.training_logs(alike=True) if isinstance(run, Identification) else ()
     data, fits, project = _data(run, logs), None, run.project
     if workers > 1 and logs and project is not None and project.can_be_loaded:
-        fits = partial(_in_processes, project.path, logs, workers)
+        fits = partial(_fits_in_processes, project.path, logs, workers)
     with (progress or Progress()).task("explain", 2 + REFITS) as task:
         found = search_missing(data, fits=fits, on_step=task.advance)
     candidates = candidate_rows(found)
@@ -108,7 +114,7 @@ def explain(
     summary: dict[str, Any] = {
         "command": "explain",
         "title": f"{run.name}: what its simulator lacks",
-        "headline": headline(found),
+        "headline": missing_physics_headline(found),
         "answer": found.answer,
         "best": found.effect,
         "none_of_these": found.answer == "none of these",
@@ -119,7 +125,7 @@ def explain(
         "log_evidence": float(found.search.bare.log_evidence),
         "added": None,
         "warnings": [f"no fit with {name}" for name in found.search.failed],
-        "tables": [table(found, candidates)],
+        "tables": [candidate_table(found, candidates)],
     }
     return MissingPhysics(
         summary | provenance(started),
@@ -149,14 +155,14 @@ class RefitJob(NamedTuple):
     bare: Estimate
 
 
-def _in_processes(
+def _fits_in_processes(
     path: Path,
     logs: tuple[Log, ...],
     workers: int,
     data: AbstractData,
     bare: Estimate,
-    ranked: Sequence[Scored],
-) -> Iterator[tuple[str, Refitted | None]]:
+    ranked: Sequence[ScoredCandidate],
+) -> Iterator[tuple[str, FittedCandidate | None]]:
     """The fits of the best candidates, as processes are free."""
     assert isinstance(data, WindowData)
     asked = {one.candidate.name: one for one in ranked}
@@ -171,17 +177,19 @@ def _in_processes(
             continue
         fitted, *numbers = fit
         back = jax.tree.map(jnp.asarray, fitted)
-        yield job.name, Refitted(asked[job.name], back, *numbers)
+        yield job.name, FittedCandidate(asked[job.name], back, *numbers)
 
 
 @in_float64
 def _refit_of(job: RefitJob) -> tuple[Estimate, float, float, float, float] | None:
-    """A candidate's fit in a process of its own: all of `Refitted` but ``scored``."""
+    """A candidate's fit in its own process: a `FittedCandidate` without ``scored``."""
     data = window_data(load_project(job.path), job.logs, job.seed)
     known = {c.name: c for c in registered(data.system, windows=True)}
     candidate = known[job.name]
     system = free_parts(data.system, [candidate.effect])
-    scored = Scored(candidate, system, 0.0, 1.0, (), job.starts)  # scores are unused
+    scored = ScoredCandidate(
+        candidate, system, 0.0, 1.0, (), job.starts
+    )  # scores are unused
     found = refit(data, jax.tree.map(jnp.asarray, job.bare), scored)
     if found is None:
         return None
@@ -218,7 +226,7 @@ def _flown(run: Demonstration) -> OneStepData:
     return OneStepData(make(), episodes, dt=dt)
 
 
-def explainable(
+def load_explainable(
     folder: Path, budget: Budget | None = None, *, strict: bool = False
 ) -> Identification | Demonstration:
     """The run of an identification, its logs read, or of a demo (E130)."""

@@ -9,7 +9,7 @@ from typing import Any
 
 import jax
 
-from sim2gp.commands.identification import Identification, Width, used
+from sim2gp.commands.identification import Identification, Width, posterior_entries
 from sim2gp.robot.export import write_model
 from sim2gp.runs import Progress
 from sim2gp.systems import one_variant
@@ -34,6 +34,6 @@ def export(
     (progress or Progress()).say(
         f"drawing {draws} machines from the {posterior} posterior"
     )
-    about = {"run": found.name, **used(found.summary, posterior)}
+    about = {"run": found.name, **posterior_entries(found.summary, posterior)}
     key = jax.random.key(seed)
     return write_model(own, Path(out), system, draws=draws, key=key, about=about)

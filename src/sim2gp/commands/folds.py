@@ -20,11 +20,11 @@ from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.forecasts.baselines import regression_errors
 from sim2gp.identification.forecasts.forecast import Band, Forecast, fit_band
 from sim2gp.identification.forecasts.prediction import (
-    Judged,
-    judged,
-    predicted,
-    recordings,
-    rows_for,
+    ScoredForecasts,
+    forecast_grid,
+    recording_names,
+    score_forecasts,
+    scored_rows,
     subset,
 )
 from sim2gp.inference.estimate import Estimate
@@ -55,12 +55,12 @@ class Fold(NamedTuple):
 
     posterior: Gaussian
     band: Band
-    judged: Judged
+    judged: ScoredForecasts
     tested: Grid
     forecast: Forecast  # of what is tested
 
 
-def without(
+def leave_out(
     left: Sequence[int], logs: Sequence[Log], of: np.ndarray, grid: Grid
 ) -> Part:
     """All but the logs with these indices."""
@@ -69,17 +69,17 @@ def without(
     return Part(~np.isin(of, left), ~test, test, len(others), logs[left[0]].name)
 
 
-def held_out(
+def split_held_out(
     logs: Sequence[Log],
     windows: Windows,
     places: Sequence[tuple[int, int]],
     grid: Grid,
 ) -> Part | None:
     """The last recording, or the last quarter of the only one; None if too short."""
-    files = recordings(logs)
+    files = recording_names(logs)
     if len(set(files)) > 1:
         last = [k for k, source in enumerate(files) if source == files[-1]]
-        found = without(last, logs, np.asarray([k for k, _ in places]), grid)
+        found = leave_out(last, logs, np.asarray([k for k, _ in places]), grid)
     else:
         first, end = float(logs[0].time[0]), float(logs[-1].time[-1])
         split = end - LAST * (end - first)
@@ -89,11 +89,13 @@ def held_out(
         words = f"the last {100 * LAST:.0f} % of {logs[0].name}"
         found = Part(train, known, test, 1, words, split)
     seen = np.asarray(windows.mask)[found.train].any()
-    judged_by = np.asarray(grid.windows.mask)[found.test, rows_for(CURVE[0])[0]].any()
+    judged_by = np.asarray(grid.windows.mask)[
+        found.test, scored_rows(CURVE[0])[0]
+    ].any()
     return found if seen and found.known.any() and judged_by else None
 
 
-def fold(
+def fit_fold(
     project: Project,
     windows: Windows,
     grid: Grid,
@@ -108,7 +110,7 @@ def fold(
 
     Raises as `sim2gp.identification.fit.fit_windows` does.
     """
-    rows = rows_for(horizon)
+    rows = scored_rows(horizon)
     mask = np.asarray(windows.mask) & part.train[:, None, None]
     kept = eqx.tree_at(lambda w: w.mask, windows, mask)
     robust = project.spec.likelihood.robust
@@ -120,7 +122,7 @@ def fold(
         starts=starts,
         warm_start=warm_start,
     ).posterior
-    result = predicted(project.system, posterior, grid, horizon)
+    result = forecast_grid(project.system, posterior, grid, horizon)
     train, tested = subset(grid, part.known), subset(grid, part.test)
     curve = np.asarray([steps_of(h) for h in CURVE])
     before = train.since[:, None] + PERIOD * curve <= part.until
@@ -129,5 +131,5 @@ def fold(
     band = fit_band(seen, train, part.recordings)
     linear = regression_errors(train, tested, rows)
     result = result.of(part.test)
-    found = judged(rows, tested, result, band, linear)
+    found = score_forecasts(rows, tested, result, band, linear)
     return Fold(posterior, band, found, tested, result)

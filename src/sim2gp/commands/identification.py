@@ -33,7 +33,7 @@ _PREFIX = {"corrected": "intervals", "plain": "belief"}
 
 
 @dataclass(frozen=True)
-class Constant:
+class IdentifiedConstant:
     """What is known of one constant, in its physical unit.
 
     ``interval`` holds it with 95 % probability, allowing for errors of the model.
@@ -65,11 +65,11 @@ class Identification(AbstractResult):
         return self._project.system
 
     @property
-    def parameters(self) -> dict[str, Constant]:
+    def parameters(self) -> dict[str, IdentifiedConstant]:
         """Each constant by name, in physical units."""
         fields = ("unit", "mean", "sd", "prior_mean", "prior_sd", "verdict")
         return {
-            name: Constant(
+            name: IdentifiedConstant(
                 name=name,
                 interval=(entry["q025"], entry["q975"]),
                 meaning=entry.get("meaning") or "",
@@ -84,7 +84,7 @@ class Identification(AbstractResult):
 
         Over virtual values; it is what leaves the run.
         """
-        return _posterior(self.arrays, "corrected")
+        return _stored_posterior(self.arrays, "corrected")
 
     @cached_property
     def plain(self) -> Gaussian:
@@ -93,7 +93,7 @@ class Identification(AbstractResult):
         Forecasts start from its mean, because the fit's errors are smallest there, and
         expected information is counted from it.
         """
-        return _posterior(self.arrays, "plain")
+        return _stored_posterior(self.arrays, "plain")
 
     @property
     def noise(self) -> dict[str, float]:
@@ -155,13 +155,13 @@ class Identification(AbstractResult):
 
 
 @in_float64
-def physical(table: Parameters, tt: AnyArray) -> np.ndarray:
+def physical_mode(table: Parameters, tt: AnyArray) -> np.ndarray:
     """The constants at the posterior's mode, in physical units."""
     return np.asarray(table.constrain(np.asarray(tt, float)))
 
 
 @in_float64
-def _posterior(x: Mapping[str, np.ndarray], which: Width) -> Gaussian:
+def _stored_posterior(x: Mapping[str, np.ndarray], which: Width) -> Gaussian:
     """One of the two posteriors of an identification, over virtual values."""
     prefix = _PREFIX[which]
     mean, scale = (np.asarray(x[f"{prefix}/{n}"]) for n in ("mean", "scale"))
@@ -177,11 +177,11 @@ def modes(x: Mapping[str, np.ndarray], table: Parameters, which: Width) -> np.nd
     prefix = _PREFIX[which]
     if f"{prefix}/theta" not in x:
         _check_fitted("the model's file", table, x)
-        return np.asarray(physical(table, jnp.asarray(x[f"{prefix}/mean"])))
+        return np.asarray(physical_mode(table, jnp.asarray(x[f"{prefix}/mean"])))
     return np.asarray(x[f"{prefix}/theta"])
 
 
-def used(summary: Mapping[str, Any], which: Width) -> dict[str, Any]:
+def posterior_entries(summary: Mapping[str, Any], which: Width) -> dict[str, Any]:
     """Which posterior left a run, for the summary of what it left for.
 
     ``which`` as asked, ``widened`` the least and the most by which the corrected sd
@@ -197,7 +197,7 @@ def used(summary: Mapping[str, Any], which: Width) -> dict[str, Any]:
     }
 
 
-def stood(run: Path, summary: dict[str, Any]) -> Path:
+def recorded_project_path(run: Path, summary: dict[str, Any]) -> Path:
     """Where the project file of an identification stood."""
     about = summary.get("project", {})
     place = run / about.get("folder", "") / about.get("file", PROJECT)
@@ -215,14 +215,16 @@ def project_of(
 
     ``model`` is another file of the model, ``machine`` one of the user's own.
     """
-    place = stood(run, stored.summary)
+    place = recorded_project_path(run, stored.summary)
     found = load_project(run / PROJECT, place.parent, model, system=machine)
     # The copy's folder is the run's: what was moved is the copy alone.
     return replace(found, path=place, own=model is not None or machine is not None)
 
 
 @in_float64
-def restored(run: Path, machine: AbstractSystem | None = None) -> Identification:
+def restore_identification(
+    run: Path, machine: AbstractSystem | None = None
+) -> Identification:
     """What `identify` saved (E130 for another folder, E184 for other constants)."""
     stored = load_run(run)
     check_identified(run, stored)
@@ -254,7 +256,7 @@ def _check_constants(run: Path, project: Project, summary: dict[str, Any]) -> No
 
 def _check_fitted(where: str, table: Parameters, x: Mapping[str, np.ndarray]) -> None:
     """A model's file still has the numbers that its default priors are about (E170)."""
-    now = physical(table, jnp.asarray(x["belief/mean"]))
+    now = physical_mode(table, jnp.asarray(x["belief/mean"]))
     theta = x.get("belief/theta", now)
     for name, is_, was in zip(table.names, np.asarray(now), theta, strict=True):
         if not np.isclose(is_, was, rtol=1e-9, atol=1e-12):

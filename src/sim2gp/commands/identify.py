@@ -73,7 +73,9 @@ def identify(
         from sim2gp.commands.longer import advice
 
         cuts = windows, places
-        found = results.found(project, logs, cuts, grid, fitted, seed, held_out)
+        found = results.identification_results(
+            project, logs, cuts, grid, fitted, seed, held_out
+        )
         summary, arrays, honest = found
         task.advance("forecasts")
         likelihood = WindowsLikelihood(project.system, windows)

@@ -6,34 +6,34 @@ from typing import Any
 import jax
 import numpy as np
 
-from sim2gp.commands.identification import physical
-from sim2gp.commands.unseen import Unseen, unseen
+from sim2gp.commands.identification import physical_mode
+from sim2gp.commands.unseen import Unseen, forecast_unseen
 from sim2gp.data.clock import clock_warnings
 from sim2gp.data.grid import CURVE, Grid
 from sim2gp.data.logs import Log, note_lines
 from sim2gp.data.windows import Windows
 from sim2gp.data.windows_likelihood import WindowsLikelihood, information_at
 from sim2gp.identification import diagnose
-from sim2gp.identification.configurations import told
+from sim2gp.identification.configurations import configuration_entries
 from sim2gp.identification.exact_posterior.importance import check_windows
 from sim2gp.identification.exact_posterior.nuts import sample_windows
 from sim2gp.identification.forecasts.forecast import Band, fit_band
 from sim2gp.identification.forecasts.prediction import (
     Picture,
+    channel_units,
     channels,
-    drawn,
-    predicted,
-    recordings,
-    rows_for,
-    thinned,
+    forecast_grid,
+    forecast_traces,
+    recording_names,
+    scored_rows,
+    thin_windows,
     trace_arrays,
-    units,
 )
 from sim2gp.identification.intervals.discrepancy import (
     corrected_windows,
 )
-from sim2gp.identification.intervals.scatter import Corrected
-from sim2gp.identification.intervals.words import lacking_table, told_intervals
+from sim2gp.identification.intervals.scatter import CorrectedFit
+from sim2gp.identification.intervals.words import interval_entry, missing_physics_table
 from sim2gp.identification.misfit.residuals import misfit_of_windows
 from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
@@ -47,7 +47,7 @@ Drawn = tuple[Gaussian, Picture, Grid]
 _SHORTEST = 4  # windows: a film of fewer held-out ones is not worth watching
 
 
-def found(
+def identification_results(
     project: Project,
     logs: Sequence[Log],
     cuts: tuple[Windows, list[tuple[int, int]]],
@@ -55,7 +55,7 @@ def found(
     fitted: Estimate,
     seed: int,
     held_out: bool,
-) -> tuple[dict[str, Any], dict[str, np.ndarray], Corrected]:
+) -> tuple[dict[str, Any], dict[str, np.ndarray], CorrectedFit]:
     """The run's summary and arrays, and the corrected intervals."""
     table, (windows, places) = project.system.parameters, cuts
     band, own = _own_forecasts(project, fitted.posterior, grid, logs)
@@ -63,9 +63,15 @@ def found(
     likelihood = WindowsLikelihood(project.system, windows)
     of = np.asarray([k for k, _ in places])
     honest = corrected_windows(likelihood, known, of)
-    summary = _summarise(project, logs, likelihood, known, honest, band, seed)
+    summary = _identification_summary(
+        project, logs, likelihood, known, honest, band, seed
+    )
     arrays = _stored(table, known, honest.posterior, band, seed)
-    other = unseen(project, logs, windows, places, grid, known) if held_out else None
+    other = (
+        forecast_unseen(project, logs, windows, places, grid, known)
+        if held_out
+        else None
+    )
     said, drawings = _drawings(project, logs, own, other)
     return summary | said, arrays | drawings, honest
 
@@ -79,11 +85,11 @@ def _own_forecasts(
     as long for them as for the fit.
     """
     if simulator_of(project.system) is not None:
-        grid = thinned(grid)
-    found = predicted(project.system, posterior, grid, CURVE[0])
-    rows = rows_for(CURVE[0])[1:]
-    band = fit_band(found.at(rows), grid, len(set(recordings(logs))))
-    return band, (posterior, drawn(found, band, grid), grid)
+        grid = thin_windows(grid)
+    found = forecast_grid(project.system, posterior, grid, CURVE[0])
+    rows = scored_rows(CURVE[0])[1:]
+    band = fit_band(found.at(rows), grid, len(set(recording_names(logs))))
+    return band, (posterior, forecast_traces(found, band, grid), grid)
 
 
 def _stored(
@@ -92,7 +98,7 @@ def _stored(
     key = jax.random.fold_in(jax.random.key(seed), 1)
     return {
         "belief/mean": np.asarray(fitted.posterior.mean),
-        "belief/theta": np.asarray(physical(table, fitted.posterior.mean)),
+        "belief/theta": np.asarray(physical_mode(table, fitted.posterior.mean)),
         "belief/scale": np.asarray(fitted.posterior.scale),
         "belief/prior_mean": np.asarray(fitted.prior.mean),
         "belief/prior_scale": np.asarray(fitted.prior.scale),
@@ -100,7 +106,7 @@ def _stored(
         "belief/noise": np.asarray(fitted.noise.sd),
         "belief/weights": np.asarray(fitted.noise.weights),
         "intervals/mean": np.asarray(honest.mean),
-        "intervals/theta": np.asarray(physical(table, honest.mean)),
+        "intervals/theta": np.asarray(physical_mode(table, honest.mean)),
         "intervals/scale": np.asarray(honest.scale),
         "band/start_sd": band.start_sd,
         "band/input_sd": band.input_sd,
@@ -112,12 +118,12 @@ def _stored(
     }
 
 
-def _summarise(
+def _identification_summary(
     project: Project,
     logs: Sequence[Log],
     likelihood: WindowsLikelihood,
     fitted: Estimate,
-    honest: Corrected,
+    honest: CorrectedFit,
     band: Band,
     seed: int,
 ) -> dict[str, Any]:
@@ -134,13 +140,13 @@ def _summarise(
     noise = dict(zip(names, np.asarray(fitted.noise.sd).tolist(), strict=True))
     rows = sum(len(log) for log in logs)
     actions = [channel.name for channel in system.actions]
-    about = told_intervals(system, honest, found["parameters"], len(windows))
-    listed = told(system, logs, found["parameters"])
-    listed["tables"] = [*lacking_table(about), *listed.get("tables", ())]
+    about = interval_entry(system, honest, found["parameters"], len(windows))
+    listed = configuration_entries(system, logs, found["parameters"])
+    listed["tables"] = [*missing_physics_table(about), *listed.get("tables", ())]
     return {
         "command": "identify",
-        "title": f"{project.name}: what {_count(logs)}",
-        "headline": headline(found["parameters"]),
+        "title": f"{project.name}: what {_count_of_logs(logs)}",
+        "headline": identified_headline(found["parameters"]),
         "seed": seed,
         "converged": True,
         "convergence": fitted.convergence.as_dict(),
@@ -148,15 +154,15 @@ def _summarise(
         "intervals": about,
         "misfit": {
             **misfit_of_windows(likelihood, fitted).as_dict(),
-            "noise": _noise_words(names, noise, windows, units(system)),
+            "noise": _noise_words(names, noise, windows, channel_units(system)),
         },
         "log_evidence": float(fitted.log_evidence),
         "n_rows": rows,
         "period": float(np.median(np.concatenate([np.diff(x.time) for x in logs]))),
-        "n_logs": len(set(recordings(logs))),
+        "n_logs": len(set(recording_names(logs))),
         "n_transitions": rows - len(logs),
         "n_windows": len(windows),
-        "units": units(system),
+        "units": channel_units(system),
         "band": {
             "input_sd": dict(zip(actions, band.input_sd.tolist(), strict=True)),
             "inflation": band.inflation,
@@ -169,7 +175,7 @@ def _summarise(
     }
 
 
-def headline(parameters: dict[str, dict[str, Any]]) -> str:
+def identified_headline(parameters: dict[str, dict[str, Any]]) -> str:
     """How many constants the logs determine, and which they do not."""
     sure = [n for n, entry in parameters.items() if entry["verdict"] == "identified"]
     rest = [n for n in parameters if n not in sure]
@@ -181,8 +187,8 @@ def headline(parameters: dict[str, dict[str, Any]]) -> str:
     )
 
 
-def _count(logs: Sequence[Log]) -> str:
-    count = len(set(recordings(logs)))
+def _count_of_logs(logs: Sequence[Log]) -> str:
+    count = len(set(recording_names(logs)))
     return "one log determines" if count == 1 else f"{count} logs determine"
 
 

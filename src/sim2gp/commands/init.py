@@ -11,7 +11,7 @@ import jax
 from sim2gp.cleanup import replace_file
 from sim2gp.data.logs import Budget
 from sim2gp.experiment_design.safe_excitation import PERIOD, Excitation, safe_excitation
-from sim2gp.project.draft import Request, draft_project, told
+from sim2gp.project.draft import Request, draft_project, draft_summary
 from sim2gp.runs import Progress
 from sim2gp.runs.store import check_absent
 from sim2gp.systems.base import AbstractSystem
@@ -56,12 +56,12 @@ def init(
     )
     if logs:
         with progress.task("init", 3) as task:
-            return told(draft_project(replace(asked, step=task.advance)), out)
+            return draft_summary(draft_project(replace(asked, step=task.advance)), out)
     table = out.with_name(f"{out.stem}-experiment.csv")
     check_absent(table)
     with progress.task("init", 2) as task:
         draft = draft_project(replace(asked, step=task.advance))
-        summary = told(draft, out)
+        summary = draft_summary(draft, out)
         until = asked.started + seconds
         found = safe_excitation(draft.system, key=jax.random.key(seed), until=until)
         task.advance("a first experiment")

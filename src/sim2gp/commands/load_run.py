@@ -7,7 +7,7 @@ from sim2gp.commands.demo import Demonstration
 from sim2gp.commands.design import FILE, NextExperiment
 from sim2gp.commands.evaluate import Evaluation
 from sim2gp.commands.explain import MissingPhysics
-from sim2gp.commands.identification import Identification, restored
+from sim2gp.commands.identification import Identification, restore_identification
 from sim2gp.commands.result import AbstractResult
 from sim2gp.commands.selftest import SelfTest
 from sim2gp.runs import store
@@ -42,7 +42,7 @@ def load_run(
     stored = store.load_run(folder)
     command = str(stored.summary.get("command"))
     if command == "identify" and not stored.summary.get("first_answer"):
-        return restored(folder, machine)
+        return restore_identification(folder, machine)
     kind = KINDS.get(command, StudyRun)
     files = {}
     if kind is NextExperiment:

@@ -16,7 +16,7 @@ from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.errors import DeadParameters, InputError, NotConverged, NotFinite
 from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.intervals.discrepancy import corrected_windows
-from sim2gp.identification.intervals.scatter import Corrected
+from sim2gp.identification.intervals.scatter import CorrectedFit
 from sim2gp.identification.misfit.residuals import misfit_of_windows
 from sim2gp.identification.words import digits
 from sim2gp.project import Project
@@ -74,7 +74,7 @@ class Longer(NamedTuple):
 def advice(
     project: Project,
     logs: Sequence[Log],
-    honest: Corrected,
+    honest: CorrectedFit,
     *,
     alarm: bool,
     key: Key,
@@ -83,7 +83,7 @@ def advice(
     """The entry "longer" of a summary; where it was not ``asked`` for, a word of it."""
     window = project.spec.likelihood.window
     if asked:
-        found = lengthened(project, logs, honest, alarm=alarm, key=key)
+        found = fit_longer_windows(project, logs, honest, alarm=alarm, key=key)
         return {"longer": found.as_dict(window)}
     if alarm or window == 0.0:
         return {}
@@ -91,10 +91,10 @@ def advice(
     return {"longer": {**unasked, "ratio": {}}}
 
 
-def lengthened(
+def fit_longer_windows(
     project: Project,
     logs: Sequence[Log],
-    honest: Corrected,
+    honest: CorrectedFit,
     *,
     alarm: bool,
     key: Key,
@@ -133,7 +133,7 @@ def lengthened(
 
 @in_float64
 def _ratios(
-    names: tuple[str, ...], found: Corrected, honest: Corrected
+    names: tuple[str, ...], found: CorrectedFit, honest: CorrectedFit
 ) -> dict[str, float]:
     ratio = np.asarray(found.posterior.sd()) / np.asarray(honest.posterior.sd())
     return dict(zip(names, ratio.tolist(), strict=True))

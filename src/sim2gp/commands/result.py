@@ -73,7 +73,7 @@ class AbstractResult:
         """The same, its summary as it will stand in ``folder``."""
         if self.project is None:
             return self
-        return self.with_entries(project=_place(self.project, folder))
+        return self.with_entries(project=_project_place(self.project, folder))
 
     def write(self, writer: Writer) -> None:
         """Write all files of a run."""
@@ -97,12 +97,12 @@ class AbstractResult:
         return brief(self.summary)
 
 
-def numbers(table: Mapping[str, Any] | None) -> dict[str, float]:
+def numeric_entries(table: Mapping[str, Any] | None) -> dict[str, float]:
     """The entries of a table of the summary that are numbers."""
     return {k: float(v) for k, v in (table or {}).items() if v is not None}
 
 
-def _place(project: Project, run: Path) -> dict[str, str]:
+def _project_place(project: Project, run: Path) -> dict[str, str]:
     """Where the project file stands, seen from the run."""
     folder = Path(os.path.abspath(project.path)).parent
     place = os.path.relpath(folder, os.path.abspath(run))

@@ -38,7 +38,7 @@ CHECKS = {
     ),
     "units": Check(
         "change of the posterior when all units change by powers of two, in sd",
-        checks.units,
+        checks.unit_invariance,
         0.0,
     ),
     "degenerate": Check(
@@ -49,7 +49,7 @@ CHECKS = {
     ),
     "bounds": Check(
         "parameters outside their bounds at virtual values up to infinity; round trip",
-        checks.bounds,
+        checks.bounds_round_trip,
         1e-12,
     ),
     "jacobians": Check(
@@ -64,7 +64,7 @@ CHECKS = {
     ),
     "calibration": Check(
         "1,000 linear problems with truths from the prior: -log10 p of squared errors",
-        checks.calibration,
+        checks.posterior_calibration,
         4.0,
     ),
     "arm": Check(
@@ -100,7 +100,7 @@ def selftest(*, seed: int = 0, progress: Progress | None = None) -> SelfTest:
     for number, (name, check) in enumerate(CHECKS.items()):
         # Its own stream: a check's figure does not hang on the others.
         found[name] = measure(check, np.random.default_rng([seed, number]))
-        progress.say(_line(name, found[name]))
+        progress.say(_check_line(name, found[name]))
     failed = [name for name, entry in found.items() if entry["result"] != "PASS"]
     summary = {
         "command": "selftest",
@@ -138,7 +138,7 @@ def measure(check: Check, rng: np.random.Generator) -> dict[str, Any]:
     return row | ({"error": error[:200]} if error else {})
 
 
-def _line(name: str, row: dict[str, Any]) -> str:
+def _check_line(name: str, row: dict[str, Any]) -> str:
     figure = "no figure" if row["figure"] is None else f"{row['figure']:.2g}"
     text = f"{row['result']} {name:<12} {figure} (at most {row['limit']:.2g})"
     text += f", {row['seconds']:.1f} s"

@@ -23,7 +23,7 @@ from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.least_squares import linear_posterior
 from sim2gp.models import Sim2GP
 from sim2gp.runs import load_run, new_run
-from sim2gp.studies.two_link import DT, LEVELS, covered, record
+from sim2gp.studies.two_link import DT, LEVELS, coverage, record
 from sim2gp.systems import CartPole, Furuta, TwoLink, UniformRodArm
 from sim2gp.systems.mechanism import AbstractMechanism
 from sim2gp.types import in_float64
@@ -36,7 +36,7 @@ Solved = tuple[Array, Array, Array]
 
 
 @jax.jit
-def _solve(*problems: Array) -> Solved:
+def _solve_batch(*problems: Array) -> Solved:
     """Posterior mean, its scale, and log evidence of a batch."""
 
     def one(J: Array, y: Array, L: Array, mean: Array, S: Array) -> Solved:
@@ -52,7 +52,9 @@ def _lower(rng: Rng, count: int, n: int) -> np.ndarray:
     return strict + rng.uniform(0.5, 2.0, (count, n, 1)) * np.eye(n)
 
 
-def _problems(rng: Rng, count: int, N: int, d: int, p: int, cond: float) -> Problems:
+def _random_problems(
+    rng: Rng, count: int, N: int, d: int, p: int, cond: float
+) -> Problems:
     """Linear problems with truths from the prior; condition numbers up to ``cond``."""
     U = np.linalg.qr(rng.standard_normal((count, N * d, p)))[0]
     V = np.linalg.qr(rng.standard_normal((count, p, p)))[0]
@@ -69,8 +71,8 @@ def _problems(rng: Rng, count: int, N: int, d: int, p: int, cond: float) -> Prob
 @in_float64
 def exactness(rng: Rng) -> float:
     """Largest error against rational arithmetic; that of the evidence over ten."""
-    problems = _problems(rng, 8, 12, 2, 4, 1e8)
-    mean, scale, evidence = (np.asarray(x) for x in _solve(*problems))
+    problems = _random_problems(rng, 8, 12, 2, 4, 1e8)
+    mean, scale, evidence = (np.asarray(x) for x in _solve_batch(*problems))
     worst = 0.0
     for i, problem in enumerate(zip(*problems, strict=True)):
         exact_mean, exact_cov, exact_evidence = _rational(*problem)
@@ -122,16 +124,16 @@ def _log(x: Fraction) -> float:
 
 
 @in_float64
-def units(rng: Rng) -> float:
+def unit_invariance(rng: Rng) -> float:
     """Change of the posterior, in sd, when every unit changes by a power of two."""
-    J, y, L, mean, S = _problems(rng, 8, 12, 2, 4, 1e8)
+    J, y, L, mean, S = _random_problems(rng, 8, 12, 2, 4, 1e8)
     rows, columns = 2.0 ** rng.integers(-40, 41, 2), 2.0 ** rng.integers(-40, 41, 4)
     scaled = (
         J * rows[:, None] / columns, y * rows, L * rows[:, None],
         mean * columns, S * columns[:, None],
     )  # fmt: skip
-    before = [np.asarray(x) for x in _solve(J, y, L, mean, S)]
-    after = [np.asarray(x) for x in _solve(*scaled)]
+    before = [np.asarray(x) for x in _solve_batch(J, y, L, mean, S)]
+    after = [np.asarray(x) for x in _solve_batch(*scaled)]
     sd = np.linalg.norm(before[1], axis=2)
     moved = np.abs(after[0] / columns - before[0]) / sd
     widened = np.abs(after[1] / columns[:, None] - before[1]) / sd[:, :, None]
@@ -168,7 +170,7 @@ def degenerate(rng: Rng) -> float:
 def _departure(problems: Problems) -> float:
     """Change of mean and variance along null directions, in prior sd."""
     worst = 0.0
-    solved = [np.asarray(x) for x in _solve(*problems)]
+    solved = [np.asarray(x) for x in _solve_batch(*problems)]
     if not all(np.isfinite(x).all() for x in solved):
         return math.inf
     mean, scale, _ = solved
@@ -185,7 +187,7 @@ def _departure(problems: Problems) -> float:
 
 
 @in_float64
-def bounds(rng: Rng) -> float:
+def bounds_round_trip(rng: Rng) -> float:
     """Error of the round trip through the bounds; infinite if one is left."""
     worst = 0.0
     for system in (Furuta(), CartPole(), TwoLink()):
@@ -292,7 +294,7 @@ def energy(rng: Rng) -> float:
 
 
 @in_float64
-def calibration(rng: Rng) -> float:
+def posterior_calibration(rng: Rng) -> float:
     """-log10 p of the squared whitened errors of 1,000 linear problems."""
     count, p = 1000, 3
     J = rng.standard_normal((count, 8, 1, p))
@@ -300,7 +302,7 @@ def calibration(rng: Rng) -> float:
     mean = rng.standard_normal((count, p))
     tt = mean + np.einsum("cij,cj->ci", S, rng.standard_normal((count, p)))
     y = np.einsum("cndp,cp->cnd", J, tt) + rng.standard_normal((count, 8, 1))
-    found, scale, _ = (np.asarray(x) for x in _solve(J, y, ones, mean, S))
+    found, scale, _ = (np.asarray(x) for x in _solve_batch(J, y, ones, mean, S))
     z = np.linalg.solve(scale, (tt - found)[:, :, None])
     return _surprise(float(np.sum(z**2)), count * p)
 
@@ -326,7 +328,7 @@ def arm(rng: Rng) -> float:
         z.append(np.asarray((truth - mean) / sd))
     worst = 1.0
     for level in LEVELS:
-        for share in covered(np.asarray(z), level):
+        for share in coverage(np.asarray(z), level):
             count = round(float(share) * ARMS)
             worst = min(worst, scipy.stats.binomtest(count, ARMS, level / 100).pvalue)
     return -math.log10(worst)

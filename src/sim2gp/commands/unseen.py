@@ -10,21 +10,21 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from sim2gp.commands.folds import Fold, fold, held_out
+from sim2gp.commands.folds import Fold, fit_fold, split_held_out
 from sim2gp.data.grid import CURVE, Grid, steps_of
 from sim2gp.data.logs import Log
 from sim2gp.data.windows import Windows
 from sim2gp.errors import DeadParameters, NotConverged, NotFinite
 from sim2gp.identification.forecasts.baselines import forecast_sentence
-from sim2gp.identification.forecasts.calibration import calibration
+from sim2gp.identification.forecasts.calibration import calibrate_forecasts
 from sim2gp.identification.forecasts.prediction import (
     TRACE,
     Picture,
+    channel_units,
     channels,
-    drawn,
-    scores,
+    forecast_scores,
+    forecast_traces,
     trace_arrays,
-    units,
 )
 from sim2gp.inference.estimate import Estimate
 from sim2gp.project import Project
@@ -41,7 +41,7 @@ class Unseen(NamedTuple):
     picture: Picture
 
 
-def unseen(
+def forecast_unseen(
     project: Project,
     logs: Sequence[Log],
     windows: Windows,
@@ -54,22 +54,24 @@ def unseen(
     It begins where the ``whole`` logs put constants, starts and noise, and has as many
     starts to choose from as that fit: the two share their compilation.
     """
-    part = held_out(logs, windows, places, grid)
+    part = split_held_out(logs, windows, places, grid)
     if part is None:
         return _none("too little was recorded to hold some of it out.")
     horizon = _horizon(grid, part.test)
     try:
         key = jax.random.key(0)  # of starts that it does not draw
-        found = fold(
+        found = fit_fold(
             project, windows, grid, part, horizon, key=key, starts=2, warm_start=whole
         )
     except (NotConverged, NotFinite, DeadParameters) as error:
         return _none(f"a fit without {part.words} failed ({error}).")
     names = channels(project.system, windows)
-    summary, arrays = scores(found.judged, names, logs, horizon)
-    summary["calibration"], shares = calibration(found.judged, names, logs, horizon)
+    summary, arrays = forecast_scores(found.judged, names, logs, horizon)
+    summary["calibration"], shares = calibrate_forecasts(
+        found.judged, names, logs, horizon
+    )
     del summary["tables"]
-    picture = drawn(found.forecast, found.band, found.tested)
+    picture = forecast_traces(found.forecast, found.band, found.tested)
     traces = trace_arrays(picture, found.tested, logs, names, PREFIX)
     summary["left_out"] = part.words
     summary["headline"] = forecast_sentence(
@@ -77,7 +79,7 @@ def unseen(
         "root mean square errors",
         summary["open_loop_rmse"],
         summary["trivial"],
-        units(project.system),
+        channel_units(project.system),
     )
     summary["text"] = (
         f"The parameters were fitted once more without {part.words}, which that fit "

@@ -60,22 +60,26 @@ def _even(log: Log) -> tuple[float, np.ndarray, float]:
 
 def clock_lines(logs: Sequence[Log], system: AbstractSystem) -> list[str]:
     """How rows of the logs and the simulator's own steps go together, in words."""
-    return [line for line, _ in _lines(logs, system)]
+    return [line for line, _ in _clock_lines_of_logs(logs, system)]
 
 
 def clock_warnings(logs: Sequence[Log], system: AbstractSystem) -> list[str]:
     """Those of `clock_lines` where the steps or the stamps are not as given (W155)."""
-    return [f"W155 {line}" for line, other in _lines(logs, system) if other]
+    return [
+        f"W155 {line}" for line, other in _clock_lines_of_logs(logs, system) if other
+    ]
 
 
-def _lines(logs: Sequence[Log], system: AbstractSystem) -> list[tuple[str, bool]]:
+def _clock_lines_of_logs(
+    logs: Sequence[Log], system: AbstractSystem
+) -> list[tuple[str, bool]]:
     own = system.own_step
     if own is None:
         return []
-    return list(dict.fromkeys(_line(log, own) for log in logs if len(log) > 2))
+    return list(dict.fromkeys(_clock_line(log, own) for log in logs if len(log) > 2))
 
 
-def _line(log: Log, own: float) -> tuple[str, bool]:
+def _clock_line(log: Log, own: float) -> tuple[str, bool]:
     """The words, and whether something is not as the files have it."""
     period, _, away = _even(log)
     step = step_between(period, own)

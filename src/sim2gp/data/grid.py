@@ -69,7 +69,7 @@ def evaluation_windows(
     for k, log in enumerate(logs):
         y, valid = on_grid(log, measured)
         first = _starts(valid)
-        starts, centred = _states(y, states, measured)
+        starts, centred = _start_states(y, states, measured)
         rows = first[:, None] + np.arange(L)[None]
         inside = rows < len(y)
         rows = np.minimum(rows, len(y) - 1)
@@ -132,12 +132,12 @@ def on_grid(
     return np.stack(y, axis=1), np.stack(bad, axis=1) < 1e-9
 
 
-def parabola(age: Float[np.ndarray, " L"]) -> Float[np.ndarray, "3 L"]:
+def parabola_weights(age: Float[np.ndarray, " L"]) -> Float[np.ndarray, "3 L"]:
     """Weights of samples at ``age``: value, slope and curvature/2 of their parabola."""
     return np.asarray(np.linalg.pinv(np.vander(age, ORDER + 1, increasing=True)))
 
 
-def slopes(
+def parabola_slopes(
     y: Float[np.ndarray, "N c"], *, causal: bool
 ) -> tuple[Float[np.ndarray, "N c"], Float[np.ndarray, "N c"]]:
     """Value and slope of the parabola through 25 samples; NaN where some are missing.
@@ -146,7 +146,7 @@ def slopes(
     """
     half = 0 if causal else SAMPLES // 2
     age = PERIOD * (np.arange(SAMPLES) - (SAMPLES - 1 - half))
-    weights = parabola(age)[:2]
+    weights = parabola_weights(age)[:2]
     value, slope = np.full_like(y, np.nan), np.full_like(y, np.nan)
     if len(y) < SAMPLES:
         return value, slope
@@ -164,11 +164,14 @@ def _starts(valid: Bool[np.ndarray, "N c"]) -> Int[np.ndarray, " W"]:
     return first[valid[past].all(axis=(1, 2))]
 
 
-def _states(
+def _start_states(
     y: Float[np.ndarray, "N c"], states: Sequence[str], measured: Sequence[str]
 ) -> tuple[Float[np.ndarray, "N n"], Float[np.ndarray, "N n"]]:
     """Every sample's state as a forecast would start, and its centred estimate."""
-    (_, causal), (value, centred) = slopes(y, causal=True), slopes(y, causal=False)
+    (_, causal), (value, centred) = (
+        parabola_slopes(y, causal=True),
+        parabola_slopes(y, causal=False),
+    )
     start = states_from(y, causal, states, measured)
     return start, states_from(value, centred, states, measured)
 

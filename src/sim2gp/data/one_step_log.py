@@ -20,7 +20,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from sim2gp.data.grid import PERIOD, SAMPLES, Grid, on_grid, parabola, states_from
+from sim2gp.data.grid import (
+    PERIOD,
+    SAMPLES,
+    Grid,
+    on_grid,
+    parabola_weights,
+    states_from,
+)
 from sim2gp.data.logs import Log
 from sim2gp.data.split_log import inputs_since, knots_of, measured_states
 from sim2gp.data.transitions import Transitions
@@ -101,7 +108,7 @@ def samples_of(logs: Sequence[Log], stepper: AbstractSystem, period: float) -> S
     span = np.full(y.shape[:2], PERIOD)
     span[:, 0] = 0.0
     local = _parabolas(y)
-    start = _state(local, -PERIOD * half, names, measured)
+    start = _parabola_state(local, -PERIOD * half, names, measured)
     windows = Windows(
         span,
         knots,
@@ -116,7 +123,7 @@ def samples_of(logs: Sequence[Log], stepper: AbstractSystem, period: float) -> S
     )
     return Samples(
         windows,
-        _state(local, 0.0, names, measured),
+        _parabola_state(local, 0.0, names, measured),
         which,
         first,
         held,
@@ -137,15 +144,15 @@ def smoothed_states(
     start, y, half = w.start, np.asarray(w.y), SAMPLES // 2
     exact = jax.tree.map(jnp.asarray, w)
     for _ in range(PASSES):
-        path = np.asarray(_simulated(system, tt, exact, jnp.asarray(start)))
+        path = np.asarray(_simulate_windows(system, tt, exact, jnp.asarray(start)))
         left = _parabolas(y - path[..., list(w.outputs)])
-        start = start + _state(left, -PERIOD * half, names, measured)
-        states = path[:, half] + _state(left, 0.0, names, measured)
+        start = start + _parabola_state(left, -PERIOD * half, names, measured)
+        states = path[:, half] + _parabola_state(left, 0.0, names, measured)
     return np.asarray(states)
 
 
 @eqx.filter_jit
-def _simulated(
+def _simulate_windows(
     system: AbstractSystem, tt: Array, windows: Windows, start: Float[Array, "N n"]
 ) -> Float[Array, "N L n"]:
     params = system.record(system.parameters.values(tt))
@@ -172,10 +179,10 @@ def _parabolas(y: Float[np.ndarray, "N L c"]) -> Float[np.ndarray, "N 3 c"]:
     """Coefficients of the parabola through each window, time from its middle."""
     half = SAMPLES // 2
     age = PERIOD * np.arange(-half, half + 1)
-    return np.asarray(np.einsum("kl,nlc->nkc", parabola(age), y))
+    return np.asarray(np.einsum("kl,nlc->nkc", parabola_weights(age), y))
 
 
-def _state(
+def _parabola_state(
     local: Float[np.ndarray, "N 3 c"],
     t: float,
     names: Sequence[str],

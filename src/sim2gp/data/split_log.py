@@ -122,7 +122,7 @@ def assemble(
     held = [knots_of(log, actions, system.longest_delay) for log in logs]
     guesses = [_local_parabolas(log, measured, start) for log in logs]
     twice = [_local_parabolas(log, measured, start, 2.0) for log in logs]
-    steps = [_steps(log.time, system.window_substep) for log in logs]
+    steps = [_integration_steps(log.time, system.window_substep) for log in logs]
     L = max(int(steps[k][0][j - 1] - steps[k][0][i]) + 1 for k, i, j in pieces)
     spans = [
         (k, logs[k].time[i], logs[k].time[j - 1] - logs[k].time[i])
@@ -215,7 +215,7 @@ def _has_data(log: Log, measured: Sequence[str], piece: tuple[int, int, int]) ->
     return bool(mask[piece[1] : piece[2]].any()) and piece[2] - piece[1] > 1
 
 
-def _steps(
+def _integration_steps(
     time: Float[np.ndarray, " N"], longest: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Integration steps of at most ``longest`` seconds that meet every stamp.
@@ -259,7 +259,7 @@ def _local_parabolas(
         )
         value, slope = np.zeros(len(measured)), np.zeros(len(measured))
         for c in range(len(measured)):
-            value[c], slope[c] = parabola(
+            value[c], slope[c] = fit_parabola(
                 t[near], values[near, c], mask[near, c], values[i, c]
             )
             if start == "causal" and mask[i, c]:
@@ -269,7 +269,7 @@ def _local_parabolas(
     return at
 
 
-def parabola(
+def fit_parabola(
     t: Float[np.ndarray, " N"],
     y: Float[np.ndarray, " N"],
     valid: Bool[np.ndarray, " N"],

@@ -23,7 +23,7 @@ from sim2gp.systems.simulate import blur_of, inputs_by_delay, inputs_of
 from sim2gp.types import AnyArray
 
 
-class Asked(NamedTuple):
+class SlopeInputs(NamedTuple):
     """Windows at ``x = 0``, and how they move with it.
 
     Virtual constants ``tt`` (of all windows, or of each) and start states, with their
@@ -39,7 +39,7 @@ class Asked(NamedTuple):
     @classmethod
     def at(
         cls, tt: Float[np.ndarray, "*W p"], start: Float[np.ndarray, "W n"]
-    ) -> "Asked":
+    ) -> "SlopeInputs":
         """Windows that do not move."""
         none = np.zeros((tt.shape[-1], 0)), np.zeros((start.shape[1], 0))
         return cls(tt, start, *none)
@@ -50,12 +50,12 @@ def about(
     start: Float[AnyArray, "W n"],
     scale: Float[AnyArray, "p p"],
     start_sd: Float[AnyArray, "*W n"],
-) -> Asked:
+) -> SlopeInputs:
     """Windows at ``start + start_sd x[:n]`` and ``tt + scale x[n:]``."""
     tt, start, scale, sd = map(np.asarray, (tt, start, scale, start_sd))
     n, p = start.shape[1], tt.size
     tt_by = np.concatenate([np.zeros((p, n)), scale], axis=1)
-    return Asked(tt, start, tt_by, sd[..., None] * np.eye(n, n + p))
+    return SlopeInputs(tt, start, tt_by, sd[..., None] * np.eye(n, n + p))
 
 
 class HostRun:
@@ -72,11 +72,11 @@ class HostRun:
         simulator: AbstractSimulator,
         system: AbstractSystem,
         windows: Pieces,
-        asked: Asked,
+        asked: SlopeInputs,
     ) -> None:
         names = names_on_host(simulator, system)
         given, by = _given_by(names, system, windows, asked)
-        self.inputs, by_delay = _inputs(system, windows, given.delays)
+        self.inputs, by_delay = _delayed_inputs(system, windows, given.delays)
         inputs, of_inputs = self.inputs, by_delay[..., None] * by.delays[:, None]
         if asked.added_by is not None:
             of_inputs += asked.added_by
@@ -101,7 +101,7 @@ class HostRun:
 
 
 def _given_by(
-    names: OnHost, system: AbstractSystem, windows: Pieces, asked: Asked
+    names: OnHost, system: AbstractSystem, windows: Pieces, asked: SlopeInputs
 ) -> tuple[OnHost, OnHost]:
     """The constants of each window that have these names, and their slopes."""
     which = np.zeros(len(asked.start), int)
@@ -120,7 +120,7 @@ def _given_by(
     return given, OnHost(*(J @ asked.tt_by for J in by_tt))
 
 
-def _inputs(
+def _delayed_inputs(
     system: AbstractSystem, windows: Pieces, late: Float[np.ndarray, "W m"]
 ) -> tuple[Float[np.ndarray, "W L m"], Float[np.ndarray, "W L m"]]:
     """The inputs that arrive, and their derivatives in their delays."""

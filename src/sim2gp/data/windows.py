@@ -68,7 +68,7 @@ class Windows(Pieces):
         return eqx.tree_at(lambda w: w.floor, jax.tree.map(lambda _: 0, self), None)
 
 
-def motion(windows: Windows) -> Float[np.ndarray, "W c"]:
+def channel_motion(windows: Windows) -> Float[np.ndarray, "W c"]:
     """Mean square of how far each channel went within a window."""
     y, mask = np.asarray(windows.y), np.asarray(windows.mask)
     away = np.where(mask, (y - y[:, :1]) ** 2, 0.0)

@@ -180,7 +180,7 @@ def linearise(
     e, tt = jnp.asarray(fitted.nuisances), jnp.asarray(tt, float)
     if likelihood.on_host:
         run = likelihood.run(*map(np.asarray, (tt, e, fitted.prior.scale)))
-        return _rows(likelihood.windows, run)
+        return _host_rows(likelihood.windows, run)
     return _linearise(likelihood, e, tt, fitted.prior.scale)
 
 
@@ -194,7 +194,7 @@ def compile_linearise(system: AbstractSystem, windows: Windows) -> None:
     _linearise.compile_for(likelihood, e, prior.mean, prior.scale)
 
 
-def _rows(windows: Windows, run: HostRun) -> Linearised:
+def _host_rows(windows: Windows, run: HostRun) -> Linearised:
     """Rows of windows that were simulated on the host; the start's columns go last."""
     J = run.slopes()[:, :, list(windows.outputs)]
     J = np.roll(np.where(windows.mask[..., None], J, 0.0), -run.states.shape[-1], -1)

@@ -2,29 +2,42 @@
 
 from sim2gp.experiment_design.experiment import (
     Experiment,
-    after,
     information,
+    posterior_scale,
     trajectory,
 )
-from sim2gp.experiment_design.goals import AbstractGoal, Everything, Named, Prediction
+from sim2gp.experiment_design.goals import (
+    AbstractGoal,
+    DOptimal,
+    SubsetDOptimal,
+    VOptimal,
+)
 from sim2gp.experiment_design.limits import LimitBox
-from sim2gp.experiment_design.search import Designed, design, prediction_rows
-from sim2gp.experiment_design.signals import AbstractSignal, Free, Multisine
+from sim2gp.experiment_design.search import (
+    DesignResult,
+    optimise_commands,
+    prediction_rows,
+)
+from sim2gp.experiment_design.signals import (
+    AbstractCommandSignal,
+    FreeCommands,
+    MultisineCommands,
+)
 
 __all__ = [
+    "AbstractCommandSignal",
     "AbstractGoal",
-    "AbstractSignal",
-    "Designed",
-    "Everything",
+    "DOptimal",
+    "DesignResult",
     "Experiment",
-    "Free",
+    "FreeCommands",
     "LimitBox",
-    "Multisine",
-    "Named",
-    "Prediction",
-    "after",
-    "design",
+    "MultisineCommands",
+    "SubsetDOptimal",
+    "VOptimal",
     "information",
+    "optimise_commands",
+    "posterior_scale",
     "prediction_rows",
     "trajectory",
 ]

@@ -20,15 +20,15 @@ from jaxtyping import Array, Float
 from sim2gp.compilation import compile_async
 from sim2gp.experiment_design.experiment import (
     Experiment,
-    after,
     information,
+    posterior_scale,
     sensitivity_at,
     trajectory,
 )
 from sim2gp.experiment_design.goals import AbstractGoal
-from sim2gp.experiment_design.limits import LimitBox, all_excess, excess, narrowed
-from sim2gp.experiment_design.signals import AbstractSignal
-from sim2gp.experiment_design.ways import Ways
+from sim2gp.experiment_design.limits import LimitBox, all_excess, excess, narrow_limits
+from sim2gp.experiment_design.signals import AbstractCommandSignal
+from sim2gp.experiment_design.ways import SearchPrograms
 from sim2gp.models.training import adamw, descend
 from sim2gp.types import Key, single
 
@@ -44,31 +44,31 @@ CHEAP, COST = 2.0, 15.0  # at first and at last, for a half of the box, in nats 
 CHECKED = 1000  # draws that the result is held against
 
 
-def ways(
+def compiled_programs(
     experiment: Experiment,
-    signal: AbstractSignal,
+    signal: AbstractCommandSignal,
     goal: AbstractGoal,
     limits: LimitBox,
     informed: Float[Array, "D p"],
     trials: Float[Array, "N p"],
     held_out: Float[Array, "K p"],
-) -> Ways:
+) -> SearchPrograms:
     """Programs of JAX; they begin to be compiled here."""
     nothing = jnp.zeros((experiment.steps, limits.low.size))
     rough, coarse = _coarser(experiment, signal)
     improve = _climber(rough, coarse, goal, limits, informed, trials)
-    _checked.compile_for(experiment, limits, nothing, held_out)
+    _plausible_states.compile_for(experiment, limits, nothing, held_out)
     _worth.compile_for(experiment, goal, informed, nothing)
-    return Ways(
+    return SearchPrograms(
         improve,
-        lambda U: _checked(experiment, limits, U, held_out),
+        lambda U: _plausible_states(experiment, limits, U, held_out),
         lambda U: _worth(experiment, goal, informed, U),
     )
 
 
 def _coarser(
-    experiment: Experiment, signal: AbstractSignal
-) -> tuple[Experiment, AbstractSignal]:
+    experiment: Experiment, signal: AbstractCommandSignal
+) -> tuple[Experiment, AbstractCommandSignal]:
     """As long and as telling, with periods of `GRID`: for a search, long enough."""
     k = math.floor(GRID / experiment.period + 1e-9)
     k = max(1, min(k, experiment.steps // 2))
@@ -86,7 +86,7 @@ def _coarser(
 
 def _climber(
     experiment: Experiment,
-    signal: AbstractSignal,
+    signal: AbstractCommandSignal,
     goal: AbstractGoal,
     limits: LimitBox,
     draws: Float[Array, "D p"],
@@ -96,12 +96,14 @@ def _climber(
     experiment, goal, limits, draws, trials = single(
         (experiment, goal, limits, draws, trials)
     )
-    inner, inputs = narrowed(limits), limits.low.size
+    inner, inputs = narrow_limits(limits), limits.low.size
     costs = goal.directions(experiment.belief.scale) * np.geomspace(CHEAP, COST, BLOCKS)
     total = jnp.asarray(BLOCK * BLOCKS)
 
     def beyond(C: Array) -> Array:
-        return _checked(experiment, inner, signal.commands(C, limits), trials)[1]
+        return _plausible_states(experiment, inner, signal.commands(C, limits), trials)[
+            1
+        ]
 
     def block(C: Array, state: optax.OptState, guards: Array, i: int) -> Any:
         cost, at = jnp.asarray(costs[i], jnp.float32), jnp.asarray(BLOCK * i)
@@ -141,7 +143,7 @@ def _climber(
 
 @compile_async
 def _climb(
-    signal: AbstractSignal,
+    signal: AbstractCommandSignal,
     experiment: Experiment,
     goal: AbstractGoal,
     limits: LimitBox,
@@ -154,13 +156,13 @@ def _climb(
     total: Array,
 ) -> tuple[Float[Array, "k m"], optax.OptState]:
     """Steps of Adam on the worth at one draw after the other, less what guards pay."""
-    beyond = _beyond_of(experiment, narrowed(limits))
+    beyond = _beyond_of(experiment, narrow_limits(limits))
 
     near = jax.vmap(experiment.plausible.at)(guards)
 
     def loss(C: Float[Array, "k m"], z: Float[Array, " p"]) -> Array:
         U, own = signal.commands(C, limits), experiment.belief.at(z)
-        states = _states(experiment, U, jnp.concatenate([own[None], near]))
+        states = _trajectories(experiment, U, jnp.concatenate([own[None], near]))
         worth, _ = _worth_at(experiment, goal, z, U, states[0])
         return cost * beyond(states[1:]) - worth
 
@@ -192,7 +194,7 @@ def _worth_at(
     experiment: Experiment, goal: AbstractGoal, z: Array, U: Array, states: Array
 ) -> tuple[Array, Array]:
     """Nats of the goal at one machine, and the scale of the belief after it."""
-    scale = after(experiment.belief, information(experiment, z, U, states))
+    scale = posterior_scale(experiment.belief, information(experiment, z, U, states))
     return goal.nats(experiment.belief.scale, scale), scale
 
 
@@ -211,17 +213,17 @@ def _worth(
     return jnp.mean(nats), scales[0], middle
 
 
-def _states(experiment: Experiment, U: Array, machines: Array) -> Array:
+def _trajectories(experiment: Experiment, U: Array, machines: Array) -> Array:
     """Of every machine, at its virtual values."""
     return jax.vmap(lambda tt: trajectory(experiment, tt, U))(machines)
 
 
 @compile_async
-def _checked(
+def _plausible_states(
     experiment: Experiment, limits: LimitBox, U: Array, draws: Array
 ) -> tuple[Array, Array]:
     """Of plausible machines, and how far each leaves the limits; infinite when lost."""
-    states = _states(experiment, U, jax.vmap(experiment.plausible.at)(draws))
+    states = _trajectories(experiment, U, jax.vmap(experiment.plausible.at)(draws))
     return states, all_excess(limits, states)
 
 

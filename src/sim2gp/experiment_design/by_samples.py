@@ -13,18 +13,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sim2gp.data.window_slopes import Asked, HostRun, about
+from sim2gp.data.window_slopes import HostRun, SlopeInputs, about
 from sim2gp.data.windows import Pieces
 from sim2gp.experiment_design.experiment import (
     Experiment,
     about_constants,
-    after,
     piece,
+    posterior_scale,
 )
 from sim2gp.experiment_design.goals import AbstractGoal
-from sim2gp.experiment_design.limits import LimitBox, all_excess, narrowed
-from sim2gp.experiment_design.signals import AbstractSignal
-from sim2gp.experiment_design.ways import Ways
+from sim2gp.experiment_design.limits import LimitBox, all_excess, narrow_limits
+from sim2gp.experiment_design.signals import AbstractCommandSignal
+from sim2gp.experiment_design.ways import SearchPrograms
 from sim2gp.systems.host import simulator_of
 from sim2gp.types import Key
 
@@ -38,20 +38,20 @@ CHEAP, COST = 10.0, 100.0  # of a half of the box, for each direction asked abou
 States = Float[np.ndarray, "K times n"]
 
 
-def ways(
+def host_programs(
     experiment: Experiment,
-    signal: AbstractSignal,
+    signal: AbstractCommandSignal,
     goal: AbstractGoal,
     limits: LimitBox,
     informed: Float[Array, "D p"],
     trials: Float[Array, "N p"],
     held_out: Float[Array, "K p"],
-) -> Ways:
+) -> SearchPrograms:
     """Loops of the host around its simulator."""
     draws, guards, others = map(np.asarray, (informed, trials, held_out))
-    return Ways(
-        sampled(experiment, signal, goal, limits, draws, guards),
-        lambda U: checked(experiment, limits, np.asarray(U), others),
+    return SearchPrograms(
+        sampling_search(experiment, signal, goal, limits, draws, guards),
+        lambda U: states_and_excess(experiment, limits, np.asarray(U), others),
         lambda U: worth(experiment, goal, draws, np.asarray(U)),
     )
 
@@ -65,7 +65,7 @@ def sensitivity(
     first = np.arange(0, experiment.steps - periods + 1, periods)
     n = states.shape[1]
     asked = about(tt, states[first], np.eye(tt.size), np.zeros(n))
-    J = _rows(experiment, asked, U, first, periods)
+    J = _sensitivity_rows(experiment, asked, U, first, periods)
     return jnp.asarray(J[:, -1, :, n:].reshape(-1, tt.size))
 
 
@@ -74,12 +74,12 @@ def states_of(
 ) -> States:
     """Those at the beginning and after each period, of machines at virtual values."""
     first, start = np.zeros(len(machines), int), np.asarray(experiment.start)
-    asked = Asked.at(machines, np.tile(start, (len(machines), 1)))
-    run = _run(experiment, asked, U, first, experiment.steps)
+    asked = SlopeInputs.at(machines, np.tile(start, (len(machines), 1)))
+    run = _run_pieces(experiment, asked, U, first, experiment.steps)
     return run.states[:, :: experiment.substeps]
 
 
-def checked(
+def states_and_excess(
     experiment: Experiment, limits: LimitBox, U: np.ndarray, draws: np.ndarray
 ) -> tuple[States, Float[np.ndarray, " K"]]:
     """Of plausible machines, and how far each leaves the limits; infinite when lost."""
@@ -100,9 +100,9 @@ def worth_at(
     first = np.arange(0, experiment.steps - count + 2, count)
     scale, n = experiment.belief.scale, states.shape[1]
     asked = about(tt, states[first], scale, experiment.start_sd)
-    J = _rows(experiment, asked, U, first, count - 1)
-    A = _about(jnp.asarray(J.reshape(len(first), -1, n + p)), n)
-    scale = after(experiment.belief, A.reshape(-1, p))
+    J = _sensitivity_rows(experiment, asked, U, first, count - 1)
+    A = _about_constants(jnp.asarray(J.reshape(len(first), -1, n + p)), n)
+    scale = posterior_scale(experiment.belief, A.reshape(-1, p))
     return float(goal.nats(experiment.belief.scale, scale)), scale
 
 
@@ -115,21 +115,21 @@ def worth(
     return float(np.mean([nats for nats, _ in found])), found[0][1], middle
 
 
-def sampled(
+def sampling_search(
     experiment: Experiment,
-    signal: AbstractSignal,
+    signal: AbstractCommandSignal,
     goal: AbstractGoal,
     limits: LimitBox,
     draws: Float[np.ndarray, "D p"],
     guards: Float[np.ndarray, "G p"],
 ) -> Callable[[Key], Float[np.ndarray, "k m"]]:
     """From random motions to a better one, in rounds of samples."""
-    inner, inputs = narrowed(limits), limits.low.size
+    inner, inputs = narrow_limits(limits), limits.low.size
     costs = goal.directions(experiment.belief.scale) * np.geomspace(CHEAP, COST, ROUNDS)
 
     def value(C: np.ndarray, z: np.ndarray, cost: float) -> float:
         U = np.asarray(commands(C))
-        over = np.maximum(checked(experiment, inner, U, guards)[1], 0.0)
+        over = np.maximum(states_and_excess(experiment, inner, U, guards)[1], 0.0)
         if not np.isfinite(over).all():
             return -np.inf
         return worth_at(experiment, goal, z, U)[0] - cost * float(np.mean(over))
@@ -158,22 +158,22 @@ def sampled(
     return improved
 
 
-def _rows(
+def _sensitivity_rows(
     experiment: Experiment,
-    asked: Asked,
+    asked: SlopeInputs,
     U: np.ndarray,
     first: Int[np.ndarray, " W"],
     periods: int,
 ) -> Float[np.ndarray, "W times c k"]:
     """Slopes of what is measured of pieces that begin at states, in noise sd."""
-    J = _run(experiment, asked, U, first, periods).slopes()
+    J = _run_pieces(experiment, asked, U, first, periods).slopes()
     J = J[:, :: experiment.substeps, list(experiment.outputs)]
     return np.asarray(J / np.asarray(experiment.noise)[:, None])
 
 
-def _run(
+def _run_pieces(
     experiment: Experiment,
-    asked: Asked,
+    asked: SlopeInputs,
     U: np.ndarray,
     first: Int[np.ndarray, " W"],
     periods: int,
@@ -192,7 +192,7 @@ def _pieces(experiment: Experiment, U: Array, first: Array, periods: int) -> Pie
 
 
 @eqx.filter_jit
-def _about(J: Float[Array, "W N q"], n: int) -> Float[Array, "W rows p"]:
+def _about_constants(J: Float[Array, "W N q"], n: int) -> Float[Array, "W rows p"]:
     return jax.vmap(lambda one: about_constants(one, n))(J)
 
 

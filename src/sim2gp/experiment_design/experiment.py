@@ -169,7 +169,7 @@ def sensitivity_at(
     return jax.vmap(one)(first).reshape(-1, tt.size)
 
 
-def after(belief: Gaussian, A: Float[Array, "rows p"]) -> Float[Array, "p p"]:
+def posterior_scale(belief: Gaussian, A: Float[Array, "rows p"]) -> Float[Array, "p p"]:
     """Square root of the covariance once the experiment was made."""
     eye = jnp.eye(A.shape[1], dtype=A.dtype)
     return over(belief.scale, triangular(jnp.concatenate([A, eye])))

@@ -35,7 +35,7 @@ class AbstractGoal(eqx.Module):
         return self.uncertainty(before) - self.uncertainty(after)
 
 
-class Everything(AbstractGoal):
+class DOptimal(AbstractGoal):
     """All constants alike: the volume of the whole belief (D-optimality)."""
 
     def uncertainty(self, scale: Scale) -> Scalar:
@@ -45,7 +45,7 @@ class Everything(AbstractGoal):
         return len(scale)
 
 
-class Named(AbstractGoal):
+class SubsetDOptimal(AbstractGoal):
     """Some constants, whatever becomes of the others: their marginal's volume."""
 
     index: tuple[int, ...] = eqx.field(static=True)
@@ -58,7 +58,7 @@ class Named(AbstractGoal):
         return len(self.index)
 
 
-class Prediction(AbstractGoal):
+class VOptimal(AbstractGoal):
     """What a prediction depends on: its mean variance, each row in its own unit."""
 
     rows: Float[Array, "k p"]

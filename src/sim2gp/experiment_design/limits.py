@@ -132,7 +132,7 @@ def all_excess(limits: LimitBox, states: Float[Array, "K T n"]) -> Float[Array, 
     return jnp.where(jnp.isfinite(beyond), beyond, jnp.inf)
 
 
-def narrowed(limits: LimitBox) -> LimitBox:
+def narrow_limits(limits: LimitBox) -> LimitBox:
     """With a little of the states' box kept free at each end."""
     low, high = limits.state_low, limits.state_high
     off = 0.5 * MARGIN * jnp.where(jnp.isfinite(high - low), high - low, 0.0)
@@ -140,7 +140,7 @@ def narrowed(limits: LimitBox) -> LimitBox:
     return eqx.tree_at(lambda l: (l.state_low, l.state_high), limits, box)
 
 
-def kept(
+def clip_commands(
     limits: LimitBox, U: Float[Array, "T m"], period: float
 ) -> Float[Array, "T m"]:
     """The nearest commands that a machine at rest may be given, one after the other."""

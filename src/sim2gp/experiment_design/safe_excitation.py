@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from sim2gp.experiment_design import LimitBox, Multisine
+from sim2gp.experiment_design import LimitBox, MultisineCommands
 from sim2gp.experiment_design.limits import input_ranges, servo_rates
 from sim2gp.systems import MuJoCo
 from sim2gp.systems.base import AbstractSystem
@@ -61,20 +61,22 @@ def safe_excitation(system: AbstractSystem, *, key: Key, until: float) -> Excita
         names = ", ".join(open_)
         return Excitation(f"no experiment: the model names no limits of {names}")
     home = np.where((low < 0.0) & (high > 0.0), 0.0, 0.5 * (low + high))
-    start = _start(system, home)
+    start = _rest_state(system, home)
     n = len(system.physical_states)
     none = np.full(n, np.inf)
     slow = servo_rates(system)
     rate = np.asarray([slow.get(c.name, np.inf) for c in system.actions])
     box = LimitBox(low - home, high - home, rate, -none, none)
-    signal = Multisine(PERIOD, round(SECONDS / PERIOD), tones=TONES, highest=HIGHEST)
+    signal = MultisineCommands(
+        PERIOD, round(SECONDS / PERIOD), tones=TONES, highest=HIGHEST
+    )
     U = np.asarray(signal.commands(signal.random(key, len(low)), box))
-    step, why = _step_of(system, key), ""
+    step, why = _drawn_step(system, key), ""
     for share in SHARES:
         if time.monotonic() > until:
             return Excitation("no experiment: the time was over")
         commands = home + share * U
-        states, why = _simulated(system, step, start, commands)
+        states, why = _simulate_commands(system, step, start, commands)
         why = why or _strain(system, start, commands)
         if not why:
             words = f"a sum of sines, at most {share:.0%} of the way to each limit"
@@ -82,7 +84,7 @@ def safe_excitation(system: AbstractSystem, *, key: Key, until: float) -> Excita
     return Excitation(f"no experiment: with the smallest commands tried, {why}")
 
 
-def _start(
+def _rest_state(
     system: AbstractSystem, home: Float[np.ndarray, " m"]
 ) -> Float[np.ndarray, " n"]:
     """At rest where the servos hold it; other joints at zero, or in their middle."""
@@ -99,7 +101,7 @@ def _start(
     return np.asarray(x)
 
 
-def _simulated(
+def _simulate_commands(
     system: AbstractSystem,
     step: Callable[..., Any],
     start: Float[np.ndarray, " n"],
@@ -116,13 +118,13 @@ def _simulated(
         x = step(x, np.tile(u, (len(x), 1)))
         found.append(x)
         if k % LOOK == LOOK - 1 or k == len(commands) - 1:
-            why = _leaves(system, np.stack(found[-LOOK:], axis=1))
+            why = _joint_that_leaves(system, np.stack(found[-LOOK:], axis=1))
             if why:
                 break
     return np.stack(found, axis=1), why
 
 
-def _step_of(system: AbstractSystem, key: Key) -> Callable[..., Any]:
+def _drawn_step(system: AbstractSystem, key: Key) -> Callable[..., Any]:
     """One period of all machines."""
     table, prior = system.parameters, system.parameters.prior()
     z = jax.random.normal(key, (DRAWS, prior.mean.size))
@@ -140,7 +142,9 @@ def _step_of(system: AbstractSystem, key: Key) -> Callable[..., Any]:
     return lambda x, u: np.asarray(flow(params, x, u))
 
 
-def _leaves(system: AbstractSystem, states: Float[np.ndarray, "K T n"]) -> str:
+def _joint_that_leaves(
+    system: AbstractSystem, states: Float[np.ndarray, "K T n"]
+) -> str:
     """The joint that comes too near to an end of its range; empty where none does."""
     if not np.isfinite(states).all():
         return "the simulation diverges"

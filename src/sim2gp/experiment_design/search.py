@@ -22,7 +22,7 @@ from sim2gp.experiment_design import by_gradients, by_samples
 from sim2gp.experiment_design.experiment import Experiment
 from sim2gp.experiment_design.goals import AbstractGoal
 from sim2gp.experiment_design.limits import LimitBox
-from sim2gp.experiment_design.signals import AbstractSignal, Multisine
+from sim2gp.experiment_design.signals import AbstractCommandSignal, MultisineCommands
 from sim2gp.systems.host import simulator_of
 from sim2gp.types import AnyArray, Key, in_float64
 
@@ -33,7 +33,7 @@ SMALLER = 0.97  # times the commands, where too many still do
 MILD = 0.03  # of an input's range, the sd of each tone of a random motion
 
 
-class Designed(eqx.Module):
+class DesignResult(eqx.Module):
     """Commands, and what they are expected to do and to tell.
 
     nats: of the goal, on average over draws.
@@ -54,16 +54,16 @@ class Designed(eqx.Module):
 
 
 @in_float64
-def design(
+def optimise_commands(
     experiment: Experiment,
     goal: AbstractGoal,
     limits: LimitBox,
-    signal: AbstractSignal,
+    signal: AbstractCommandSignal,
     *,
     key: Key,
     draws: int = DRAWS,
     starts: int = STARTS,
-) -> Designed:
+) -> DesignResult:
     """The best commands found.
 
     Raises `InputError` E150 where none of them keeps the limits, E148 for no draws or
@@ -84,12 +84,12 @@ def design(
     about = experiment, signal, goal, limits, informed, trials, held_out
     improve, check, told = by.ways(*about)
 
-    def one(key: Key) -> Designed:
+    def one(key: Key) -> DesignResult:
         U = signal.commands(jnp.asarray(improve(key), float), limits)
         U, states, bad = _kept(check, U)
         worth, scale, middle = told(U)
         low, high = np.quantile(np.asarray(states), [0.05, 0.95], axis=0)
-        return Designed(
+        return DesignResult(
             np.asarray(U),
             float(worth),
             np.asarray(scale),
@@ -107,9 +107,11 @@ def design(
     return best
 
 
-def _of_starts(one: Callable[[Key], Designed], key: Key, starts: int) -> list[Designed]:
+def _of_starts(
+    one: Callable[[Key], DesignResult], key: Key, starts: int
+) -> list[DesignResult]:
     """What each start ends with; E150 of the last one where none keeps the limits."""
-    found: list[Designed] = []
+    found: list[DesignResult] = []
     refused: InputError | None = None
     for i in range(starts):
         try:
@@ -148,7 +150,7 @@ def prediction_rows(
         longest = f"{experiment.period * experiment.steps:g}"
         raise error("prediction_too_long", got=f"{horizon:g} s", longest=longest)
     experiment, limits = jax.tree.map(jnp.asarray, (experiment, limits))
-    signal = Multisine(experiment.period, experiment.steps)
+    signal = MultisineCommands(experiment.period, experiment.steps)
     U = signal.commands(MILD * signal.random(key, limits.low.size), limits)
     rows: Array = _by(experiment).sensitivity(experiment, U, periods)
     return rows

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sim2gp import checks
-from sim2gp.experiment_design.limits import LimitBox, kept
+from sim2gp.experiment_design.limits import LimitBox, clip_commands
 from sim2gp.planning.coloured_noise import coloured_noise
 from sim2gp.planning.mpc import from_unit
 from sim2gp.types import Box, Key
@@ -22,7 +22,7 @@ FADE = 0.25  # s, in which a multisine comes and goes
 COLOUR = 1.0  # of free random motions: power falls as one over frequency
 
 
-class AbstractSignal(eqx.Module):
+class AbstractCommandSignal(eqx.Module):
     """A map from ``(k, m)`` coefficients in ``[-1, 1]`` to commands.
 
     Raises `InputError` E148 for a number that cannot be.
@@ -49,7 +49,7 @@ class AbstractSignal(eqx.Module):
         """Coefficients of a motion like any other, of sd 1: a search begins there."""
 
 
-class Multisine(AbstractSignal):
+class MultisineCommands(AbstractCommandSignal):
     """Sines of ``tones`` frequencies, from one cycle in all to ``highest`` (Hz)."""
 
     tones: int = eqx.field(static=True, default=12)
@@ -76,13 +76,13 @@ class Multisine(AbstractSignal):
         steepest = jnp.max(jnp.abs(jnp.diff(U, axis=0)), axis=0) / self.period
         share = jnp.maximum(jnp.max(jnp.abs(U), axis=0) / half, steepest / limits.rate)
         # The last digits: a product may round up.
-        return kept(limits, U / jnp.maximum(share, 1.0)[None], self.period)
+        return clip_commands(limits, U / jnp.maximum(share, 1.0)[None], self.period)
 
     def random(self, key: Key, inputs: int) -> Float[Array, "k m"]:
         return jax.random.normal(key, (self.coefficients, inputs))
 
 
-class Free(AbstractSignal):
+class FreeCommands(AbstractCommandSignal):
     """Straight lines between knots ``spacing`` seconds apart."""
 
     spacing: float = eqx.field(static=True, default=0.1)
@@ -100,7 +100,7 @@ class Free(AbstractSignal):
         share = jnp.asarray((at - left)[:, None], C.dtype)
         line = (1.0 - share) * C[left] + share * C[left + 1]
         box = Box(jnp.asarray(limits.low), jnp.asarray(limits.high))
-        return kept(limits, from_unit(line, box), self.period)
+        return clip_commands(limits, from_unit(line, box), self.period)
 
     def random(self, key: Key, inputs: int) -> Float[Array, "k m"]:
         none = jnp.zeros((self.coefficients, inputs))

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from sim2gp.errors import error
-from sim2gp.identification.words import digits, listed
+from sim2gp.identification.words import digits, join_names
 
 NARROWER = 0.05  # an experiment must narrow what is asked by this share
 
@@ -27,11 +27,11 @@ class Limits:
         **more: float | tuple[float, float],
     ) -> None:
         given = {**(channels or {}), **more}
-        self.boxes = {name: _pair(name, x) for name, x in given.items()}
+        self.boxes = {name: _limit_pair(name, x) for name, x in given.items()}
         self.rates = {name: float(x) for name, x in (rates or {}).items()}
 
 
-def _pair(name: str, limit: float | tuple[float, float]) -> tuple[float, float]:
+def _limit_pair(name: str, limit: float | tuple[float, float]) -> tuple[float, float]:
     """Low and high (E141 where low is not below high)."""
     low, high = (-limit, limit) if isinstance(limit, int | float) else limit
     if low < high:
@@ -40,7 +40,7 @@ def _pair(name: str, limit: float | tuple[float, float]) -> tuple[float, float]:
 
 
 @dataclass(frozen=True)
-class Asked:
+class DesignOptions:
     """What is asked of an experiment: the options of `sim2gp.design`."""
 
     seconds: float = 10.0
@@ -55,8 +55,8 @@ class Asked:
     configuration: str | None = None
 
 
-def verdict(
-    asked: Asked, expected: Mapping[str, Mapping[str, Any]], nats: float
+def experiment_verdict(
+    asked: DesignOptions, expected: Mapping[str, Mapping[str, Any]], nats: float
 ) -> tuple[bool, str]:
     """Whether it is worth the robot's time, and why.
 
@@ -69,7 +69,7 @@ def verdict(
     if not told:
         return False, (
             "Not worth running: within these limits nothing narrows "
-            f"{listed(names)} by more than {100.0 * NARROWER:.0f} %."
+            f"{join_names(names)} by more than {100.0 * NARROWER:.0f} %."
         )
     share, wide = (
         {n: 100.0 * expected[n][sd] / abs(expected[n]["mean"]) for n in told}
@@ -77,18 +77,18 @@ def verdict(
     )
     poor = [n for n in told if share[n] > asked.within]
     untold = [n for n in names if n not in told]
-    rest = f" It says next to nothing about {listed(untold)}." if untold else ""
+    rest = f" It says next to nothing about {join_names(untold)}." if untold else ""
     wider = [n for n in told if wide[n] > max(asked.within, share[n])]
     if not poor and wider:
         worst = max(wider, key=lambda n: wide[n])
         return False, (
-            f"Not worth running: the logs alone determine {listed(told)} within "
+            f"Not worth running: the logs alone determine {join_names(told)} within "
             f"{asked.within:g} % already; the model's errors keep {worst} at "
             f"{digits(wide[worst], 2)} %, which more data do not reduce.{rest}"
         )
     if not poor:
         return False, (
-            f"Not worth running: {listed(told)} known within {asked.within:g} % "
+            f"Not worth running: {join_names(told)} known within {asked.within:g} % "
             f"already.{rest}"
         )
     worst = max(poor, key=lambda n: share[n])
@@ -105,7 +105,9 @@ def verdict(
     return True, f"{text} {now} % now, should be within {after} % after.{rest}"
 
 
-def foretold(asked: Asked, ahead: Mapping[str, float], nats: float) -> tuple[bool, str]:
+def prediction_verdict(
+    asked: DesignOptions, ahead: Mapping[str, float], nats: float
+) -> tuple[bool, str]:
     """The same of a prediction, its sd in those of the sensors' noise.
 
     Nobody can see that it is better than the sensors.

@@ -8,7 +8,7 @@ from jaxtyping import Array
 from sim2gp.types import AnyArray, Key
 
 
-class Ways(NamedTuple):
+class SearchPrograms(NamedTuple):
     """Better coefficients, draws' states and excess over limits, and what is told.
 
     The last of commands: nats, the belief's scale after them, and the mean's states.

@@ -4,13 +4,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from sim2gp.data.logs import Log
-from sim2gp.identification.forecasts.prediction import recordings
+from sim2gp.identification.forecasts.prediction import recording_names
 from sim2gp.identification.words import quantity
 from sim2gp.inference.parameters import Parameters
 from sim2gp.systems import AbstractSystem, Variant
 
 
-def told(
+def configuration_entries(
     system: AbstractSystem,
     logs: Sequence[Log],
     parameters: Mapping[str, Mapping[str, Any]],
@@ -22,7 +22,7 @@ def told(
     variants, table = system.variants, system.parameters
     if not variants:
         return {}
-    sources = list(zip(recordings(logs), (log.group for log in logs), strict=True))
+    sources = list(zip(recording_names(logs), (log.group for log in logs), strict=True))
     about = {
         c.name: {
             "recordings": len({source for source, group in sources if group == i}),
@@ -34,7 +34,7 @@ def told(
     differing = {x: None for c in variants for x in (*dict(c.fixed), *c.own)}
     rows = [["recordings", *(str(entry["recordings"]) for entry in about.values())]]
     for constant in differing:
-        cells = [_cell(table, c, constant, parameters) for c in variants]
+        cells = [_configuration_cell(table, c, constant, parameters) for c in variants]
         rows.append([constant, *cells])
     listed = {
         "title": "The machine's configurations",
@@ -45,7 +45,7 @@ def told(
     return {"configurations": about, "tables": [listed]}
 
 
-def _cell(
+def _configuration_cell(
     table: Parameters,
     variant: Variant,
     constant: str,

@@ -19,13 +19,13 @@ from jaxtyping import Array, Float
 
 from sim2gp.identification.identifiability.base_parameters import base_parameters
 from sim2gp.identification.identifiability.conflicts import prior_conflicts
-from sim2gp.identification.identifiability.directions import directions
+from sim2gp.identification.identifiability.directions import describe_directions
 from sim2gp.identification.identifiability.spectrum import (
     FisherAt,
     Spectrum,
     spectrum,
 )
-from sim2gp.identification.identifiability.table import add_plain, parameter_table
+from sim2gp.identification.identifiability.table import add_plain, parameter_entries
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.parameters import Parameters
 from sim2gp.types import Key, in_float64
@@ -35,8 +35,8 @@ __all__ = [
     "Spectrum",
     "arrays",
     "base_parameters",
-    "directions",
-    "parameter_table",
+    "describe_directions",
+    "parameter_entries",
     "prior_conflicts",
     "spectrum",
     "summary",
@@ -64,13 +64,13 @@ def summary(
     """
     known = posterior if corrected is None else corrected
     spec = spectrum(parameters, prior, known, information, at=posterior.mean)
-    table = parameter_table(spec)
+    table = parameter_entries(spec)
     if corrected is not None:
         add_plain(table, parameters, posterior)
     return {
         "parameters": table,
         "rank": spec.rank,
-        "directions": directions(spec),
+        "directions": describe_directions(spec),
         "base_parameters": base_parameters(spec, fisher_at),
         "prior_conflicts": prior_conflicts(spec),
     }

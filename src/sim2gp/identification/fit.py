@@ -72,7 +72,7 @@ def fit_windows(
     about = ParameterPrior(prior, system.parameters)
     same: dict[str, Any] = {"freedom": freedom, "needed": needed, "report": report}
     same["rounds"] = NOISE_ROUNDS
-    some = _some(likelihood) if warm_start is None else None
+    some = _first_windows(likelihood) if warm_start is None else None
     if some is not None:
         part = likelihood.some(some)
         found = estimate(part, about, starts=first, until=NEAR, **same)
@@ -88,7 +88,7 @@ def fit_windows(
     return found
 
 
-def _some(likelihood: WindowsLikelihood) -> Int[np.ndarray, " w"] | None:
+def _first_windows(likelihood: WindowsLikelihood) -> Int[np.ndarray, " w"] | None:
     """Windows that a fit on the host begins with, spread over all; None for all."""
     W = len(likelihood.counts)
     count = max(LEAST, round(SHARE * W))

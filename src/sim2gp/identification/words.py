@@ -26,13 +26,13 @@ def finite_or_none(x: float) -> float | None:
     return float(x) if math.isfinite(x) else None
 
 
-def listed(names: Iterable[str]) -> str:
+def join_names(names: Iterable[str]) -> str:
     """a, b and c."""
     *head, last = names
     return f"{', '.join(head)} and {last}" if head else last
 
 
-def falling(sizes: np.ndarray) -> list[int]:
+def descending_order(sizes: np.ndarray) -> list[int]:
     """Positions by falling size; sizes equal up to rounding keep their order."""
     steps = np.round(sizes / max(float(np.max(sizes, initial=0.0)), 1e-300), 6)
     return [int(j) for j in np.argsort(-steps, kind="stable")]
@@ -44,7 +44,7 @@ def weighted_sum(weights: np.ndarray, names: Sequence[str]) -> str:
     A term that stands alone stands for itself, whatever its weight.
     """
     size = np.abs(weights)
-    order = [j for j in falling(size) if size[j] > 0.2 * size.max()]
+    order = [j for j in descending_order(size) if size[j] > 0.2 * size.max()]
     if len(order) == 1:
         return names[order[0]]
     terms = linear_sum([(float(weights[j]), names[j]) for j in order], 2)

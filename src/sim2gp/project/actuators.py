@@ -16,7 +16,7 @@ from sim2gp.errors import error
 from sim2gp.inference.parameters import Parameter
 from sim2gp.project.priors import prior
 from sim2gp.project.schema import ProjectSpec
-from sim2gp.project.source import Source
+from sim2gp.project.source import ProjectSource
 from sim2gp.project.validate import unknown
 from sim2gp.systems import AbstractSystem, with_parts
 from sim2gp.systems.actuators import neutral_actuators
@@ -24,7 +24,7 @@ from sim2gp.systems.machine import plant_of
 
 
 def with_actuators(
-    system: AbstractSystem, spec: ProjectSpec, source: Source
+    system: AbstractSystem, spec: ProjectSpec, source: ProjectSource
 ) -> AbstractSystem:
     """The machine with its actuators; what the file does not name is neutral.
 
@@ -33,7 +33,7 @@ def with_actuators(
     if not spec.actuators:
         return system
     inputs = [channel.name for channel in system.actions]
-    tables = _tables(spec, source, inputs)
+    tables = _inputs_by_table(spec, source, inputs)
     ties = {
         name: found[0]
         for pattern, found in tables.items()
@@ -59,8 +59,8 @@ def with_actuators(
     return with_parts(system, parts, stated)
 
 
-def _tables(
-    spec: ProjectSpec, source: Source, inputs: Sequence[str]
+def _inputs_by_table(
+    spec: ProjectSpec, source: ProjectSource, inputs: Sequence[str]
 ) -> dict[str, list[str]]:
     """The inputs of each table; no input has two (E145), one alone no tie (E160)."""
     tables: dict[str, list[str]] = {}

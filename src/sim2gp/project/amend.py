@@ -37,7 +37,7 @@ def addition(candidate: Candidate) -> tuple[tuple[str, ...], dict[str, Any]]:
     raise error("lag_in_project_file", got=candidate.name, channel=effect.where)
 
 
-def amended(text: str, candidate: Candidate, note: str = _NOTE) -> str:
+def amend_text(text: str, candidate: Candidate, note: str = _NOTE) -> str:
     """The text with the candidate as a free parameter (E160 where it is stated)."""
     place, entries = addition(candidate)
     document = tomlkit.parse(text)
@@ -47,10 +47,10 @@ def amended(text: str, candidate: Candidate, note: str = _NOTE) -> str:
             table.append(name, _table_in(table, note * (depth == len(place) - 1)))
         table = table[name]
         if not isinstance(table, AbstractTable):
-            raise _stated(candidate, ".".join(place[: depth + 1]), table)
+            raise _already_stated(candidate, ".".join(place[: depth + 1]), table)
     for key, value in entries.items():
         if key in table:
-            raise _stated(candidate, ".".join([*place, key]), table[key])
+            raise _already_stated(candidate, ".".join([*place, key]), table[key])
         table.append(key, value)
     return tomlkit.dumps(document)
 
@@ -65,14 +65,14 @@ def _table_in(parent: Any, note: str) -> Any:
     return table
 
 
-def _stated(candidate: Candidate, key: str, value: Any) -> InputError:
+def _already_stated(candidate: Candidate, key: str, value: Any) -> InputError:
     got = tomlkit.item(value).as_string()
     return error("stated_already", where=f"key {key}", got=got, name=candidate.name)
 
 
 def amend(path: Path, candidate: Candidate, note: str = _NOTE) -> None:
     """Add a candidate to a project file (E160 where the result is not one)."""
-    text = amended(path.read_text(encoding="utf-8"), candidate, note)
+    text = amend_text(path.read_text(encoding="utf-8"), candidate, note)
 
     def freed(found: Project) -> None:
         if candidate.name not in found.system.parameters.names:

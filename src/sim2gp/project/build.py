@@ -15,29 +15,29 @@ from sim2gp.inference.parameters import Parameter, Parameters, unknown_parameter
 from sim2gp.project import slips
 from sim2gp.project.actuators import with_actuators
 from sim2gp.project.effects import with_effects
-from sim2gp.project.priors import located, prior
+from sim2gp.project.priors import prior, with_location
 from sim2gp.project.schema import (
     ColumnSpec,
     LogSpec,
     ParameterSpec,
     ProjectSpec,
 )
-from sim2gp.project.source import Source
-from sim2gp.project.validate import unknown, words, wrong_value
+from sim2gp.project.source import ProjectSource
+from sim2gp.project.validate import describe_violation, unknown, wrong_value
 from sim2gp.systems import AbstractPlant, AbstractSystem
 from sim2gp.systems.machine import as_machine
 from sim2gp.systems.variants import AT
 
 
 def build_system(
-    spec: ProjectSpec, source: Source, kind: type[AbstractPlant]
+    spec: ProjectSpec, source: ProjectSource, kind: type[AbstractPlant]
 ) -> AbstractSystem:
     """The machine of the file, with effects and actuators (E141, E145, E160)."""
-    options = _options(spec.options, source, kind)
+    options = _class_options(spec.options, source, kind)
     try:
         plain = kind(**options)
     except InputError as caught:
-        raise located(caught, source.where("options")) from caught
+        raise with_location(caught, source.where("options")) from caught
     except (TypeError, ValueError) as caught:
         where, expected = source.where("options"), str(caught)
         got = ", ".join(f"{k} = {v}" for k, v in options.items())
@@ -45,13 +45,13 @@ def build_system(
             "options_refused", where=where, got=got, expected=expected
         ) from caught
     shared = {k: v for k, v in spec.parameters.items() if AT not in k}
-    table = _table(plain.parameters, shared, source, ("parameters",))
+    table = _parameters_with_priors(plain.parameters, shared, source, ("parameters",))
     plant: Any = kind(parameters=table, **options)
     return with_actuators(with_effects(plant, spec.effects, source), spec, source)
 
 
 def build_own(
-    spec: ProjectSpec, source: Source, system: AbstractSystem
+    spec: ProjectSpec, source: ProjectSource, system: AbstractSystem
 ) -> AbstractSystem:
     """A user's system with the file's priors, effects and actuators.
 
@@ -60,13 +60,13 @@ def build_own(
     for name in spec.options:
         raise unknown("option", name, (), source.where("options", name))
     shared = {k: v for k, v in spec.parameters.items() if AT not in k}
-    table = _table(system.parameters, shared, source, ("parameters",))
+    table = _parameters_with_priors(system.parameters, shared, source, ("parameters",))
     machine = replace(as_machine(system), parameters=table)
     return with_actuators(with_effects(machine, spec.effects, source), spec, source)
 
 
-def _options(
-    options: Mapping[str, Any], source: Source, kind: type[AbstractPlant]
+def _class_options(
+    options: Mapping[str, Any], source: ProjectSource, kind: type[AbstractPlant]
 ) -> dict[str, Any]:
     """The options that the class takes, each of its declared type."""
     hints = get_type_hints(kind.__init__)
@@ -86,16 +86,16 @@ def _options(
         try:
             out[name] = adapter.validate_python(given)
         except ValidationError as error:
-            expected = words({**error.errors()[0]})
-            fix = slips.of_value(("options", name), value, expected)
+            expected = describe_violation({**error.errors()[0]})
+            fix = slips.fix_for_value(("options", name), value, expected)
             raise wrong_value("E160", where, value, expected, fix) from error
     return out
 
 
-def _table(
+def _parameters_with_priors(
     table: Parameters,
     specs: Mapping[str, ParameterSpec | float],
-    source: Source,
+    source: ProjectSource,
     path: tuple[str, ...],
 ) -> Parameters:
     """The table with the file's priors and fixed values in place of its own."""
@@ -111,12 +111,14 @@ def _table(
             base = Parameter(name, "", "", "identity", mean=fixed[name], sd=1.0)
         else:
             known = [*table.names, *fixed]
-            raise located(unknown_parameter(name, known), where)
+            raise with_location(unknown_parameter(name, known), where)
         changes[name] = prior(stated, base, where, fixed.get(name))
     return table.replace(**changes)
 
 
-def check_names(spec: ProjectSpec, source: Source, system: AbstractSystem) -> None:
+def check_known_names(
+    spec: ProjectSpec, source: ProjectSource, system: AbstractSystem
+) -> None:
     """Every channel and parameter that the file names is the machine's."""
     states = [channel.name for channel in system.physical_states]
     inputs = [channel.name for channel in system.actions]
@@ -136,7 +138,7 @@ def check_names(spec: ProjectSpec, source: Source, system: AbstractSystem) -> No
         for name in group.fixed:
             if name not in constants:
                 where = source.where("logs", i, "fixed", name)
-                raise located(unknown_parameter(name, constants), where)
+                raise with_location(unknown_parameter(name, constants), where)
         for k, (low, high) in enumerate(group.exclude):
             where = source.where("logs", i, "exclude", k)
             _check_pair("excluded interval", low, high, where)
@@ -151,7 +153,9 @@ def check_names(spec: ProjectSpec, source: Source, system: AbstractSystem) -> No
     _check_likelihood(spec, source, states)
 
 
-def _check_likelihood(spec: ProjectSpec, source: Source, states: list[str]) -> None:
+def _check_likelihood(
+    spec: ProjectSpec, source: ProjectSource, states: list[str]
+) -> None:
     """What the file says of windows, of states, and of noise is what is fitted."""
     stated = spec.likelihood
     if stated.window == 0.0 and "start" in stated.model_fields_set:
@@ -171,7 +175,11 @@ def _check_likelihood(spec: ProjectSpec, source: Source, states: list[str]) -> N
 
 
 def _check_complete(
-    named: list[str], states: list[str], inputs: list[str], source: Source, i: int
+    named: list[str],
+    states: list[str],
+    inputs: list[str],
+    source: ProjectSource,
+    i: int,
 ) -> None:
     """Every input is known, and something is measured."""
     where = source.where("logs", i, "columns")
@@ -184,7 +192,7 @@ def _check_complete(
     raise error("no_column_for_channel", where=where, got=got, channel=lacking[0])
 
 
-def _check_clock(group: LogSpec, source: Source, i: int) -> None:
+def _check_clock(group: LogSpec, source: ProjectSource, i: int) -> None:
     """Time comes from a column or a period; rows from a period or from stamps."""
     if isinstance(group.time, ColumnSpec) and group.time.saturation is not None:
         where = source.where("logs", i, "time", "saturation")

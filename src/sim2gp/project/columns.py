@@ -23,26 +23,28 @@ Values = Float[np.ndarray, " N"]
 Words = tuple[str, ...]
 
 
-def _words(text: str) -> frozenset[str]:
+def _word_set(text: str) -> frozenset[str]:
     return frozenset(text.split())
 
 
-TIME = _words("t time timestamp timestamps stamp sec secs seconds clock")
-POSITION = _words("q pos position positions qpos angle encoder enc")
-VELOCITY = _words("v dq qd qvel vel velocity velocities dot qdot speed omega rate gyro")
-INPUT = _words(
+TIME = _word_set("t time timestamp timestamps stamp sec secs seconds clock")
+POSITION = _word_set("q pos position positions qpos angle encoder enc")
+VELOCITY = _word_set(
+    "v dq qd qvel vel velocity velocities dot qdot speed omega rate gyro"
+)
+INPUT = _word_set(
     "u a tau torque cmd command commanded con control ctrl input action act effort "
     "force voltage volt motor pwm"
 )
 #: What the only joint that slides, or the only one that turns, is called elsewhere.
 _KIND = {
-    "m": _words("x y z cart carriage slide slider trolley"),
-    "rad": _words("theta phi psi alpha beta angle pole pendulum rod hinge"),
+    "m": _word_set("x y z cart carriage slide slider trolley"),
+    "rad": _word_set("theta phi psi alpha beta angle pole pendulum rod hinge"),
 }
 #: Not the thing itself: what it should be, and what somebody made of it.
-_AIMED = _words("des desired ref reference target goal setpoint err error fric")
-_MADE = _words("filt filtered smooth smoothed est estimate estimated")
-_MEASURED = _words("meas measured actual feedback")
+_AIMED = _word_set("des desired ref reference target goal setpoint err error fric")
+_MADE = _word_set("filt filtered smooth smoothed est estimate estimated")
+_MEASURED = _word_set("meas measured actual feedback")
 _SPELT = {
     **{unit.lower(): unit for unit in UNITS if unit != "mN m"},
     "degree": "deg",
@@ -52,7 +54,7 @@ _SPELT = {
     "seconds": "s",
 }
 #: The last word of a name that can be nothing but a unit.
-_PLAIN = _words("deg degree degrees rad rpm mm cm ms us ns")
+_PLAIN = _word_set("deg degree degrees rad rpm mm cm ms us ns")
 #: Slope of a position on the integral of its velocity -> the units of both.
 _OF_SLOPE: dict[float, tuple[str | None, str | None]] = {
     1.0: (None, None),
@@ -142,7 +144,7 @@ def match(
     for c in states:
         joint = found.get(c.name.removesuffix(".velocity"))
         if joint is not None and c.name.endswith(".velocity"):
-            _pair(c, joint, found, columns, links)
+            _match_velocity(c, joint, found, columns, links)
     used = {m.column.column for m in found.values()}
     free = {k: v for k, v in columns.items() if k not in used}
     # A controller's command follows the motion, one that never changes says nothing.
@@ -156,7 +158,7 @@ def match(
     left = [k for k in free if k not in taken and moves[k] >= -0.5]
     if missing and len(left) == len(missing):
         pairs = zip(missing, left, strict=True)
-        inputs |= {c.name: _stated(c, k, "nothing else is left") for c, k in pairs}
+        inputs |= {c.name: _stated_unit(c, k, "nothing else is left") for c, k in pairs}
     elif missing:
         raise _unmatched("input", missing, free, where)
     return found | inputs
@@ -209,7 +211,7 @@ def _assigned(
     names = list(columns)
     rows, places = scipy.optimize.linear_sum_assignment(scores, maximize=True)
     return {
-        channels[i].name: _stated(channels[i], names[j], "by name")
+        channels[i].name: _stated_unit(channels[i], names[j], "by name")
         for i, j in zip(rows, places, strict=True)
         if scores[i, j] >= _ENOUGH
     }
@@ -242,7 +244,7 @@ def _of_role(words: set[str], role: frozenset[str], others: frozenset[str]) -> f
     )
 
 
-def _pair(
+def _match_velocity(
     channel: Channel,
     joint: Match,
     found: dict[str, Match],
@@ -293,7 +295,7 @@ def _pair(
         )
 
 
-def _stated(channel: Channel, name: str, why: str) -> Match:
+def _stated_unit(channel: Channel, name: str, why: str) -> Match:
     """A column in the unit that its name states, if the channel can be in it."""
     unit = unit_in(name)
     known = unit in UNITS and channel.unit in UNITS

@@ -13,17 +13,17 @@ from collections.abc import Mapping
 from sim2gp.errors import InputError, error
 from sim2gp.inference.linear_measurements import LinearMeasurement
 from sim2gp.inference.parameters import Parameter, unknown_parameter
-from sim2gp.project.priors import located, prior
+from sim2gp.project.priors import prior, with_location
 from sim2gp.project.schema import ParameterSpec, ProjectSpec
-from sim2gp.project.source import Source
+from sim2gp.project.source import ProjectSource
 from sim2gp.systems import AbstractSystem, Variant, with_variants
 from sim2gp.systems.assemble import with_measurements
 from sim2gp.systems.function_checks import names_of
 from sim2gp.systems.variants import AT
 
 
-def in_configurations(
-    spec: ProjectSpec, source: Source, system: AbstractSystem
+def with_configurations(
+    spec: ProjectSpec, source: ProjectSource, system: AbstractSystem
 ) -> AbstractSystem:
     """The machine in all configurations of the file; as it is, where there is one.
 
@@ -39,7 +39,7 @@ def in_configurations(
         for column in own_columns(spec.parameters):
             known = names_of(system.parameters)
             where = source.where("parameters", column)
-            raise located(unknown_parameter(column, known), where)
+            raise with_location(unknown_parameter(column, known), where)
         return system
     found = []
     for name, i in places.items():
@@ -54,13 +54,13 @@ def in_configurations(
                 where = source.where("logs", i, "free")
             else:
                 where = source.where("logs", i, "fixed", wrong)
-            raise located(caught, where) from caught
+            raise with_location(caught, where) from caught
     priors = _priors(spec, source, system, found)
     return with_variants(system, found, priors)
 
 
-def weighed(
-    spec: ProjectSpec, source: Source, system: AbstractSystem
+def with_linear_measurements(
+    spec: ProjectSpec, source: ProjectSource, system: AbstractSystem
 ) -> AbstractSystem:
     """The machine with the sums that the file says were measured (E142 to E160)."""
     for i, stated in enumerate(spec.weighed):
@@ -75,7 +75,7 @@ def weighed(
         try:
             system = with_measurements(system, [found])
         except InputError as caught:
-            raise located(caught, where) from caught
+            raise with_location(caught, where) from caught
     return system
 
 
@@ -86,7 +86,7 @@ def own_columns(parameters: Mapping[str, object]) -> list[str]:
 
 def _priors(
     spec: ProjectSpec,
-    source: Source,
+    source: ProjectSource,
     system: AbstractSystem,
     variants: list[Variant],
 ) -> dict[str, Parameter]:
@@ -97,7 +97,9 @@ def _priors(
     for column in own_columns(spec.parameters):
         where = source.where("parameters", column)
         if column not in columns:
-            raise located(unknown_parameter(column, [*columns, *table.names]), where)
+            raise with_location(
+                unknown_parameter(column, [*columns, *table.names]), where
+            )
         stated = spec.parameters[column]
         base = table[columns[column]]
         found = prior(stated, base, where)

@@ -16,7 +16,7 @@ import numpy as np
 
 from sim2gp.data.clock import clock_lines
 from sim2gp.data.logs import Budget, Column, Log, read_log
-from sim2gp.data.logs.formats import recordings
+from sim2gp.data.logs.formats import read_recordings
 from sim2gp.data.logs.units import UNITS
 from sim2gp.errors import InputError
 from sim2gp.identification.identifiability.selection import Selection
@@ -32,7 +32,7 @@ from sim2gp.project.project import (
 )
 from sim2gp.project.readings import (
     SURE,
-    Found,
+    BestReadings,
     Question,
     Reading,
     find_readings,
@@ -85,7 +85,7 @@ class Draft:
     system: AbstractSystem
     text: str
     columns: dict[str, Match]
-    found: Found
+    found: BestReadings
     selection: Selection | None = None
 
 
@@ -95,15 +95,15 @@ def draft_project(asked: Request) -> Draft:
     Raises `InputError` E103 where a joint or an input finds no column, E160 for an
     unknown machine, and the codes of models and logs.
     """
-    system = _machine(asked)
+    system = _find_machine(asked)
     if not asked.files:
         bare = Contents(asked.model, (), asked.out, system, asked.root)
         replace_project(asked.out, draft_text(bare), lambda _: None)
         asked.step("project file")
-        return Draft(system, draft_text(bare), {}, Found({}))
-    time_, columns, travel = _columns(asked, system)
+        return Draft(system, draft_text(bare), {}, BestReadings({}))
+    time_, columns, travel = _match_columns(asked, system)
     asked.step("columns matched; trying readings")
-    options = _options(system, columns, travel)
+    options = _reading_options(system, columns, travel)
     read = {n: _in_unit(n, m.column, options) for n, m in columns.items()}
     logs, mended = _mended_logs(asked, system, read, time_)
     question = Question(logs, options, _together(system, options))
@@ -137,7 +137,7 @@ def draft_project(asked: Request) -> Draft:
     return Draft(system, text, said, found, contents.selection)
 
 
-def _machine(asked: Request) -> AbstractSystem:
+def _find_machine(asked: Request) -> AbstractSystem:
     """A bundled machine by name, or a model by its file."""
     if asked.model in SYSTEMS:
         kind: Any = system_class(asked.model)  # concrete, and content without arguments
@@ -148,7 +148,7 @@ def _machine(asked: Request) -> AbstractSystem:
     raise unknown_system(asked.model, "the command line")
 
 
-def _columns(
+def _match_columns(
     asked: Request, system: AbstractSystem
 ) -> tuple[Match | None, dict[str, Match], dict[str, float]]:
     """The column of time, where the format needs one, and those of the channels.
@@ -157,7 +157,7 @@ def _columns(
     """
     file, budget = asked.files[0], asked.budget
     period = asked.period
-    tables = recordings(file, None, period=period, budget=budget)[0].tables
+    tables = read_recordings(file, None, period=period, budget=budget)[0].tables
     main = max(tables, key=lambda t: len(t.rows.numbers) * len(t.columns))
     columns, clock, named = dict(main.columns), main.clock, None
     where = main.rows.source
@@ -185,7 +185,7 @@ def _seconds(x: np.ndarray, column: Column) -> np.ndarray:
     return np.asarray(x * UNITS[column.unit or "s"][1])
 
 
-def _options(
+def _reading_options(
     system: AbstractSystem, columns: Mapping[str, Match], travel: Mapping[str, float]
 ) -> dict[str, list[Reading]]:
     """Both signs, half a turn's zero where a joint turns freely, and two units.
@@ -206,12 +206,12 @@ def _options(
         turns = joint is not None and joint.angle
         zeros = (0.0, np.pi) if turns else (0.0,)
         stated = columns[name].column.unit is not None
-        units = [None] if stated else _units(channel, travel[name])
+        units = [None] if stated else _possible_units(channel, travel[name])
         found[name] = [Reading(s, z, u) for u in units for z in zeros for s in (1, -1)]
     return found
 
 
-def _units(channel: Channel, travel: float) -> list[str | None]:
+def _possible_units(channel: Channel, travel: float) -> list[str | None]:
     """The units that a column may be in, by its travel, the likely one first."""
     smaller, reach = _SMALLER.get(channel.unit), FAR * (channel.high - channel.low)
     if smaller is None or travel <= min(LARGE, reach):
@@ -252,7 +252,7 @@ def _mended_logs(
     keys: dict[str, str] = {}
     while True:
         try:
-            return _logs(asked, system, columns, clock, keys), keys
+            return _draft_logs(asked, system, columns, clock, keys), keys
         except InputError as error:
             key = _MENDS.get(error.code, "")
             if not key or key in keys or f"{key} = true" not in error.fix:
@@ -260,7 +260,7 @@ def _mended_logs(
             keys[key] = f"{error.what} in {error.where}"
 
 
-def _logs(
+def _draft_logs(
     asked: Request,
     system: AbstractSystem,
     columns: Mapping[str, Column],
@@ -287,7 +287,7 @@ def _logs(
 def _as_read(
     name: str,
     found: Match,
-    readings: Found,
+    readings: BestReadings,
     options: Mapping[str, Sequence[Reading]],
     untried: str,
 ) -> Match:
@@ -299,21 +299,23 @@ def _as_read(
     column = reading.of(found.column, rate=name != joint)
     if name != joint or len(options[name]) == 1:
         return Match(column, found.why)
-    words = _words(reading)
+    words = _reading_text(reading)
     if name not in readings.surer:
-        asked = _asked(options[name])
+        asked = _differing_words(options[name])
         return Match(column, f"{found.why}; {asked} not tried: {untried}")
     surer = readings.surer[name]
     if surer > SURE:
         why = "the model predicts the log best so"
     else:
         rival = readings.rivals[name].items()
-        other = [f"{n} {_words(r)}" for n, r in rival if r != readings.readings[n]]
+        other = [
+            f"{n} {_reading_text(r)}" for n, r in rival if r != readings.readings[n]
+        ]
         why = f"look: the log hardly tells this from {' and '.join(other)}"
     return Match(column, f"{found.why}; {words} ({why})")
 
 
-def _words(reading: Reading) -> str:
+def _reading_text(reading: Reading) -> str:
     """`as it stands`, or what is done to a column."""
     words = [f"in {reading.unit}"] if reading.unit else []
     if reading.sign < 0:
@@ -323,14 +325,14 @@ def _words(reading: Reading) -> str:
     return " and ".join(words) or "as it stands"
 
 
-def _asked(options: Sequence[Reading]) -> str:
+def _differing_words(options: Sequence[Reading]) -> str:
     """What the readings of a channel differ in."""
     parts = [("sign", "sign"), ("zero", "offset"), ("unit", "unit")]
     differ = [w for w, key in parts if len({getattr(r, key) for r in options}) > 1]
     return " and ".join(differ)
 
 
-def told(draft: Draft, out: Path) -> dict[str, Any]:
+def draft_summary(draft: Draft, out: Path) -> dict[str, Any]:
     """The summary of a draft."""
     table = {
         name: {

@@ -13,7 +13,7 @@ from sim2gp.identification.words import digits, linear_sum
 from sim2gp.project.columns import Match
 from sim2gp.project.project import is_model
 from sim2gp.project.replace import key as toml_key
-from sim2gp.project.replace import quoted
+from sim2gp.project.replace import quote
 from sim2gp.systems import MuJoCo
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.mujoco.constants import constants_of
@@ -55,16 +55,16 @@ class Contents:
 def draft_text(c: Contents) -> str:
     """The project file as TOML."""
     folder, file = c.out.parent, is_model(c.model)
-    named = _relative(Path(c.model), folder) if file else c.model
+    named = _relative_path(Path(c.model), folder) if file else c.model
     rows = [
         "# A draft by sim2gp init: every guess has its reason beside it. Read them.",
-        f"system = {quoted(named)}",
+        f"system = {quote(named)}",
         "",
     ]
     if c.root is not None:
-        rows += ["[options]", f"root = {quoted(_relative(c.root, folder))}", ""]
-    rows += _constants(c, file)
-    rows += ["", *(_logs(c) if c.files else _wanted(c.system))]
+        rows += ["[options]", f"root = {quote(_relative_path(c.root, folder))}", ""]
+    rows += _constant_lines(c, file)
+    rows += ["", *(_log_lines(c) if c.files else _wanted(c.system))]
     if isinstance(c.system, MuJoCo) and c.system.servos:
         rows += ["", *_window(c.longest if c.files else math.inf)]
     rows += ["", "# Inputs act late on most machines; delay = 0.0 takes that out."]
@@ -78,7 +78,7 @@ def draft_text(c: Contents) -> str:
     return "\n".join(rows) + "\n"
 
 
-def _constants(c: Contents, file: bool) -> list[str]:
+def _constant_lines(c: Contents, file: bool) -> list[str]:
     """What is open, what is held, and how to say more about it."""
     table, nominal = c.system.parameters.free, c.system.parameters.nominal()
     selection = c.selection or Selection({}, {})
@@ -136,12 +136,12 @@ def _has_servos(system: AbstractSystem) -> bool:
     return any(c.kind == "actuator" and c.quantity in _GAINS for c in known)
 
 
-def _logs(c: Contents) -> list[str]:
+def _log_lines(c: Contents) -> list[str]:
     """The recordings, and the column of each channel."""
-    listed = [quoted(_relative(file, c.out.parent)) for file in c.files]
+    listed = [quote(_relative_path(file, c.out.parent)) for file in c.files]
     rows = ["[[logs]]", f"files = [{', '.join(listed)}]"]
     if c.time is not None:
-        rows.append(f"time = {_value(c.time.column)}  # {c.time.why}")
+        rows.append(f"time = {_column_text(c.time.column)}  # {c.time.why}")
     elif c.period is not None:
         rows.append(f"period = {c.period!r}")
     rows += [f"{key} = true  # {why}" for key, why in c.mended.items()]
@@ -154,7 +154,7 @@ def _logs(c: Contents) -> list[str]:
         ]
     rows.append("[logs.columns]")
     for name, m in c.columns.items():
-        rows.append(f"{toml_key(name)} = {_value(m.column)}  # {m.why}")
+        rows.append(f"{toml_key(name)} = {_column_text(m.column)}  # {m.why}")
     for name, value in c.constant.items():
         rows.append(f"{toml_key(name)} = {value!r}  # constant, as --constant says")
     return rows
@@ -204,14 +204,14 @@ def _window(longest: float) -> list[str]:
     ]
 
 
-def _value(column: Column) -> str:
+def _column_text(column: Column) -> str:
     """A column as the file says it."""
     plain = Column(column.column)
     if column == plain:
-        return quoted(column.column)
-    words = [f"column = {quoted(column.column)}"]
+        return quote(column.column)
+    words = [f"column = {quote(column.column)}"]
     if column.unit is not None:
-        words.append(f"unit = {quoted(column.unit)}")
+        words.append(f"unit = {quote(column.unit)}")
     if column.sign != plain.sign:
         words.append(f"sign = {column.sign}")
     if column.offset != plain.offset:
@@ -219,5 +219,5 @@ def _value(column: Column) -> str:
     return "{" + ", ".join(words) + "}"
 
 
-def _relative(file: Path, folder: Path) -> str:
+def _relative_path(file: Path, folder: Path) -> str:
     return Path(os.path.relpath(file, folder)).as_posix()

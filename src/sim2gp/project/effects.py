@@ -13,7 +13,7 @@ from sim2gp.errors import InputError, error, nearest
 from sim2gp.inference.parameters import Parameter
 from sim2gp.project.priors import prior
 from sim2gp.project.schema import EFFECT_OPTIONS, EffectSpec
-from sim2gp.project.source import Source
+from sim2gp.project.source import ProjectSource
 from sim2gp.project.validate import unknown
 from sim2gp.systems import AbstractPart, AbstractPlant, AbstractSystem, with_parts
 from sim2gp.systems.effects.registry import (
@@ -30,7 +30,7 @@ from sim2gp.systems.machine import plant_of
 def with_effects(
     system: AbstractSystem,
     specs: Mapping[str, Mapping[str, EffectSpec | float]],
-    source: Source,
+    source: ProjectSource,
 ) -> AbstractSystem:
     """The machine with the effects of the file; magnitudes are constants by name."""
     plant, parts = plant_of(system), list[AbstractPart]()
@@ -39,7 +39,7 @@ def with_effects(
         for what, said in kinds.items():
             line = source.where("effects", where, what)
             if not possible(plant, what, where):
-                raise _impossible(plant, what, where, line)
+                raise _impossible_effect(plant, what, where, line)
             options = effect_options(what, said, options_of(what), line)
             part = named(what, where, 1.0, **options)
             parts.append(part)
@@ -47,7 +47,9 @@ def with_effects(
     return with_parts(system, parts, stated)
 
 
-def _impossible(plant: AbstractPlant, what: str, where: str, line: str) -> InputError:
+def _impossible_effect(
+    plant: AbstractPlant, what: str, where: str, line: str
+) -> InputError:
     """An effect that no machine, this one, or this channel has (E103, E145, E160)."""
     channels = [c.name for c in (*joints_of(plant), *plant.actions)]
     known = {

@@ -8,11 +8,11 @@ import jax
 import numpy as np
 import tomlkit
 
-from sim2gp.data.logs import Log, RawLog, none_unused
+from sim2gp.data.logs import Log, RawLog, check_all_used
 from sim2gp.errors import error
 from sim2gp.project.project import IN_MEMORY, Project
-from sim2gp.project.source import parsed
-from sim2gp.project.validate import validated, wrong_value
+from sim2gp.project.source import parse_project
+from sim2gp.project.validate import validate_project, wrong_value
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.machine import as_machine
 from sim2gp.systems.variants import index_of, which
@@ -33,15 +33,17 @@ def project_of_machine(
     Raises `InputError` E141, E144 and E160 as `load_project` does.
     """
     tables = {"likelihood": likelihood, "limits": limits, "rates": rates}
-    stated = {table: _plain(values) for table, values in tables.items() if values}
+    stated = {
+        table: _python_values(values) for table, values in tables.items() if values
+    }
     where = f"{name} (in memory)"
     try:
         text = tomlkit.dumps({"system": IN_MEMORY} | stated)
     except (ValueError, TypeError) as caught:
         got, expected = repr(stated), "numbers, text, lists and tables of them"
         raise wrong_value("E160", where, got, expected, "") from caught
-    source = parsed(text, where)
-    spec, path = validated(source), Path(f"{name}.toml")
+    source = parse_project(text, where)
+    spec, path = validate_project(source), Path(f"{name}.toml")
     return Project(path, source, spec, as_machine(machine), own=True)
 
 
@@ -91,16 +93,16 @@ def read_logs(
     given = [files] if isinstance(files, Path | str) else list(files)
     found = machine.read_logs(given, configuration)
     if strict:
-        none_unused(found)
+        check_all_used(found)
     return found
 
 
-def _plain(value: Any) -> Any:
+def _python_values(value: Any) -> Any:
     """Numbers of NumPy and JAX as Python's, mappings as dictionaries."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(x) for key, x in value.items()}
+        return {str(key): _python_values(x) for key, x in value.items()}
     if isinstance(value, tuple | list):
-        return [_plain(x) for x in value]
+        return [_python_values(x) for x in value]
     if isinstance(value, np.ndarray | np.generic | jax.Array):
         return np.asarray(value).tolist()
     return value

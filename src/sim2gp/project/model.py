@@ -15,9 +15,9 @@ from sim2gp.errors import InputError, error
 from sim2gp.inference.parameters import Parameter
 from sim2gp.project.actuators import with_actuators
 from sim2gp.project.effects import with_effects
-from sim2gp.project.priors import located, prior
+from sim2gp.project.priors import prior, with_location
 from sim2gp.project.schema import ParameterSpec, ProjectSpec
-from sim2gp.project.source import Source
+from sim2gp.project.source import ProjectSource
 from sim2gp.project.validate import unknown
 from sim2gp.systems import AbstractSystem, MuJoCo
 from sim2gp.systems.mujoco.constants import (
@@ -32,7 +32,7 @@ from sim2gp.systems.variants import AT
 
 
 def build_model(
-    spec: ProjectSpec, source: Source, folder: Path, other: Path | None = None
+    spec: ProjectSpec, source: ProjectSource, folder: Path, other: Path | None = None
 ) -> AbstractSystem:
     """The machine of a model's file, or of another one, behind its actuators.
 
@@ -43,7 +43,7 @@ def build_model(
     try:
         model = loaded(path, root)
     except InputError as caught:
-        raise located(caught, caught.where or source.where("system")) from caught
+        raise with_location(caught, caught.where or source.where("system")) from caught
     known = constants_of(model)
     groups: list[list[str]] = []
     priors: dict[str, Parameter | float] = {}
@@ -54,7 +54,7 @@ def build_model(
         try:
             found = matching(known, pattern)
         except InputError as caught:
-            raise located(caught, where) from caught
+            raise with_location(caught, where) from caught
         # A path of its own is the exception to a pattern.
         found = [c for c in found if c.path == pattern or c.path not in spec.parameters]
         if not found:
@@ -62,15 +62,15 @@ def build_model(
         shared = isinstance(stated, ParameterSpec) and stated.tie
         for group in tied(found, model) if shared else [[c] for c in found]:
             groups.append([c.path for c in group])
-            priors[group[0].path] = _prior(stated, group[0], model, where)
+            priors[group[0].path] = _stated_prior(stated, group[0], model, where)
     try:
         plant = MuJoCo(model, groups or None, priors, source=path)
     except InputError as caught:
-        raise located(caught, source.where("parameters")) from caught
+        raise with_location(caught, source.where("parameters")) from caught
     return with_actuators(with_effects(plant, spec.effects, source), spec, source)
 
 
-def _root(spec: ProjectSpec, source: Source, folder: Path) -> Path | None:
+def _root(spec: ProjectSpec, source: ProjectSource, folder: Path) -> Path | None:
     """The folder that the model's files must lie in, where the file names one."""
     options = dict(spec.options)
     root = options.pop("root", None)
@@ -81,7 +81,7 @@ def _root(spec: ProjectSpec, source: Source, folder: Path) -> Path | None:
     return None if root is None else folder / root
 
 
-def _prior(
+def _stated_prior(
     stated: ParameterSpec | float, constant: Constant, model: object, where: str
 ) -> Parameter | float:
     """What the file says, about the model's own number."""

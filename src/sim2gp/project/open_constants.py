@@ -14,7 +14,7 @@ from jaxtyping import Int
 
 from sim2gp.data.logs import Log
 from sim2gp.data.split_log import cut
-from sim2gp.data.windows import Windows, motion
+from sim2gp.data.windows import Windows, channel_motion
 from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.errors import NotFinite, error
 from sim2gp.identification.identifiability.selection import (
@@ -62,12 +62,12 @@ def select_constants(
     if not isinstance(plant, MuJoCo):
         return Selection({}, {})
     windows, _ = cut(logs, system, window=length)
-    some = _liveliest(windows)[: max(1, round(SECONDS / length))]
+    some = _by_motion(windows)[: max(1, round(SECONDS / length))]
     size = min(AT_ONCE, len(some))
     # Of equal size, so that one program serves all of them.
     batches = some[: len(some) // size * size].reshape(-1, size)
     prior, likelihood = table.prior(), WindowsLikelihood(system, windows)
-    linear = _linearised(likelihood, prior, batches, until)
+    linear = _linearise_prior(likelihood, prior, batches, until)
     zeros = jnp.zeros((1, len(table)))
     fitted = estimate(linear, ParameterPrior(prior, table), starts=zeros, rounds=0)
     if not np.isfinite(fitted.log_evidence):
@@ -78,7 +78,7 @@ def select_constants(
     return select_parameters(table, prior, factor, nuisances=nuisances)
 
 
-def _linearised(
+def _linearise_prior(
     likelihood: WindowsLikelihood,
     prior: Gaussian,
     batches: Int[np.ndarray, "B w"],
@@ -109,7 +109,7 @@ def _not_finite() -> NotFinite:
     return error("model_leaves_logs", NotFinite)
 
 
-def _liveliest(windows: Windows) -> Int[np.ndarray, " W"]:
+def _by_motion(windows: Windows) -> Int[np.ndarray, " W"]:
     """Windows in order: those in which some channel moves most, channel by channel."""
-    place = np.argsort(np.argsort(-motion(windows), axis=0), axis=0)
+    place = np.argsort(np.argsort(-channel_motion(windows), axis=0), axis=0)
     return np.argsort(place.min(axis=1), kind="stable")

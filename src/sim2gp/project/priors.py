@@ -18,7 +18,7 @@ _MATTER = {"kg": "mass", "kg m^2": "inertia"}
 _BOXED = "bounded or log_bounded, with low and high"
 
 
-def located(error: InputError, where: str) -> InputError:
+def with_location(error: InputError, where: str) -> InputError:
     """The same error with its place in the file."""
     return InputError(
         error.code,
@@ -47,22 +47,22 @@ def prior(
     given = spec.model_dump(exclude_none=True, include=set(PriorSpec.model_fields))
     if spec.value is not None:
         if len(given) > 1:
-            raise _conflict(where, "value", given, "value alone, or a prior")
+            raise _incomplete_prior(where, "value", given, "value alone, or a prior")
         _check_matter(spec.value, base, where)
         return spec.value
     _check_bounds(spec, base, where)
     _check_matter(spec.low, base, where)
     try:
         if spec.mean is None and spec.sd is None:
-            return _box(spec, base, where)
+            return _with_bounds(spec, base, where)
         mean = own if spec.mean is None else spec.mean
         if mean is None or spec.sd is None:
-            raise _conflict(where, "mean and sd", given, "both of them")
+            raise _incomplete_prior(where, "mean and sd", given, "both of them")
         if spec.map in ("log", "identity") and {"low", "high"} & set(given):
-            raise _conflict(where, f"map = {spec.map}", given, _BOXED)
+            raise _incomplete_prior(where, f"map = {spec.map}", given, _BOXED)
         return _moments(spec, mean, spec.sd, base)
     except InputError as error:
-        raise located(error, where) from error
+        raise with_location(error, where) from error
 
 
 def _check_matter(least: float | None, base: Parameter, where: str) -> None:
@@ -80,12 +80,14 @@ def _absolute(
     mean = own if spec.mean is None else spec.mean
     if mean is None or mean == 0.0 or spec.sd is not None:
         given = spec.model_dump(exclude_none=True)
-        raise _conflict(where, "relative_sd", given, "a mean that is not 0, and no sd")
+        raise _incomplete_prior(
+            where, "relative_sd", given, "a mean that is not 0, and no sd"
+        )
     changes = {"mean": mean, "sd": share * abs(mean), "relative_sd": None}
     return spec.model_copy(update=changes)
 
 
-def _conflict(
+def _incomplete_prior(
     where: str, what: str, given: Mapping[str, object], expected: str
 ) -> InputError:
     got = ", ".join(given) or "an empty table"
@@ -104,13 +106,15 @@ def _check_bounds(spec: PriorSpec, base: Parameter, where: str) -> None:
     raise error("bounds_reversed", where=where, got=got, name=name)
 
 
-def _box(spec: PriorSpec, base: Parameter, where: str) -> Parameter:
+def _with_bounds(spec: PriorSpec, base: Parameter, where: str) -> Parameter:
     if spec.low is None and spec.high is None:
         if spec.map is None:
-            raise _conflict(where, "nothing stated", {}, "a prior or a value")
+            raise _incomplete_prior(where, "nothing stated", {}, "a prior or a value")
         if spec.map != base.map and spec.map not in ("bounded", "log_bounded"):
             expected = "mean and sd, whose logarithm or value is Gaussian"
-            raise _conflict(where, f"map = {spec.map}", {"map": spec.map}, expected)
+            raise _incomplete_prior(
+                where, f"map = {spec.map}", {"map": spec.map}, expected
+            )
         return replace(base, map=spec.map)
     low = base.low if spec.low is None else spec.low
     high = base.high if spec.high is None else spec.high
@@ -121,7 +125,7 @@ def _box(spec: PriorSpec, base: Parameter, where: str) -> Parameter:
     kind = spec.map or ("log_bounded" if logarithmic else "bounded")
     if kind not in ("bounded", "log_bounded"):
         given = {"low": low, "high": high, "map": kind}
-        raise _conflict(where, f"map = {kind}", given, _BOXED)
+        raise _incomplete_prior(where, f"map = {kind}", given, _BOXED)
     return replace(base, map=kind, low=low, high=high, mean=0.0, sd=BOX_SD)
 
 

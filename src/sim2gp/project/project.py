@@ -20,10 +20,10 @@ from sim2gp.data.logs import (
     Log,
     RawLog,
     Resample,
-    none_unused,
+    check_all_used,
     read_log,
 )
-from sim2gp.data.logs.file import shown
+from sim2gp.data.logs.file import display_path
 from sim2gp.errors import InputError, error, nearest
 from sim2gp.project.schema import (
     ColumnSpec,
@@ -31,8 +31,8 @@ from sim2gp.project.schema import (
     ProjectSpec,
     ResampleSpec,
 )
-from sim2gp.project.source import Source, read_source
-from sim2gp.project.validate import validated
+from sim2gp.project.source import ProjectSource, read_source
+from sim2gp.project.validate import validate_project
 
 if TYPE_CHECKING:
     from sim2gp.systems import AbstractPlant, AbstractSystem
@@ -60,7 +60,7 @@ class Project:
     """
 
     path: Path
-    source: Source
+    source: ProjectSource
     spec: ProjectSpec
     system: "AbstractSystem"
     budget: Budget = field(default_factory=Budget)
@@ -104,7 +104,10 @@ class Project:
                     where = self.source.where("logs", group, "files")
                     other = seen[place] + 1
                     raise error(
-                        "file_listed_twice", where=where, got=shown(file), other=other
+                        "file_listed_twice",
+                        where=where,
+                        got=display_path(file),
+                        other=other,
                     )
                 seen[place] = group
                 logs += self._read(file, group, spec)
@@ -112,7 +115,7 @@ class Project:
             where, got = self.source.where("logs"), "no [[logs]] table"
             raise error("no_logs_in_project", where=where, got=got)
         if strict:
-            none_unused(logs)
+            check_all_used(logs)
         return tuple(_uniquely_named(logs))
 
     def read_logs(
@@ -180,7 +183,7 @@ class Project:
                 continue
             matches = sorted(glob.glob(anchored, recursive=True))
             if not matches:
-                got, folder = repr(pattern), shown(self.path.parent)
+                got, folder = repr(pattern), display_path(self.path.parent)
                 raise error("no_file_matches", where=where, got=got, folder=folder)
             found.update(dict.fromkeys(Path(match) for match in matches))
         return list(found)
@@ -188,10 +191,10 @@ class Project:
     def _read(self, path: Path | RawLog, group: int, spec: LogSpec) -> tuple[Log, ...]:
         return read_log(
             path,
-            {name: _column(value) for name, value in spec.columns.items()},
+            {name: _column_of(value) for name, value in spec.columns.items()},
             states=self.system.physical_states,
             actions=self.system.actions,
-            time=None if spec.time is None else _clock(spec.time),
+            time=None if spec.time is None else _clock_column(spec.time),
             period=spec.period,
             episode=spec.episode,
             resample=_resample(spec.resample),
@@ -222,8 +225,8 @@ def load_project(
     path = Path(path)
     source, spec = read_spec(path, own=system is not None)
     # Imported late: a misspelt key is reported before the simulators are loaded.
-    from sim2gp.project.build import build_own, build_system, check_names
-    from sim2gp.project.configure import in_configurations, weighed
+    from sim2gp.project.build import build_own, build_system, check_known_names
+    from sim2gp.project.configure import with_configurations, with_linear_measurements
     from sim2gp.systems.machine import as_machine
 
     if system is not None and spec.system == IN_MEMORY:
@@ -239,18 +242,22 @@ def load_project(
         system = build_model(spec, source, folder, model)
     else:
         system = build_system(spec, source, system_class(spec.system))
-    check_names(spec, source, system)
-    system = weighed(spec, source, in_configurations(spec, source, system))
+    check_known_names(spec, source, system)
+    system = with_linear_measurements(
+        spec, source, with_configurations(spec, source, system)
+    )
     return Project(path, source, spec, system, own=own)
 
 
-def read_spec(path: Path | str, *, own: bool = False) -> tuple[Source, ProjectSpec]:
+def read_spec(
+    path: Path | str, *, own: bool = False
+) -> tuple[ProjectSource, ProjectSpec]:
     """The file's text and its validated values, without loading any simulator.
 
     The system of the file must be known, but for a user's ``own``.
     """
     source = read_source(Path(path))
-    spec = validated(source)
+    spec = validate_project(source)
     if not (own or spec.system in SYSTEMS or is_model(spec.system)):
         raise unknown_system(spec.system, source.where("system"))
     return source, spec
@@ -286,7 +293,7 @@ def system_class(name: str) -> "type[AbstractPlant]":
     return found
 
 
-def _column(value: str | float | ColumnSpec) -> Column | float:
+def _column_of(value: str | float | ColumnSpec) -> Column | float:
     if isinstance(value, str):
         return Column(value)
     if not isinstance(value, ColumnSpec):
@@ -302,8 +309,8 @@ def _column(value: str | float | ColumnSpec) -> Column | float:
     )
 
 
-def _clock(value: str | ColumnSpec) -> Column | str:
-    found = _column(value)
+def _clock_column(value: str | ColumnSpec) -> Column | str:
+    found = _column_of(value)
     return found if isinstance(found, Column) else str(found)
 
 
@@ -313,7 +320,7 @@ def _resample(spec: ResampleSpec | None) -> Resample | None:
     return Resample(spec.method, spec.period, spec.stamps)
 
 
-def _no_group(source: Source) -> InputError:
+def _no_group(source: ProjectSource) -> InputError:
     where = source.where("logs")
     return error("no_group_of_logs", where=where, got="no [[logs]] table")
 

@@ -24,9 +24,9 @@ import numpy as np
 from jaxtyping import Float
 
 from sim2gp.data.logs import Column, Log
-from sim2gp.data.logs.units import factor
+from sim2gp.data.logs.units import unit_factor
 from sim2gp.data.split_log import cut
-from sim2gp.data.windows import motion
+from sim2gp.data.windows import channel_motion
 from sim2gp.systems import MuJoCo
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.simulate import inputs_of
@@ -87,7 +87,7 @@ def finer(options: Sequence[Reading]) -> str | None:
 
 
 @dataclass
-class Found:
+class BestReadings:
     """The best reading of each channel, and how sure that is.
 
     ``surer[name]``: the sign test's z against the best reading in which the channel
@@ -104,26 +104,30 @@ class Found:
 
 
 @in_float64
-def find_readings(system: AbstractSystem, asked: Question, *, until: float) -> Found:
+def find_readings(
+    system: AbstractSystem, asked: Question, *, until: float
+) -> BestReadings:
     """The reading of joints and inputs that explains the logs best.
 
     ``until`` (of `time.monotonic`, s): what was not tried by then keeps its first
     option. Raises `InputError` E116 where no window can be cut.
     """
-    found = Found({name: options[0] for name, options in asked.options.items()})
-    groups = _groups(asked)
+    found = BestReadings({name: options[0] for name, options in asked.options.items()})
+    groups = _channel_groups(asked)
     try:
         trial = _Trial(system, asked, until)
         for turn in range(1 if len(groups) == 1 else 2):
             found.images = 1
             for names in groups:
-                _settle(trial, asked, names, found, alone=turn == 0 < len(groups) - 1)
+                _settle_readings(
+                    trial, asked, names, found, alone=turn == 0 < len(groups) - 1
+                )
     except TimeoutError:
         pass
     return found
 
 
-def _groups(asked: Question) -> Sequence[Sequence[str]]:
+def _channel_groups(asked: Question) -> Sequence[Sequence[str]]:
     """All channels at once where their readings are few; those with one are known."""
     open_ = [name for name, options in asked.options.items() if len(options) > 1]
     if np.prod([len(asked.options[name]) for name in open_]) <= EXHAUSTIVE:
@@ -132,11 +136,11 @@ def _groups(asked: Question) -> Sequence[Sequence[str]]:
     return [names for names in groups if names]
 
 
-def _settle(
+def _settle_readings(
     trial: "_Trial",
     asked: Question,
     names: Sequence[str],
-    found: Found,
+    found: BestReadings,
     *,
     alone: bool,
 ) -> None:
@@ -187,7 +191,9 @@ class _Trial:
 
     def __init__(self, system: AbstractSystem, asked: Question, until: float) -> None:
         windows, _ = cut(_beginning(asked.logs), system, window=WINDOW)
-        most = np.argsort(-motion(windows).mean(axis=1), kind="stable")[:WINDOWS]
+        most = np.argsort(-channel_motion(windows).mean(axis=1), kind="stable")[
+            :WINDOWS
+        ]
         self.windows = windows.some(np.sort(most))
         now = np.zeros(self.windows.area.shape[-1])
         self.inputs = np.stack([inputs_of(x, now) for x in self.windows.held()])
@@ -197,7 +203,7 @@ class _Trial:
             c.name: c.unit for c in (*system.physical_states, *system.actions)
         }
         self.base = {name: finer(options) for name, options in asked.options.items()}
-        self.step, self.until = _step_of(system), until
+        self.step, self.until = _nominal_step(system), until
 
     def scores(self, readings: Sequence[Readings], names: Sequence[str]) -> Scores:
         """Of each reading and window, by some channels or, where none is measured, all.
@@ -233,7 +239,7 @@ class _Trial:
             away = s[:, seen].reshape(K, W, -1) - y[:, :, row]
             error += np.where(w.mask[:, row], away**2, 0.0)
         error /= np.maximum(w.mask[:, 1:].sum(axis=1), 1)
-        moved = motion(w).mean(axis=0) * scale[:, None, seen] ** 2
+        moved = channel_motion(w).mean(axis=0) * scale[:, None, seen] ** 2
         share = np.sqrt(error / np.maximum(moved, 1e-30))
         share = np.where(np.isfinite(share), np.clip(share, _FLOOR, _CAP), _CAP)
         return np.asarray(np.log(share))
@@ -249,7 +255,7 @@ class _Trial:
                 reading = each.get(whole, PLAIN)
                 unit = self.units.get(whole, "")
                 own, read = self.base.get(whole), reading.unit
-                ratio = factor(read, unit, name) / factor(own, unit, name)
+                ratio = unit_factor(read, unit, name) / unit_factor(own, unit, name)
                 scale[k, i] = reading.sign * ratio
                 zero[k, i] = reading.offset if name == whole else 0.0
         return scale, zero
@@ -275,7 +281,7 @@ def _beginning(logs: Sequence[Log]) -> list[Log]:
     return some
 
 
-def _step_of(system: AbstractSystem) -> Callable[..., Float[np.ndarray, "B n"]]:
+def _nominal_step(system: AbstractSystem) -> Callable[..., Float[np.ndarray, "B n"]]:
     """One step of many rows at the parameters' nominal values.
 
     MuJoCo's own engine where it is one: nothing is compiled then.

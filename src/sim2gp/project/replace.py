@@ -11,14 +11,14 @@ from sim2gp.project.project import Project, load_project
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 
 
-def quoted(text: str) -> str:
+def quote(text: str) -> str:
     """A text as TOML writes it."""
     return json.dumps(text, ensure_ascii=False)
 
 
 def key(name: str) -> str:
     """A name as a key of TOML: quoted where it must be."""
-    return name if _BARE.fullmatch(name) else quoted(name)
+    return name if _BARE.fullmatch(name) else quote(name)
 
 
 def replace_project(path: Path, text: str, check: Callable[[Project], object]) -> None:

@@ -47,7 +47,7 @@ def toml(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
-def elsewhere(key: str) -> str:
+def suggest_table(key: str) -> str:
     """Where a key of another table belongs."""
     if key in ProjectSpec.model_fields:
         kind = ProjectSpec.model_fields[key].annotation
@@ -56,7 +56,7 @@ def elsewhere(key: str) -> str:
     return f"{key} is a key of {headers[0]}" if headers else ""
 
 
-def of_key(path: Path_, known: Collection[str]) -> str:
+def fix_for_key(path: Path_, known: Collection[str]) -> str:
     """For a key that its table does not have."""
     key = str(path[-1])
     if key in PARTS and len(path) > 1:
@@ -67,17 +67,17 @@ def of_key(path: Path_, known: Collection[str]) -> str:
     if difflib.get_close_matches(key.lower(), known, n=1, cutoff=_ALIKE):
         return f"did you mean {nearest(key, known)}"
     close = nearest(key, known)
-    return elsewhere(key) or (f"did you mean {close}" if close else "")
+    return suggest_table(key) or (f"did you mean {close}" if close else "")
 
 
-def of_choice(value: Any, expected: str) -> str:
+def fix_for_choice(value: Any, expected: str) -> str:
     """For a word that is none of pydantic's list of choices."""
     choices = expected.replace("'", "").replace(" or ", ", ").split(", ")
     close = nearest(value, choices) if isinstance(value, str) else None
     return f"did you mean {close!r}" if close else ""
 
 
-def of_value(path: Path_, value: Any, expected: str) -> str:
+def fix_for_value(path: Path_, value: Any, expected: str) -> str:
     """For a value of another kind than its key has."""
     key = str(path[-1])
     if isinstance(value, str):
@@ -97,13 +97,13 @@ def of_value(path: Path_, value: Any, expected: str) -> str:
     if "exclude" in path:
         return "write each interval in brackets: exclude = [[12.0, 13.5]]"
     if path[0] == "limits" or key == "saturation":
-        return f"write {_key(key)} = [{-abs(value)}, {abs(value)}]"
+        return f"write {_quoted_key(key)} = [{-abs(value)}, {abs(value)}]"
     return ""
 
 
 def _of_text(key: str, value: str, expected: str) -> str:
     if "list" in expected:
-        return f"write {_key(key)} = [{toml(value)}]"
+        return f"write {_quoted_key(key)} = [{toml(value)}]"
     if expected == "true or false":
         return {"yes": "write true", "no": "write false"}.get(value.lower(), "")
     found = re.fullmatch(rf"({_NUMBER})(.*)", value.strip())
@@ -126,7 +126,7 @@ def _of_table(path: Path_, value: dict[str, Any]) -> str:
 def _of_list(path: Path_, value: list[Any], expected: str) -> str:
     key = str(path[-1])
     if value and all(isinstance(each, dict) for each in value):
-        names = ".".join(_key(str(p)) for p in path if isinstance(p, str))
+        names = ".".join(_quoted_key(str(p)) for p in path if isinstance(p, str))
         return f"write [{names}], once and in single brackets"
     if key in LogSpec.model_fields and "columns" in path[:-1]:
         return f"write {key} above [logs.columns]"
@@ -136,5 +136,5 @@ def _of_list(path: Path_, value: list[Any], expected: str) -> str:
     return ""
 
 
-def _key(name: str) -> str:
+def _quoted_key(name: str) -> str:
     return name if re.fullmatch(r"[\w-]+", name) else f'"{name}"'

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sim2gp.data.logs.file import read_bytes, shown
+from sim2gp.data.logs.file import display_path, read_bytes
 from sim2gp.data.logs.table import decode
 from sim2gp.errors import InputError, error
-from sim2gp.project.syntax import of_repeated, of_syntax
+from sim2gp.project.syntax import fix_for_repeated, fix_for_syntax
 
 MAX_BYTES = 1_000_000
 MAX_DEPTH = 64
@@ -40,7 +40,7 @@ _HOSTILE = re.compile(r"\$\{|^\s*(eval|exec|import|env|file|python)\s*:|^\s*!!")
 
 
 @dataclass(frozen=True)
-class Source:
+class ProjectSource:
     """A parsed project file: its text, its values, and the line of each key."""
 
     name: str
@@ -58,37 +58,37 @@ class Source:
         return f"{self.name}:line {line}" + (f", key {key}" if key else "")
 
 
-def read_source(path: Path) -> Source:
+def read_source(path: Path) -> ProjectSource:
     """Read and parse a project file (E120, E130, E160, E161, E162)."""
-    name = shown(path)
-    return parsed(decode(read_bytes(path, limit=64 * MAX_BYTES), name), name)
+    name = display_path(path)
+    return parse_project(decode(read_bytes(path, limit=64 * MAX_BYTES), name), name)
 
 
-def parsed(text: str, name: str) -> Source:
+def parse_project(text: str, name: str) -> ProjectSource:
     """Parse the text of a project file that is called ``name`` (E160, E161, E162)."""
     if len(text) > MAX_BYTES:
-        raise _refused(name, f"{len(text)} characters", f"at most {MAX_BYTES}")
+        raise _too_large(name, f"{len(text)} characters", f"at most {MAX_BYTES}")
     # Strings and comments keep their length and lines but lose their content.
     bare = _TOKEN.sub(_blank, text)
     depth = _depth(bare)
     if depth > MAX_DEPTH:
-        raise _refused(name, f"a nesting of {depth}", f"at most {MAX_DEPTH}")
+        raise _too_large(name, f"a nesting of {depth}", f"at most {MAX_DEPTH}")
     try:
         values = tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError, ValueError) as caught:
         raise _yaml(name, bare) or _syntax(name, text, str(caught)) from caught
     lines: dict[Path_, int] = {}
-    for key, line in _lines(text, bare):
+    for key, line in _key_lines(text, bare):
         lines.setdefault(key, line)  # of a table in pieces, the first
-    source = Source(name, text, values, lines)
-    for key, value in _leaves(values, ()):
+    source = ProjectSource(name, text, values, lines)
+    for key, value in _key_paths(values, ()):
         if _is_hostile(key, value):
             where, got = source.where(*key), repr(value)[:40]
             raise error("code_in_project_file", where=where, got=got)
     return source
 
 
-def _refused(name: str, got: str, expected: str) -> InputError:
+def _too_large(name: str, got: str, expected: str) -> InputError:
     return error("project_file_too_large", where=name, got=got, expected=expected)
 
 
@@ -139,11 +139,13 @@ def _syntax(name: str, text: str, message: str) -> InputError:
     twice = re.search(r"overwrite|twice|redefine|already", reason, re.IGNORECASE)
     where, got = f"{name}:line {line}", repr(row.strip()[:60])
     if not twice:
-        fix, said = of_syntax(reason, row, column), reason[:80].lower()
+        fix, said = fix_for_syntax(reason, row, column), reason[:80].lower()
         return error("not_valid_toml", where=where, got=got, reason=said, fix=fix)
     if _table_at(text, line).startswith("parameters"):
-        return error("duplicate_parameter", where=where, got=got, fix=of_repeated(row))
-    return error("key_stands_twice", where=where, got=got, fix=of_repeated(row))
+        return error(
+            "duplicate_parameter", where=where, got=got, fix=fix_for_repeated(row)
+        )
+    return error("key_stands_twice", where=where, got=got, fix=fix_for_repeated(row))
 
 
 def _table_at(text: str, line: int) -> str:
@@ -151,7 +153,7 @@ def _table_at(text: str, line: int) -> str:
     return headers[-1].strip(" []") if headers else ""
 
 
-def _lines(text: str, bare: str) -> Iterator[tuple[Path_, int]]:
+def _key_lines(text: str, bare: str) -> Iterator[tuple[Path_, int]]:
     """The path and line of each table header and each key at a line's start."""
     table: Path_ = ()
     counts: dict[Path_, int] = {}
@@ -166,14 +168,14 @@ def _lines(text: str, bare: str) -> Iterator[tuple[Path_, int]]:
             double = stripped.startswith("[[")
             found = _DOTTED.match(stripped.lstrip("["))
             if found:
-                parts = _parts(found.group(1))
+                parts = _split_key(found.group(1))
                 table = _resolve(parts, counts, double)
                 for end in range(1, len(table) + 1):
                     yield table[:end], number
             continue
         found = _DOTTED.match(line) if depth == 0 else None
         if found and line[found.end() :].startswith("="):
-            key = (*table, *_parts(found.group(1)))
+            key = (*table, *_split_key(found.group(1)))
             for end in range(len(table) + 1, len(key) + 1):
                 yield key[:end], number
             yield from _inline(key, line[found.end() + 1 :], number)
@@ -186,7 +188,7 @@ def _inline(key: Path_, rest: str, number: int) -> Iterator[tuple[Path_, int]]:
     """Keys of a one-line inline table share its line."""
     if rest.lstrip().startswith("{"):
         for inner in re.findall(rf"[{{,]\s*({_KEY})\s*=", rest):
-            yield (*key, *_parts(inner)), number
+            yield (*key, *_split_key(inner)), number
 
 
 def _resolve(parts: Path_, counts: dict[Path_, int], double: bool) -> Path_:
@@ -201,18 +203,18 @@ def _resolve(parts: Path_, counts: dict[Path_, int], double: bool) -> Path_:
     return table
 
 
-def _parts(dotted: str) -> Path_:
+def _split_key(dotted: str) -> Path_:
     return tuple(part.strip("\"'") for part in re.findall(_KEY, dotted))
 
 
-def _leaves(value: Any, path: Path_) -> Iterator[tuple[Path_, Any]]:
+def _key_paths(value: Any, path: Path_) -> Iterator[tuple[Path_, Any]]:
     if isinstance(value, dict):
         for key, inner in value.items():
             yield (*path, key), ""
-            yield from _leaves(inner, (*path, key))
+            yield from _key_paths(inner, (*path, key))
     elif isinstance(value, list):
         for i, inner in enumerate(value):
-            yield from _leaves(inner, (*path, i))
+            yield from _key_paths(inner, (*path, i))
     else:
         yield path, value
 

@@ -39,7 +39,7 @@ _SYNTAX: Sequence[tuple[str, str, str]] = (
 )
 
 
-def of_syntax(reason: str, row: str, column: int) -> str:
+def fix_for_syntax(reason: str, row: str, column: int) -> str:
     """For a line that is not TOML, of which the parser stopped at a column."""
     rest = row[max(0, column - 1) :]
     for said, found, fix in _SYNTAX:
@@ -48,7 +48,7 @@ def of_syntax(reason: str, row: str, column: int) -> str:
     return "correct the line"
 
 
-def of_repeated(row: str) -> str:
+def fix_for_repeated(row: str) -> str:
     """For a key or table that is there already."""
     header = re.match(r"\s*\[+\s*(\w+)", row)
     if header and header[1] in LISTS:

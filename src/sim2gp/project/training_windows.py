@@ -32,13 +32,13 @@ def cut_places(
         logs,
         project.system,
         window=times * stated.window,
-        start_sd=_each(stated.start_sd, names),
-        floor=_each(stated.noise_floor, measured),
+        start_sd=_for_each_channel(stated.start_sd, names),
+        floor=_for_each_channel(stated.noise_floor, measured),
         start=stated.start,
     )
 
 
-def _each(
+def _for_each_channel(
     value: float | dict[str, float] | None, names: Sequence[str]
 ) -> dict[str, float] | None:
     """A single number holds for every channel."""

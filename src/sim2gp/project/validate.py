@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from sim2gp.errors import InputError, error, nearest
 from sim2gp.project import slips
 from sim2gp.project.schema import RESERVED, ProjectSpec, keys_at
-from sim2gp.project.source import Path_, Source
+from sim2gp.project.source import Path_, ProjectSource
 
 Fault = tuple[Path_, dict[str, Any]]
 
@@ -30,7 +30,7 @@ _WORDS = {
 }
 
 
-def validated(source: Source) -> ProjectSpec:
+def validate_project(source: ProjectSource) -> ProjectSpec:
     """The file's values as a `ProjectSpec`, or its first error (E141, E144, E160)."""
     try:
         return ProjectSpec.model_validate(source.values)
@@ -41,7 +41,7 @@ def validated(source: Source) -> ProjectSpec:
     deep = [(path, error) for path, error in faults if path not in above]
     path, error = min(deep, key=lambda fault: _order(source, fault[0]))
     if error["type"] == "missing":
-        raise _missing(source, path, error)
+        raise _missing_key(source, path, error)
     if error["type"] == "extra_forbidden":
         raise _unknown_key(source, path, error["input"])
     raise _wrong(source, path, error, [e for p, e in deep if p == path])
@@ -59,42 +59,47 @@ def _present(loc: Path_, values: Any) -> Path_:
     return path
 
 
-def _order(source: Source, path: Path_) -> int:
+def _order(source: ProjectSource, path: Path_) -> int:
     return int(source.where(*path).split(":line ")[1].split(",")[0])
 
 
-def _missing(source: Source, path: Path_, failure: dict[str, Any]) -> InputError:
+def _missing_key(
+    source: ProjectSource, path: Path_, failure: dict[str, Any]
+) -> InputError:
     name, value = str(failure["loc"][-1]), failure["input"]
     got = ", ".join(value)[:60] or "an empty table"
     return error("missing_key", where=source.where(*path), got=got, name=name)
 
 
-def _unknown_key(source: Source, path: Path_, value: Any) -> InputError:
+def _unknown_key(source: ProjectSource, path: Path_, value: Any) -> InputError:
     where, key = source.where(*path), str(path[-1])
     if len(path) == 1 and key in RESERVED:
         named = key == "model" and isinstance(value, str)
         fix = f"write system = {slips.toml(value)}" if named else "remove it"
         return error("reserved_section", where=where, got=key, section=key, fix=fix)
     known = keys_at(path[:-1])
-    fix = slips.of_key(path, known) or "remove it"
+    fix = slips.fix_for_key(path, known) or "remove it"
     return error("unknown_key", where=where, got=key, known=", ".join(known), fix=fix)
 
 
 def _wrong(
-    source: Source, path: Path_, error: dict[str, Any], same: list[dict[str, Any]]
+    source: ProjectSource,
+    path: Path_,
+    error: dict[str, Any],
+    same: list[dict[str, Any]],
 ) -> InputError:
     """A value of another kind or size; ``same`` are all errors of its alternatives."""
     kind, value = error["type"], error["input"]
-    expected = " or ".join(dict.fromkeys(words(e) for e in same))
+    expected = " or ".join(dict.fromkeys(describe_violation(e) for e in same))
     code = "E160"
     if kind == "finite_number" and path[-1] in ("low", "high"):
         code = "E141"
     elif {"sd", "relative_sd", "start_sd", "noise_floor"} & set(path):
         code = "E144" if kind in ("greater_than", "finite_number") else "E160"
-    fix = slips.of_value(path, value, expected)
+    fix = slips.fix_for_value(path, value, expected)
     choices = [e["ctx"]["expected"] for e in same if e["type"] == "literal_error"]
     if choices and not fix:
-        fix = slips.of_choice(value, choices[0])
+        fix = slips.fix_for_choice(value, choices[0])
     return wrong_value(code, source.where(*path), value, expected, fix)
 
 
@@ -116,7 +121,7 @@ def wrong_value(
 def unknown(kind: str, name: str, known: Collection[str], where: str) -> InputError:
     """E160 with the name that was probably meant."""
     close = nearest(name, known)
-    fix = f"did you mean {close}" if close else slips.elsewhere(name)
+    fix = f"did you mean {close}" if close else slips.suggest_table(name)
     fix = fix or ("use a known name" if known else "remove it")
     expected = "one of " + ", ".join(known) if known else f"no {kind}"
     return error(
@@ -124,7 +129,7 @@ def unknown(kind: str, name: str, known: Collection[str], where: str) -> InputEr
     )
 
 
-def words(error: Mapping[str, Any]) -> str:
+def describe_violation(error: Mapping[str, Any]) -> str:
     """Pydantic's sentence in the words of a project file."""
     kind = error["type"]
     if kind in _WORDS:

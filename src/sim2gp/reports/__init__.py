@@ -11,7 +11,7 @@ from sim2gp.reports.figure2 import figure2
 from sim2gp.reports.figure3 import figure3
 from sim2gp.reports.mismatch_map import mismatch_map
 from sim2gp.reports.notebook import show
-from sim2gp.reports.redraw import load_run, redraw
+from sim2gp.reports.redraw import load_summary, redraw
 
 __all__ = [
     "animation_gif",
@@ -21,7 +21,7 @@ __all__ = [
     "figure2",
     "figure3",
     "figure_bytes",
-    "load_run",
+    "load_summary",
     "mismatch_map",
     "redraw",
     "show",

@@ -17,7 +17,7 @@ from markupsafe import Markup, escape
 from sim2gp.reports import frames, svg
 from sim2gp.reports.parameters import Arrays, Section
 from sim2gp.reports.scenes import Scene, Shape, keep_frames, project, scene_of
-from sim2gp.reports.skeleton import overlaid, skeleton
+from sim2gp.reports.skeleton import overlay_motion, skeleton
 
 _MOST_FRAMES = 1500
 _MOST_POINTS = 40_000  # of all frames: some 700 kB
@@ -165,7 +165,7 @@ def _strip(
     return svg.chart(axes, marks, title=name, said=said, unit=unit)
 
 
-def _frames(count: int, dt: float, points: int) -> np.ndarray:
+def _frame_rows(count: int, dt: float, points: int) -> np.ndarray:
     """Which rows are shown: no finer than needed, never too many."""
     most = min(_MOST_FRAMES, max(_MOST_POINTS // max(points, 1), 2))
     stride = max(1, math.floor(_SLOWEST / dt + 1e-9), math.ceil(count / most))
@@ -229,8 +229,8 @@ def player(about: Mapping[str, Any], arrays: Arrays) -> Section:
     scene, other = _scene(about, arrays)
     count = len(scene.moving)
     if other is not None:
-        scene = overlaid(scene, other.moving)
-    index = _frames(count, dt, scene.moving.shape[1])
+        scene = overlay_motion(scene, other.moving)
+    index = _frame_rows(count, dt, scene.moving.shape[1])
     stride = int(index[1] - index[0]) if len(index) > 1 else 1
     marks = _marks(about)
     rows = sorted({round(time / dt) for time, _ in marks} - {0})
@@ -306,7 +306,7 @@ def _paint_trail(
         )
 
 
-def _shrunk(scene: Scene, width: int) -> Scene:
+def _shrink_scene(scene: Scene, width: int) -> Scene:
     """The same picture, `width` pixels wide."""
     from dataclasses import replace
 
@@ -337,7 +337,7 @@ def animation_gif(
     """The film as a GIF that loops; `about` as in `player`, `fps` frames a second."""
     state = np.asarray(state, dtype=float)
     dt = float(about["dt"])
-    scene = _shrunk(scene_of(about, state), width)
+    scene = _shrink_scene(scene_of(about, state), width)
     marks = _marks(about)
     rows = _rows_of_gif(len(state), dt, fps)
     step = int(rows[1] - rows[0]) if len(rows) > 1 else 1
@@ -371,7 +371,7 @@ def animation_png(
     """One moment of the film as a PNG, with the path of the tip before it."""
     state = np.asarray(state, dtype=float)
     row = row % len(state)
-    scene = _shrunk(scene_of(about, state), width)
+    scene = _shrink_scene(scene_of(about, state), width)
     first = max(0, row - round(_TRAIL_SECONDS / float(about["dt"])))
     file = io.BytesIO()
     _paint(scene, row, range(first, row + 1), "", 3).save(file, format="PNG")

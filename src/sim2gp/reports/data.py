@@ -9,14 +9,21 @@ from markupsafe import Markup
 from sim2gp.reports import svg
 from sim2gp.reports.numbers import (
     MISSING,
+    format_number,
+    format_percent,
     is_number,
-    number,
-    percent,
     power_of_ten,
     unit_text,
 )
 from sim2gp.reports.parameters import Arrays, Section, Summary
-from sim2gp.reports.tables import SHARES, Cell, Table, records, shown, table
+from sim2gp.reports.tables import (
+    SHARES,
+    ReportTable,
+    TableCell,
+    format_value,
+    make_table,
+    records,
+)
 from sim2gp.reports.traces import forecasts, unit_of
 
 NARROW = 3  # columns that a telephone shows side by side
@@ -28,10 +35,10 @@ def colour(index: int) -> str:
     return COLOURS[index % len(COLOURS)]
 
 
-def _sentence(item: object) -> object:
+def _item_text(item: object) -> object:
     if isinstance(item, Mapping):
         return item.get("text") or ", ".join(
-            f"{key.replace('_', ' ')} {shown(key, value)}"
+            f"{key.replace('_', ' ')} {format_value(key, value)}"
             for key, value in item.items()
         )
     return item
@@ -50,19 +57,19 @@ _TESTS = {
 def _p_value(p: object) -> str:
     """Two digits; what is next to nothing has none."""
     tiny = is_number(p) and float(p) < _LEAST  # type: ignore[arg-type]
-    return f"< {power_of_ten(-99)}" if tiny else number(p, 2)
+    return f"< {power_of_ten(-99)}" if tiny else format_number(p, 2)
 
 
-def _tests(tests: Mapping[str, Any]) -> Table:
+def _tests(tests: Mapping[str, Any]) -> ReportTable:
     """What the residuals say of the model, test by test."""
 
     def row(name: str, test: Mapping[str, Any]) -> list[object]:
         chip = ("bad", "alarm") if test.get("alarm") else ("good", "passed")
-        statistic, p = number(test.get("statistic")), _p_value(test.get("p"))
-        tested = Cell(chip=chip) if is_number(test.get("p")) else MISSING
+        statistic, p = format_number(test.get("statistic")), _p_value(test.get("p"))
+        tested = TableCell(chip=chip) if is_number(test.get("p")) else MISSING
         return [_TESTS.get(name, name), statistic, p, tested, test.get("text") or ""]
 
-    return table(
+    return make_table(
         ["what is asked of the residuals", "statistic", "p", "verdict", "in words"],
         [row(name, test) for name, test in tests.items()],
         words=(0, 3, 4),
@@ -91,11 +98,11 @@ def noise_and_misfit(summary: Summary) -> Section:
         "asked": bool(misfit),
         "verdict": None if explains else about.get("verdict"),
         "tests": _tests(tests) if tests else None,
-        "notes": list(map(_sentence, about.get("noise") or ())),
+        "notes": list(map(_item_text, about.get("noise") or ())),
     }
 
 
-def calibration(summary: Summary, arrays: Arrays) -> Section:
+def calibration_section(summary: Summary, arrays: Arrays) -> Section:
     """How many held-out measurements lie in the bands, level by level."""
     prefix = "calibration/share/"
     names = [key[len(prefix) :] for key in arrays if key.startswith(prefix)]
@@ -103,8 +110,9 @@ def calibration(summary: Summary, arrays: Arrays) -> Section:
         return None
     about = (summary.get("held_out") or summary).get("calibration") or {}
     counted = (
-        f"{number(about.get('windows'))} forecasts over {number(about.get('horizon'))} "
-        f"s, judged by {about.get('blocks') or 'none'}"
+        f"{format_number(about.get('windows'))} forecasts over "
+        f"{format_number(about.get('horizon'))} s, "
+        f"judged by {about.get('blocks') or 'none'}"
     )
     drawings = [_curve_of_shares(arrays, name, i) for i, name in enumerate(names)]
     return {"text": about.get("text"), "curves": drawings, "counted": counted}
@@ -124,7 +132,7 @@ def _curve_of_shares(arrays: Arrays, name: str, index: int) -> Markup:
         marks.append(svg.dots(axes, levels[outside], share[outside], css))
     marks.append(svg.line(axes, levels, share, css))
     said = ", ".join(
-        f"the {percent(a)} band holds {percent(b)}"
+        f"the {format_percent(a)} band holds {format_percent(b)}"
         for a, b in zip(levels, share, strict=True)
         if a in (levels[0], levels[-1])
     )
@@ -132,7 +140,7 @@ def _curve_of_shares(arrays: Arrays, name: str, index: int) -> Markup:
     return svg.chart(axes, marks, title=name, said=said, unit="share inside the band")
 
 
-def _by_channel(summary: Summary) -> Table:
+def _by_channel(summary: Summary) -> ReportTable:
     """Errors and coverage with a row per channel and a line for the pooled ones."""
     known = {
         "open_loop_rmse": "error at the horizon",
@@ -149,15 +157,15 @@ def _by_channel(summary: Summary) -> Table:
         per_channel = value if isinstance(value, Mapping) else {"all": value}
         for channel, x in per_channel.items():
             if is_number(x):
-                text = percent(x) if key in SHARES else number(x)
+                text = format_percent(x) if key in SHARES else format_number(x)
                 rows.setdefault(str(channel), {})[words] = text
     used = [w for w in known.values() if any(w in row for row in rows.values())]
     units = {channel: unit_text(unit_of(summary, channel)) for channel in rows}
     named = [
-        [Cell(name=channel, unit=units[channel]), *(row.get(w, "") for w in used)]
+        [TableCell(name=channel, unit=units[channel]), *(row.get(w, "") for w in used)]
         for channel, row in rows.items()
     ]
-    return table(["channel", *used], named, words=(0,), cards=True)
+    return make_table(["channel", *used], named, words=(0,), cards=True)
 
 
 def _curve(
@@ -179,12 +187,14 @@ def _curve(
         for method, curve in reversed(curves.items())
     ]
     unit, last = unit_of(summary, channel), horizon[-1:]
-    said = ", ".join(f"{m} {number(c[-1])}" for m, c in curves.items() if len(c))
-    said = f"errors after {number(last[0])} s: {said}" if len(last) else "no errors"
+    said = ", ".join(f"{m} {format_number(c[-1])}" for m, c in curves.items() if len(c))
+    said = (
+        f"errors after {format_number(last[0])} s: {said}" if len(last) else "no errors"
+    )
     return svg.chart(axes, marks, title=channel, said=said, unit=unit)
 
 
-def held_out(summary: Summary, arrays: Arrays) -> Section:
+def held_out_section(summary: Summary, arrays: Arrays) -> Section:
     """Prediction of what the model was not shown.
 
     Of a run that was fitted, its own section "held_out"; else the run is about nothing
@@ -201,9 +211,9 @@ def held_out(summary: Summary, arrays: Arrays) -> Section:
     numbers = _by_channel({"units": summary.get("units")} | dict(about))
     facts = []
     if is_number(about.get("horizon")):
-        facts.append(f"horizon {number(about['horizon'])} s")
+        facts.append(f"horizon {format_number(about['horizon'])} s")
     if is_number(about.get("windows")):
-        facts.append(f"{number(about['windows'])} windows")
+        facts.append(f"{format_number(about['windows'])} windows")
     found = {
         "text": about.get("text"),
         "facts": ", ".join(facts) if numbers.rows else "",
@@ -225,31 +235,33 @@ def extra_tables(summary: Summary) -> list[dict[str, Any]]:
             for i in range(len(entry["columns"]))
             if any(isinstance(row[i], str) for row in rows)
         ]
-        cells = [[shown("", cell) for cell in row] for row in rows]
+        cells = [[format_value("", cell) for cell in row] for row in rows]
         many = len(entry["columns"]) > NARROW
-        drawn = table(entry["columns"], cells, words=words, cards=many, prose=False)
+        drawn = make_table(
+            entry["columns"], cells, words=words, cards=many, prose=False
+        )
         title = entry.get("title", "")
         parts.append({"title": title, "table": drawn, "note": entry.get("note")})
     return parts
 
 
-def claims(summary: Summary) -> Table | None:
+def claims_section(summary: Summary) -> ReportTable | None:
     """What a reproduction claims, and whether it holds here."""
     rows = [
         [
-            Cell(name=name.replace("_", " ")),
-            Cell(
+            TableCell(name=name.replace("_", " ")),
+            TableCell(
                 chip=("good", "holds")
                 if entry.get("holds")
                 else ("bad", "does not hold")
             ),
-            shown("", entry.get("figure")),
-            Cell(why=entry.get("text") or ""),
+            format_value("", entry.get("figure")),
+            TableCell(why=entry.get("text") or ""),
         ]
         for name, entry in (summary.get("claims") or {}).items()
     ]
     columns = ["claim", "", "figure", ""]
-    return table(columns, rows, words=(0, 1, 2, 3), cards=True) if rows else None
+    return make_table(columns, rows, words=(0, 1, 2, 3), cards=True) if rows else None
 
 
 def claims_in_a_sentence(summary: Summary) -> str:

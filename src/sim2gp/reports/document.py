@@ -11,9 +11,9 @@ from sim2gp.reports import data, parameters
 from sim2gp.reports.animation import player
 from sim2gp.reports.experiment import experiment
 from sim2gp.reports.glance import glance, unique
-from sim2gp.reports.numbers import duration, is_number, number
+from sim2gp.reports.numbers import format_duration, format_number, is_number
 from sim2gp.reports.parameters import Arrays, Section, Summary
-from sim2gp.reports.returns import returns
+from sim2gp.reports.returns import returns_section
 from sim2gp.reports.template import asset, render
 from sim2gp.reports.traces import traces
 
@@ -29,7 +29,7 @@ _FACTS = {
 }
 
 
-def _said(item: object) -> str:
+def _warning_text(item: object) -> str:
     """One warning as text, whether it came as a string or as {code, text}."""
     if isinstance(item, Mapping):
         code, text = item.get("code", ""), item.get("text") or item.get("message", "")
@@ -37,12 +37,12 @@ def _said(item: object) -> str:
     return str(item)
 
 
-def _named(summary: Summary, verdict: str) -> str:
+def _names_with_verdict(summary: Summary, verdict: str) -> str:
     entries: Mapping[str, Any] = summary.get("parameters") or {}
     return ", ".join(n for n, e in entries.items() if e.get("verdict") == verdict)
 
 
-def _problems(summary: Summary) -> list[tuple[str, str]]:
+def _report_problems(summary: Summary) -> list[tuple[str, str]]:
     """What a reader must know before any number: pairs of weight and words."""
     found: list[tuple[str, str]] = []
     status = summary.get("status")
@@ -50,11 +50,11 @@ def _problems(summary: Summary) -> list[tuple[str, str]]:
         found.append(("bad", "The fit did not converge; its numbers are not a result."))
     elif status and str(status) not in ("ok", "done", "converged", "complete"):
         found.append(("bad", f"Status: {status}."))
-    pressed = _named(summary, "at_bound")
+    pressed = _names_with_verdict(summary, "at_bound")
     if pressed:
         text = "The data press these against the edge of their range"
         found.append(("bad", f"{text}: {pressed}."))
-    idle = _named(summary, "dead")
+    idle = _names_with_verdict(summary, "dead")
     if idle:
         found.append(("bad", f"The data do not depend on: {idle}."))
     misfit = summary.get("misfit")
@@ -66,19 +66,19 @@ def _problems(summary: Summary) -> list[tuple[str, str]]:
         verdict = misfit.get("verdict") or "The residuals contradict the model."
         found.append(("warn", str(verdict)))
     for item in summary.get("prior_conflicts") or ():
-        found.append(("warn", f"Data against prior: {_said(item)}"))
+        found.append(("warn", f"Data against prior: {_warning_text(item)}"))
     flat = [d for d in summary.get("directions") or () if d.get("flat")]
     if flat:
         noun = "combination is" if len(flat) == 1 else "combinations are"
         text = f"{len(flat)} {noun} left open by the data (see Combinations)"
         found.append(("warn", f"{text}."))
-    found += [("warn", _said(item)) for item in summary.get("warnings") or ()]
+    found += [("warn", _warning_text(item)) for item in summary.get("warnings") or ()]
     return unique(found)
 
 
-def _status(summary: Summary) -> dict[str, Any]:
+def _status_box(summary: Summary) -> dict[str, Any]:
     """The box at the top: what went wrong, or that nothing did."""
-    found = _problems(summary)
+    found = _report_problems(summary)
     return {
         "problems": [words for _, words in found],
         "tone": "bad" if any(weight == "bad" for weight, _ in found) else "warn",
@@ -86,12 +86,12 @@ def _status(summary: Summary) -> dict[str, Any]:
     }
 
 
-def _headline(summary: Summary) -> str:
+def _report_headline(summary: Summary) -> str:
     """What came out, in a sentence; of a study how many claims hold."""
     return str(summary.get("headline") or "") or data.claims_in_a_sentence(summary)
 
 
-def _made(summary: Summary) -> Section:
+def _provenance_section(summary: Summary) -> Section:
     """Command line, size, time and versions."""
     rows: list[tuple[str, object]] = []
     line = summary.get("command_line")
@@ -99,15 +99,17 @@ def _made(summary: Summary) -> Section:
         line = shlex.join(map(str, line))
     for key, words in _FACTS.items():
         if is_number(summary.get(key)):
-            rows.append((words, number(summary[key], 4)))
+            rows.append((words, format_number(summary[key], 4)))
     latency = summary.get("latency_ms")
     if isinstance(latency, Mapping):
-        parts = [f"{name} {number(value)} ms" for name, value in latency.items()]
+        parts = [f"{name} {format_number(value)} ms" for name, value in latency.items()]
         rows.append(("latency", ", ".join(parts)))
     if is_number(summary.get("interaction_seconds")):
-        rows.append(("real interaction", duration(summary["interaction_seconds"])))
+        rows.append(
+            ("real interaction", format_duration(summary["interaction_seconds"]))
+        )
     if is_number(summary.get("wall_seconds")):
-        rows.append(("wall time", duration(summary["wall_seconds"])))
+        rows.append(("wall time", format_duration(summary["wall_seconds"])))
     if summary.get("seed") is not None:
         rows.append(("seed", summary["seed"]))
     if summary.get("device"):
@@ -118,14 +120,14 @@ def _made(summary: Summary) -> Section:
     return {"command": line, "rows": rows} if line or rows else None
 
 
-def _machine(summary: Summary, arrays: Arrays) -> Section:
+def _machine_section(summary: Summary, arrays: Arrays) -> Section:
     about, state = summary.get("animation"), arrays.get("animation/state")
     if not about or state is None or len(state) < 2:
         return None
     return player(about, arrays)
 
 
-def _figure(summary: Summary, arrays: Arrays) -> Section:
+def _figure_section(summary: Summary, arrays: Arrays) -> Section:
     """The paper's figure that this run reproduces."""
     from sim2gp.reports.figure1 import figure1, figure_bytes
     from sim2gp.reports.figure2 import figure2
@@ -171,20 +173,24 @@ def _figure(summary: Summary, arrays: Arrays) -> Section:
 
 def _sections(summary: Summary, arrays: Arrays) -> list[dict[str, Any]]:
     """What there is to show, in the order in which a reader asks for it."""
-    figure, scored = _figure(summary, arrays), returns(summary, arrays)
-    machine = ("machine", "The machine", _machine(summary, arrays))
+    figure, scored = _figure_section(summary, arrays), returns_section(summary, arrays)
+    machine = ("machine", "The machine", _machine_section(summary, arrays))
     title = figure["title"] if figure else ""
     found: list[tuple[str, str, Any]] = [
-        ("claims", "Claims", data.claims(summary)),
+        ("claims", "Claims", data.claims_section(summary)),
         ("figure", title, figure),
         *([machine] if scored else []),
         ("returns", "Returns", scored),
         ("experiment", "The experiment", experiment(summary, arrays)),
-        ("parameters", "Parameters", parameters.parameter_table(summary)),
-        ("directions", "Combinations", parameters.directions(summary)),
+        ("parameters", "Parameters", parameters.parameter_section(summary)),
+        ("directions", "Combinations", parameters.directions_section(summary)),
         ("misfit", "Noise and misfit", data.noise_and_misfit(summary)),
-        ("heldout", "Prediction of held-out data", data.held_out(summary, arrays)),
-        ("calibration", "Calibration", data.calibration(summary, arrays)),
+        (
+            "heldout",
+            "Prediction of held-out data",
+            data.held_out_section(summary, arrays),
+        ),
+        ("calibration", "Calibration", data.calibration_section(summary, arrays)),
         *([] if scored else [machine]),
         ("traces", "Measured against simulated", traces(summary, arrays)),
         (
@@ -198,7 +204,7 @@ def _sections(summary: Summary, arrays: Arrays) -> list[dict[str, Any]]:
             parameters.correlations(summary, arrays),
         ),
         ("tables", "More numbers", data.extra_tables(summary)),
-        ("made", "How this was made", _made(summary)),
+        ("made", "How this was made", _provenance_section(summary)),
     ]
     return [
         {
@@ -227,8 +233,8 @@ def write_report(summary: Summary, arrays: Arrays) -> str:
         style=Markup(asset("page.css")),
         player=Markup(asset("player.js")),
         tables_script=Markup(asset("tables.js")),
-        status=_status(summary),
-        headline="" if answers else _headline(summary),
+        status=_status_box(summary),
+        headline="" if answers else _report_headline(summary),
         glance=answers,
         sections=sections,
     )

@@ -25,11 +25,12 @@ def experiment(summary: Summary, arrays: Arrays) -> Section:
         return _chart(name, str(units.get(name, "")), t, values, box)
 
     commands = [
-        drawn(name, t[:-1], "command") for name in _names(arrays, "design/command/")
+        drawn(name, t[:-1], "command")
+        for name in _names_under(arrays, "design/command/")
     ]
     states = [
         drawn(name, t, "state", "low", "high")
-        for name in _names(arrays, "design/state/")
+        for name in _names_under(arrays, "design/state/")
     ]
     share = summary.get("violations")
     checked = summary.get("draws_checked")
@@ -40,17 +41,17 @@ def experiment(summary: Summary, arrays: Arrays) -> Section:
         if isinstance(share, float)
         else ""
     )
-    kept += _said(summary)
+    kept += _posterior_sentence(summary)
     return {"kept": kept, "commands": commands, "states": states}
 
 
-def _said(summary: Summary) -> str:
+def _posterior_sentence(summary: Summary) -> str:
     """Which of two posteriors was used where, and why they differ."""
     which, why = summary.get("posterior"), summary.get("why")
     return f" {which}. {why or ''}" if isinstance(which, str) else ""
 
 
-def _names(arrays: Arrays, prefix: str) -> list[str]:
+def _names_under(arrays: Arrays, prefix: str) -> list[str]:
     return [key.removeprefix(prefix) for key in arrays if key.startswith(prefix)]
 
 

@@ -76,16 +76,16 @@ def arm_drawing(
     axes.set_axis_off()
 
 
-def _belief(arrays: Arrays, stage: str) -> tuple[np.ndarray, np.ndarray]:
+def _belief_moments(arrays: Arrays, stage: str) -> tuple[np.ndarray, np.ndarray]:
     """Mean (p,) and covariance (p, p) of one belief in virtual space."""
     mean = np.asarray(arrays[f"figure1/{stage}/mean"], dtype=float)
     scale = np.asarray(arrays[f"figure1/{stage}/scale"], dtype=float)
     return mean, scale @ scale.T
 
 
-def _range(arrays: Arrays, index: int) -> tuple[float, float]:
+def _axis_range(arrays: Arrays, index: int) -> tuple[float, float]:
     """The axis of one virtual parameter: the prior's bulk and the truth."""
-    mean, cov = _belief(arrays, "prior")
+    mean, cov = _belief_moments(arrays, "prior")
     sd = np.sqrt(cov[index, index])
     low, high = mean[index] - 2.6 * sd, mean[index] + 2.6 * sd
     truth = arrays.get("figure1/truth")
@@ -96,9 +96,9 @@ def _range(arrays: Arrays, index: int) -> tuple[float, float]:
 
 def marginal(axes: "Axes", arrays: Arrays, index: int, stages: Sequence[str]) -> None:
     """Marginal densities of one virtual parameter, each scaled to its peak."""
-    low, high = _range(arrays, index)
+    low, high = _axis_range(arrays, index)
     for stage in stages:
-        mean, cov = _belief(arrays, stage)
+        mean, cov = _belief_moments(arrays, stage)
         sd = float(np.sqrt(cov[index, index]))
         near = mean[index] + sd * np.linspace(-5, 5, 201)
         at = np.unique(np.clip(np.r_[np.linspace(low, high, 201), near], low, high))
@@ -121,7 +121,7 @@ def pair(axes: "Axes", arrays: Arrays, i: int, j: int, stages: Sequence[str]) ->
     angle = np.linspace(0, 2 * np.pi, 121)
     circle = np.stack([np.cos(angle), np.sin(angle)])
     for stage in stages:
-        mean, cov = _belief(arrays, stage)
+        mean, cov = _belief_moments(arrays, stage)
         block = cov[np.ix_([i, j], [i, j])]
         root = np.linalg.cholesky(block)
         colour = STAGES[stage][0]
@@ -132,8 +132,8 @@ def pair(axes: "Axes", arrays: Arrays, i: int, j: int, stages: Sequence[str]) ->
     truth = arrays.get("figure1/truth")
     if truth is not None:
         axes.plot([truth[i]], [truth[j]], "+", color=_INK, ms=6, mew=1.1, zorder=9)
-    axes.set_xlim(*_range(arrays, i))
-    axes.set_ylim(*_range(arrays, j))
+    axes.set_xlim(*_axis_range(arrays, i))
+    axes.set_ylim(*_axis_range(arrays, j))
 
 
 def _prediction(
@@ -160,7 +160,7 @@ def _prediction(
     axes.set_ylim(low - pad, high + pad)
 
 
-def _labels(summary: Summary) -> list[str]:
+def _parameter_labels(summary: Summary) -> list[str]:
     """Names of the virtual parameters, with a tilde."""
     short = {"mass": "m", "damping": "b"}
     names = []
@@ -192,7 +192,7 @@ def _compare(
             if column == 0:
                 axes.set_title(title, loc="left", fontsize=8.5)
         return
-    names = _labels(summary)
+    names = _parameter_labels(summary)
     inner = grid.subgridspec(1, len(names), wspace=0.12)
     for index, name in enumerate(names):
         axes = figure.add_subplot(inner[index])
@@ -204,7 +204,7 @@ def _compare(
 
 def _corner(figure: "Figure", grid: Any, arrays: Arrays, summary: Summary) -> None:
     """Panel (d): all marginals and pairs in virtual space."""
-    names = _labels(summary)
+    names = _parameter_labels(summary)
     count = len(names)
     stages = [stage for stage in STAGES if f"figure1/{stage}/mean" in arrays]
     inner = grid.subgridspec(count, count, wspace=0.10, hspace=0.10)

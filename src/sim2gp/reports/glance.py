@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from statistics import median
 from typing import Any
 
-from sim2gp.reports.numbers import number
+from sim2gp.reports.numbers import format_number
 from sim2gp.reports.parameters import Summary
 
 MANY = 4  # names that a sentence lists
@@ -20,10 +20,10 @@ def glance(summary: Summary) -> dict[str, str]:
         return {}
     return {
         "What was learned": str(summary.get("headline") or ""),
-        "How sure": _sure(summary),
+        "How sure": _width_answer(summary),
         "Does it predict": _predicts(summary),
-        "What is missing": _missing(summary),
-        "What next": _next(summary),
+        "What is missing": _misfit_answer(summary),
+        "What next": _next_command(summary),
     }
 
 
@@ -32,7 +32,7 @@ def _entries(summary: Summary) -> Mapping[str, Mapping[str, Any]]:
     return found
 
 
-def _sure(summary: Summary) -> str:
+def _width_answer(summary: Summary) -> str:
     """How wide the intervals are, and what they allow for."""
     shares = [
         100.0 * entry["sd"] / abs(entry["mean"])
@@ -41,9 +41,10 @@ def _sure(summary: Summary) -> str:
     ]
     said = []
     if shares:
-        words = f"Standard deviations are {number(median(shares), 2)} % of the values"
+        middle = format_number(median(shares), 2)
+        words = f"Standard deviations are {middle} % of the values"
         if len(shares) > 1:
-            words += f" (median; at most {number(max(shares), 2)} %)"
+            words += f" (median; at most {format_number(max(shares), 2)} %)"
         said.append(f"{words}.")
     which = (summary.get("intervals") or {}).get("which")
     if which == "corrected":
@@ -62,7 +63,7 @@ def _predicts(summary: Summary) -> str:
     return str(about.get("headline") or about.get("text") or "Not asked (--quick).")
 
 
-def _missing(summary: Summary) -> str:
+def _misfit_answer(summary: Summary) -> str:
     """What the residuals say of the model."""
     misfit = summary.get("misfit") or {}
     if misfit.get("alarm"):
@@ -70,7 +71,7 @@ def _missing(summary: Summary) -> str:
     return str(misfit.get("verdict") or "")
 
 
-def _next(summary: Summary) -> str:
+def _next_command(summary: Summary) -> str:
     """The command that helps most."""
     misfit = summary.get("misfit") or {}
     if misfit.get("alarm"):
@@ -81,7 +82,7 @@ def _next(summary: Summary) -> str:
         if entry.get("verdict") not in ("identified", "dead")
     ]
     if open_:
-        names = _listed(open_)
+        names = _first_names(open_)
         return f"sim2gp design RUN: an experiment that tells more of {names}."
     longer = summary.get("longer") or {}
     if longer.get("advised") and longer.get("text"):
@@ -92,10 +93,10 @@ def _next(summary: Summary) -> str:
     )
 
 
-def _listed(names: Sequence[str]) -> str:
+def _first_names(names: Sequence[str]) -> str:
     shown = ", ".join(names[:MANY])
     rest = len(names) - MANY
-    return f"{shown} and {number(rest)} more" if rest > 0 else shown
+    return f"{shown} and {format_number(rest)} more" if rest > 0 else shown
 
 
 def unique(problems: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:

@@ -21,7 +21,7 @@ def mismatch_map(
     about = summary["mismatch"]
     rows, columns = about["conditions"], about["methods"]
     score = np.asarray(
-        [[_last(arrays[f"mismatch/{r}/{c}"]) for c in columns] for r in rows]
+        [[_last_median(arrays[f"mismatch/{r}/{c}"]) for c in columns] for r in rows]
     )
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(5.4, 0.9 + 0.3 * len(rows)), layout="constrained")
@@ -44,7 +44,7 @@ def mismatch_map(
     return figure
 
 
-def _last(score: np.ndarray) -> float:
+def _last_median(score: np.ndarray) -> float:
     """The median of the last episode; an episode that was not run scores nothing."""
     last = np.where(np.isfinite(score[:, -1]), score[:, -1], 0.0)
     return float(np.median(last))

@@ -44,7 +44,7 @@ def film(
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Summary entry "animation" and its arrays; both empty for an unknown machine.
 
-    ``picture`` is what `drawn` of the forecasts made of ``grid``. Of a machine in
+    ``picture`` is what `forecast_traces` made of ``grid``. Of a machine in
     several configurations the film keeps to that of its first window.
     """
     machine = plant_of(system)
@@ -59,7 +59,7 @@ def film(
     joints = [n for n in names if not n.endswith((".velocity", ".activation"))]
     columns = {names[i]: c for c, i in enumerate(grid.windows.outputs)}
     motion = [_motion(x, y, columns, joints) for x in (mean, y)]
-    constants = _constants(system, posterior, int(configuration[0]))
+    constants = _posterior_constants(system, posterior, int(configuration[0]))
     dt = float(time[0, 1] - time[0, 0])
     about, arrays = _drawing(machine, constants, motion, dt)
     if not about:
@@ -72,7 +72,7 @@ def film(
         title = f"{title}; {', '.join(unseen)} was not measured and is drawn at zero"
     actions = [c.name for c in system.actions][:2]
     each = list(zip(grid.log[which], time, strict=True))
-    held = np.concatenate([_held(logs[k], t, system)[:, :2] for k, t in each])
+    held = np.concatenate([_held_inputs(logs[k], t, system)[:, :2] for k, t in each])
     marks = [
         {"time": n * dt * len(t), "text": f"{logs[k].name}, from {t[0]:.1f} s"}
         for n, (k, t) in enumerate(each)
@@ -92,7 +92,7 @@ def film(
     }
 
 
-def _held(
+def _held_inputs(
     log: Log, time: Float[np.ndarray, " T"], system: AbstractSystem
 ) -> Float[np.ndarray, "T m"]:
     """The inputs of a log at some times."""
@@ -103,7 +103,7 @@ def _held(
 
 
 @in_float64
-def _constants(
+def _posterior_constants(
     system: AbstractSystem, posterior: Gaussian, configuration: int
 ) -> dict[str, float]:
     values = system.values(np.asarray(posterior.mean, float), configuration)
@@ -152,7 +152,7 @@ def _drawing(
     points = figure.moving.astype(np.float32)
     half = len(motion[0])
     entry = figure_entry(figure)
-    frames = _frames(model, motion, skeleton(entry, points), round(FRAME / dt))
+    frames = _rendered_frames(model, motion, skeleton(entry, points), round(FRAME / dt))
     return {"system": "figure", "figure": entry} | frames[0], {
         "animation/points": points[:half],
         "animation/recorded_points": points[half:],
@@ -160,19 +160,19 @@ def _drawing(
     }
 
 
-def _frames(
+def _rendered_frames(
     model: Any, motion: list[np.ndarray], scene: "Scene", least: int
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """MuJoCo's own pictures, seen as the stick figure is; empty where it has none.
 
     One each ``least`` rows, or fewer if they would be too many.
     """
-    from sim2gp.systems.mujoco.film import MOST, rendered
+    from sim2gp.systems.mujoco.film import MOST, render_motion
 
     every = max(1, least, -(-len(motion[0]) // MOST))
     width, height = scene.width * 3 // 4, scene.height * 3 // 4
     camera = scene.camera
-    found = rendered(
+    found = render_motion(
         model,
         motion[1][::every],
         motion[0][::every],

@@ -14,7 +14,7 @@ from sim2gp.runs import load_run as loaded
 
 
 @runtime_checkable
-class Reported(Protocol):
+class HasReport(Protocol):
     """Whatever a report can be drawn of."""
 
     @property
@@ -24,7 +24,7 @@ class Reported(Protocol):
 
 
 @dataclass(frozen=True)
-class Shown:
+class NotebookReport:
     """A report that notebooks draw; elsewhere a line of text."""
 
     page: str
@@ -71,11 +71,11 @@ def _main_table(summary: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]
     return [], []
 
 
-def show(run: Reported | Path | str) -> Shown:
+def show(run: HasReport | Path | str) -> NotebookReport:
     """The report of a result, or of a run's folder, for a notebook.
 
     Raises E130, E183 or E185 for a folder that is not a finished run.
     """
     found = loaded(run) if isinstance(run, Path | str) else run
     name = str(found.summary.get("title") or found.summary.get("command"))
-    return Shown(write_report(found.summary, found.arrays), name)
+    return NotebookReport(write_report(found.summary, found.arrays), name)

@@ -39,18 +39,18 @@ def unit_text(unit: object) -> str:
     return re.sub(r"\^(-?\d+)", lambda m: m[1].translate(_SUPERSCRIPT), str(unit or ""))
 
 
-def _power(exponent: int) -> str:
+def _power_suffix(exponent: int) -> str:
     return f" × {power_of_ten(exponent)}" if exponent else ""
 
 
-def _fixed(value: float, decimals: int) -> str:
+def _fixed_point(value: float, decimals: int) -> str:
     text = f"{value:.{max(decimals, 0)}f}"
     if float(text) == 0:
         text = text.lstrip("-")
     return text.replace("-", "−")
 
 
-def number(value: object, digits: int = 3) -> str:
+def format_number(value: object, digits: int = 3) -> str:
     """The number with so many significant digits, or a dash where there is none."""
     if not is_number(value):
         return MISSING
@@ -59,40 +59,42 @@ def number(value: object, digits: int = 3) -> str:
         return f"{int(value):,}".replace(",", "\u202f").replace("-", "−")
     exponent = _shared_exponent(x)
     if exponent == 0 and abs(x) >= 10_000:
-        return number(round(x))
+        return format_number(round(x))
     scaled = x / 10.0**exponent
-    return _fixed(scaled, digits - 1 - _exponent(scaled)) + _power(exponent)
+    return _fixed_point(scaled, digits - 1 - _exponent(scaled)) + _power_suffix(
+        exponent
+    )
 
 
 def plus_minus(mean: object, sd: object) -> str:
     """Mean and standard deviation to the two leading digits of the latter."""
     if not (is_number(mean) and is_number(sd)):
-        return number(mean)
+        return format_number(mean)
     m, s = float(mean), float(sd)  # type: ignore[arg-type]
     if s <= 0:
-        return number(m)
+        return format_number(m)
     exponent = _shared_exponent(m, s)
     decimals = 1 - _exponent(s / 10.0**exponent)
     m, s = m / 10.0**exponent, s / 10.0**exponent
-    text = f"{_fixed(m, decimals)} ± {_fixed(s, decimals)}"
-    return f"({text}){_power(exponent)}" if exponent else text
+    text = f"{_fixed_point(m, decimals)} ± {_fixed_point(s, decimals)}"
+    return f"({text}){_power_suffix(exponent)}" if exponent else text
 
 
-def interval(low: object, high: object) -> str:
+def format_interval(low: object, high: object) -> str:
     """An interval with as many digits as its width deserves."""
     if not (is_number(low) and is_number(high)):
         return MISSING
     a, b = float(low), float(high)  # type: ignore[arg-type]
     if a > 0 and b > 20 * a:  # decades apart: each with its own digits
-        return f"{number(a, 2)} to {number(b, 2)}"
+        return f"{format_number(a, 2)} to {format_number(b, 2)}"
     exponent = _shared_exponent(a, b)
     a, b = a / 10.0**exponent, b / 10.0**exponent
     decimals = 1 - _exponent((b - a) / 4) if b > a else 3
-    text = f"{_fixed(a, decimals)} to {_fixed(b, decimals)}"
-    return f"({text}){_power(exponent)}" if exponent else text
+    text = f"{_fixed_point(a, decimals)} to {_fixed_point(b, decimals)}"
+    return f"({text}){_power_suffix(exponent)}" if exponent else text
 
 
-def percent(share: object) -> str:
+def format_percent(share: object) -> str:
     """A share as a percentage."""
     if not is_number(share):
         return MISSING
@@ -100,13 +102,13 @@ def percent(share: object) -> str:
     return f"{value:.1f} %"
 
 
-def duration(seconds: object) -> str:
+def format_duration(seconds: object) -> str:
     """Seconds in words that fit their size."""
     if not is_number(seconds):
         return MISSING
     s = float(seconds)  # type: ignore[arg-type]
     if s < 100:
-        return f"{number(s)} s"
+        return f"{format_number(s)} s"
     minutes, rest = divmod(round(s), 60)
     if minutes < 100:
         return f"{minutes} min {rest:02d} s"

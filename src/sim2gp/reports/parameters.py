@@ -9,13 +9,13 @@ from markupsafe import Markup, escape
 from sim2gp.reports import densities, svg
 from sim2gp.reports.numbers import (
     MISSING,
-    interval,
+    format_interval,
+    format_number,
     is_number,
-    number,
     plus_minus,
     unit_text,
 )
-from sim2gp.reports.tables import Cell, table
+from sim2gp.reports.tables import TableCell, make_table
 
 Summary = Mapping[str, Any]
 Arrays = Mapping[str, np.ndarray]
@@ -39,31 +39,38 @@ def verdict_chip(verdict: object) -> tuple[str, str]:
     return tone, str(verdict or MISSING).replace("_", " ")
 
 
-def _remaining(entry: Mapping[str, Any]) -> Cell:
+def _remaining(entry: Mapping[str, Any]) -> TableCell:
     """How much of the prior's spread is left, as a bar and a percentage."""
     sd, before = entry.get("sd"), entry.get("prior_sd")
     if not (is_number(sd) and is_number(before)) or not float(before) > 0:  # type: ignore[arg-type]
-        return Cell(MISSING)
+        return TableCell(MISSING)
     share = float(sd) / float(before)  # type: ignore[arg-type]
-    text = f"{number(100 * share, 2)} %" if share < 0.1 else f"{100 * share:.0f} %"
-    return Cell(text, share=f"{100 * min(share, 1.0):.0f}%")
+    text = (
+        f"{format_number(100 * share, 2)} %" if share < 0.1 else f"{100 * share:.0f} %"
+    )
+    return TableCell(text, share=f"{100 * min(share, 1.0):.0f}%")
 
 
-def _interval(entry: Mapping[str, Any]) -> Cell:
+def _interval(entry: Mapping[str, Any]) -> TableCell:
     """The run's interval; below it the plain one, where that is another."""
-    text, plain = interval(entry.get("q025"), entry.get("q975")), entry.get("plain")
+    text, plain = (
+        format_interval(entry.get("q025"), entry.get("q975")),
+        entry.get("plain"),
+    )
     if not isinstance(plain, Mapping):
-        return Cell(text)
-    return Cell(text, why=f"plain: {interval(plain.get('q025'), plain.get('q975'))}")
+        return TableCell(text)
+    return TableCell(
+        text, why=f"plain: {format_interval(plain.get('q025'), plain.get('q975'))}"
+    )
 
 
-def _row(name: str, entry: Mapping[str, Any], truth: bool) -> list[object]:
+def _parameter_row(name: str, entry: Mapping[str, Any], truth: bool) -> list[object]:
     verdict = entry.get("verdict")
     why = entry.get("note") or VERDICTS.get(str(verdict), ("", ""))[1]
     if verdict == "identified":  # its note says by how much, as "spread left" does
         why = VERDICTS["identified"][1]
     row: list[object] = [
-        Cell(name=name, why=entry.get("meaning") or ""),
+        TableCell(name=name, why=entry.get("meaning") or ""),
         unit_text(entry.get("unit")) or "1",
         plus_minus(entry.get("prior_mean"), entry.get("prior_sd")),
         plus_minus(entry.get("mean"), entry.get("sd")),
@@ -71,11 +78,11 @@ def _row(name: str, entry: Mapping[str, Any], truth: bool) -> list[object]:
         _remaining(entry),
     ]
     if truth:
-        row.append(number(entry.get("truth"), 4))
-    return [*row, Cell(chip=verdict_chip(verdict), why=why)]
+        row.append(format_number(entry.get("truth"), 4))
+    return [*row, TableCell(chip=verdict_chip(verdict), why=why)]
 
 
-def parameter_table(summary: Summary) -> Section:
+def parameter_section(summary: Summary) -> Section:
     """Prior, posterior and verdict of every parameter."""
     entries: Mapping[str, Any] = summary.get("parameters") or {}
     if not entries:
@@ -83,12 +90,12 @@ def parameter_table(summary: Summary) -> Section:
     truth = any(is_number(entry.get("truth")) for entry in entries.values())
     columns = ["parameter", "unit", "prior", "posterior", "95 % interval"]
     columns += ["spread left", *(["truth"] if truth else []), "verdict"]
-    rows = [_row(name, entry, truth) for name, entry in entries.items()]
+    rows = [_parameter_row(name, entry, truth) for name, entry in entries.items()]
     # Which intervals these are; what --longer, --check and --nuts found.
     about = [summary.get(key) for key in ("intervals", "longer", "check", "nuts")]
     return {
         "said": [x.get("text") for x in about if isinstance(x, Mapping)],
-        "table": table(columns, rows, words=(0, 1, len(columns) - 1), cards=True),
+        "table": make_table(columns, rows, words=(0, 1, len(columns) - 1), cards=True),
     }
 
 
@@ -103,7 +110,7 @@ def _area(axes: svg.Axes, draws: np.ndarray, axis: densities.View, css: str) -> 
     )
 
 
-def _density(
+def _density_chart(
     name: str,
     entry: Mapping[str, Any],
     prior: np.ndarray | None,
@@ -125,7 +132,7 @@ def _density(
     caption = plus_minus(entry.get("mean"), entry.get("sd"))
     if truth is not None and is_number(entry.get("sd")) and float(entry["sd"]) > 0:
         away = (float(entry["mean"]) - truth) / float(entry["sd"])
-        caption += f"; truth {number(truth, 4)}, {abs(away):.1f} sd away"
+        caption += f"; truth {format_number(truth, 4)}, {abs(away):.1f} sd away"
     before = plus_minus(entry.get("prior_mean"), entry.get("prior_sd"))
     said = "" if before == MISSING else f"{before} before the data, "
     said += "a curve" if caption == MISSING else f"{caption} after the data"
@@ -145,7 +152,9 @@ def parameter_densities(summary: Summary, arrays: Arrays) -> Section:
         return None
     before = arrays.get("parameters/prior_samples")
     drawn = [
-        _density(name, entry, None if before is None else before[:, i], samples[:, i])
+        _density_chart(
+            name, entry, None if before is None else before[:, i], samples[:, i]
+        )
         for i, (name, entry) in enumerate(entries.items())
     ]
     keys = [] if before is None else [("quiet", "prior")]
@@ -213,7 +222,7 @@ def _strongest(names: list[str], correlation: np.ndarray) -> str:
         return "posterior correlations: none is known"
     off = np.where(below, np.abs(correlation), -1.0)  # what is not known never wins
     i, j = np.unravel_index(int(np.argmax(off)), off.shape)
-    r = number(float(correlation[i, j]), 2)
+    r = format_number(float(correlation[i, j]), 2)
     return f"posterior correlations: the strongest is {r}, of {names[i]} and {names[j]}"
 
 
@@ -226,18 +235,18 @@ def correlations(summary: Summary, arrays: Arrays) -> Section:
     return {"drawing": _matrix(list(entries), matrix)}
 
 
-def _direction(entry: Mapping[str, Any]) -> dict[str, Any]:
+def _direction_row(entry: Mapping[str, Any]) -> dict[str, Any]:
     text, combination = entry.get("text") or "", entry.get("combination")
     repeated, nats = str(combination) in str(text), entry.get("information")
     return {
         "text": text,
         "combination": None if repeated else combination,
-        "nats": number(nats) if is_number(nats) else None,
+        "nats": format_number(nats) if is_number(nats) else None,
         "flat": bool(entry.get("flat")),
     }
 
 
-def directions(summary: Summary) -> Section:
+def directions_section(summary: Summary) -> Section:
     """Which combinations of parameters the data fix, and which they leave open."""
     entries = summary.get("directions") or []
     base = summary.get("base_parameters") or []
@@ -245,15 +254,15 @@ def directions(summary: Summary) -> Section:
         return None
     rows = [
         [
-            Cell(name=unit_text(entry.get("text"))),
+            TableCell(name=unit_text(entry.get("text"))),
             plus_minus(entry.get("value"), entry.get("sd")),
             unit_text(entry.get("unit")) or "1",
-            Cell(chip=verdict_chip(entry.get("verdict"))),
+            TableCell(chip=verdict_chip(entry.get("verdict"))),
         ]
         for entry in base
     ]
     columns = ["combination", "value", "unit", "verdict"]
     return {
-        "found": [_direction(entry) for entry in entries],
-        "base": table(columns, rows, words=(0, 2, 3), cards=True),
+        "found": [_direction_row(entry) for entry in entries],
+        "base": make_table(columns, rows, words=(0, 2, 3), cards=True),
     }

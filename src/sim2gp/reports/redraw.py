@@ -12,7 +12,7 @@ from sim2gp.runs import store
 REPORT = "report.html"
 
 
-def load_run(run_dir: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def load_summary(run_dir: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Summary and arrays of a finished run (E130, E183, E185 if it is not one)."""
     run = store.load_run(run_dir)
     return run.summary, run.arrays
@@ -24,7 +24,7 @@ def redraw(run_dir: str | Path) -> Path:
     The manifest keeps the checksum of the first report; a run's reader checks only what
     a report is drawn from.
     """
-    summary, arrays = load_run(run_dir)
+    summary, arrays = load_summary(run_dir)
     path = Path(run_dir) / REPORT
     try:
         replace_file(path, write_report(summary, arrays).encode())

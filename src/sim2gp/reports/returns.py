@@ -6,9 +6,9 @@ import numpy as np
 
 from sim2gp.reports import svg
 from sim2gp.reports.data import COLOURS, colour
-from sim2gp.reports.numbers import MISSING, is_number, number
+from sim2gp.reports.numbers import MISSING, format_number, is_number
 from sim2gp.reports.parameters import Arrays, Section, Summary
-from sim2gp.reports.tables import Cell, Table, table
+from sim2gp.reports.tables import ReportTable, TableCell, make_table
 
 
 def _series(summary: Summary, arrays: Arrays) -> dict[str, np.ndarray]:
@@ -29,7 +29,7 @@ def _series(summary: Summary, arrays: Arrays) -> dict[str, np.ndarray]:
     return {name: value for name, value in known.items() if value.size}
 
 
-def _lines(axes: svg.Axes, values: np.ndarray, css: str) -> list[str]:
+def _return_marks(axes: svg.Axes, values: np.ndarray, css: str) -> list[str]:
     """One seed: its line. Many: the median, the quartiles, every seed as a dot."""
     episodes = np.arange(1.0, values.shape[1] + 1)
     if len(values) == 1:
@@ -59,7 +59,7 @@ def _episodes_to_95(summary: Summary, method: str, alone: bool) -> str:
             return "never"
         middle = f"{float(np.median(reached)):g}"
         return f"{middle} ({len(reached)} of {len(value)} seeds)"
-    return number(value) if is_number(value) else "never"
+    return format_number(value) if is_number(value) else "never"
 
 
 def _scores(summary: Summary, values: np.ndarray) -> tuple[str, str]:
@@ -67,26 +67,26 @@ def _scores(summary: Summary, values: np.ndarray) -> tuple[str, str]:
     last = float(np.nanmedian(values[:, -1]))
     oracle, hang = summary.get("oracle_return"), summary.get("hang_return")
     if not (is_number(oracle) and is_number(hang)) or oracle == hang:
-        return number(last), ""
+        return format_number(last), ""
     score = (last - float(hang)) / (float(oracle) - float(hang))  # type: ignore[arg-type]
-    return number(last), f"{score:.2f}"
+    return format_number(last), f"{score:.2f}"
 
 
-def _methods(summary: Summary, series: Mapping[str, np.ndarray]) -> Table:
+def _methods(summary: Summary, series: Mapping[str, np.ndarray]) -> ReportTable:
     rows = []
     for method, values in series.items():
         last, score = _scores(summary, values)
-        best = number(float(np.nanmedian(np.nanmax(values, axis=1))))
+        best = format_number(float(np.nanmedian(np.nanmax(values, axis=1))))
         reached = _episodes_to_95(summary, method, len(series) == 1)
-        rows.append([Cell(name=method_name(method)), reached, best, last, score])
+        rows.append([TableCell(name=method_name(method)), reached, best, last, score])
     columns = ["method", "episodes to 95 %", "best return", "last return", "score"]
-    return table(columns, rows, words=(0,), cards=True)
+    return make_table(columns, rows, words=(0,), cards=True)
 
 
 def _median(values: np.ndarray) -> str:
     """The median of what is known."""
     known = values[np.isfinite(values)]
-    return number(float(np.median(known))) if known.size else MISSING
+    return format_number(float(np.median(known))) if known.size else MISSING
 
 
 def method_name(method: str) -> str:
@@ -94,7 +94,7 @@ def method_name(method: str) -> str:
     return method.replace("_", " ")
 
 
-def returns(summary: Summary, arrays: Arrays) -> Section:
+def returns_section(summary: Summary, arrays: Arrays) -> Section:
     """Return of every episode, with the oracle's and that of doing nothing.
 
     A study has hundreds of them, and figures and tables of its own.
@@ -119,7 +119,7 @@ def returns(summary: Summary, arrays: Arrays) -> Section:
         svg.level(axes, value, "quiet", words) for words, value in references.items()
     ]
     for index, values in enumerate(series.values()):
-        marks += _lines(axes, values, colour(index))
+        marks += _return_marks(axes, values, colour(index))
     said = "; ".join(
         f"{method_name(name)} {_median(values[:, 0])} in the first episode, "
         f"{_median(values[:, -1])} in the last"

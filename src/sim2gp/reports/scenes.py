@@ -95,7 +95,7 @@ def _circle(radius: float, z: float, count: int = 48) -> Points:
     )
 
 
-def _box(low: Sequence[float], high: Sequence[float]) -> Points:
+def _box_corners(low: Sequence[float], high: Sequence[float]) -> Points:
     (x0, y0, z0), (x1, y1, z1) = low, high
     return np.array(
         [
@@ -106,7 +106,7 @@ def _box(low: Sequence[float], high: Sequence[float]) -> Points:
     )
 
 
-#: The faces of `_box`, each anticlockwise as seen from outside, with its shade.
+#: The faces of `_box_corners`, each anticlockwise as seen from outside, with its shade.
 _FACES = (
     ((4, 5, 6, 7), "steel-top"),
     ((0, 1, 5, 4), "steel"),
@@ -133,7 +133,7 @@ def furuta(state: np.ndarray, params: Mapping[str, float]) -> Scene:
     )
     floor = -1.12 * rod
     half = 0.42 * arm
-    cube = _box((-half, -half, floor), (half, half, -0.16 * rod))
+    cube = _box_corners((-half, -half, floor), (half, half, -0.16 * rod))
     disc = _circle(1.45 * arm, floor)
     hub = np.array([[0, 0, -0.16 * rod], [0, 0, 0], [0, 0, 0.03 * rod]])
     fixed = np.concatenate([disc, cube, hub])
@@ -183,7 +183,7 @@ def cartpole(state: np.ndarray, params: Mapping[str, float]) -> Scene:
     pivot = np.stack([x, zero, zero], axis=1)
     tip = pivot + pole * np.stack([np.sin(theta), zero, -np.cos(theta)], axis=1)
     half, depth, height = 0.16 * pole, 0.09 * pole, 0.075 * pole
-    corners = _box((-half, -depth, -height), (half, depth, height))
+    corners = _box_corners((-half, -depth, -height), (half, depth, height))
     body = pivot[:, None, :] + corners
     end = rail / 2 + half
     fixed = np.array(

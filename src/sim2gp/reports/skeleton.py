@@ -61,7 +61,7 @@ def skeleton(about: Mapping[str, Any], moving: Moving) -> Scene:
     return Scene((*rods, *balls), fixed, moving, camera, _WIDTH, height)
 
 
-def overlaid(scene: Scene, recorded: Moving) -> Scene:
+def overlay_motion(scene: Scene, recorded: Moving) -> Scene:
     """The scene over a second motion of its machine, drawn as a wide pale shadow."""
     first, count = len(scene.fixed), scene.moving.shape[1]
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from markupsafe import Markup, escape
 
-from sim2gp.reports.numbers import number, power_of_ten
+from sim2gp.reports.numbers import format_number, power_of_ten
 
 _TOP, _RIGHT = 26.0, 10.0
 _DIGIT_WIDTH = 6.6  # pixels of a digit of the tick labels
@@ -86,7 +86,9 @@ def extent(values: np.ndarray | float, unit: str = "") -> str:
     flat = flat[np.isfinite(flat)]
     if flat.size == 0:
         return "no values"
-    text = f"from {number(float(flat.min()))} to {number(float(flat.max()))}"
+    text = (
+        f"from {format_number(float(flat.min()))} to {format_number(float(flat.max()))}"
+    )
     return f"{text} {unit}".rstrip()
 
 
@@ -122,7 +124,7 @@ def _round_numbers(low: float, high: float) -> list[float]:
     return [value for value in steps if low <= value <= high]
 
 
-def _runs(*columns: np.ndarray) -> Iterator[tuple[np.ndarray, ...]]:
+def _finite_stretches(*columns: np.ndarray) -> Iterator[tuple[np.ndarray, ...]]:
     """The stretches over which every column is finite."""
     good = np.all([np.isfinite(c) for c in columns], axis=0)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(int), [0]])))
@@ -159,7 +161,7 @@ def line(axes: Axes, x: np.ndarray, y: np.ndarray, css: str, limit: int = 600) -
     x, y = thin(np.asarray(x, dtype=float), np.asarray(y, dtype=float), limit)
     px, py = axes.px(x), axes.py(y)
     parts = []
-    for a, b in _runs(px, py):
+    for a, b in _finite_stretches(px, py):
         if a.size == 1:
             parts.append(f'<circle class="dot {css}" cx="{a[0]:.1f}" cy="{b[0]:.1f}"/>')
         else:
@@ -195,7 +197,7 @@ def band(
     return "".join(
         f'<polygon class="band {css}" points="'
         f'{_points(np.r_[a, a[::-1]], np.r_[b, c[::-1]])}"/>'
-        for a, b, c in _runs(*columns)
+        for a, b, c in _finite_stretches(*columns)
     )
 
 

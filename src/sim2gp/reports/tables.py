@@ -4,13 +4,13 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sim2gp.reports.numbers import is_number, number, percent
+from sim2gp.reports.numbers import format_number, format_percent, is_number
 
 SHARES = ("coverage90", "coverage95", "coverage")
 
 
 @dataclass(frozen=True)
-class Cell:
+class TableCell:
     """One cell, in the order in which it is read.
 
     A bar of a ``share`` ("40%"), a ``name`` in bold, ``text``, its ``unit``, a ``chip``
@@ -32,7 +32,7 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Table:
+class ReportTable:
     """Columns and rows; ``words`` are the columns of text, not of numbers.
 
     With ``cards`` every row becomes a card of its own on a narrow screen, which begins
@@ -40,38 +40,41 @@ class Table:
     """
 
     columns: Sequence[str]
-    rows: Sequence[Sequence[Cell]]
+    rows: Sequence[Sequence[TableCell]]
     words: Collection[int]
     cards: bool = False
     prose: bool = True
 
 
-def table(
+def make_table(
     columns: Sequence[str],
     rows: Iterable[Sequence[object]],
     *,
     words: Collection[int],
     cards: bool = False,
     prose: bool = True,
-) -> Table:
+) -> ReportTable:
     """A table whose cells may be plain text."""
     cells = [
-        [x if isinstance(x, Cell) else Cell("" if x is None else x) for x in row]
+        [
+            x if isinstance(x, TableCell) else TableCell("" if x is None else x)
+            for x in row
+        ]
         for row in rows
     ]
-    return Table(columns, cells, words, cards, prose)
+    return ReportTable(columns, cells, words, cards, prose)
 
 
-def shown(key: str, value: object) -> object:
+def format_value(key: str, value: object) -> object:
     """A value of a summary as text."""
     if key in SHARES:
-        return percent(value)
+        return format_percent(value)
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return number(value) if is_number(value) or value is None else value
+    return format_number(value) if is_number(value) or value is None else value
 
 
-def records(entries: Mapping[str, Any], first: str) -> Table:
+def records(entries: Mapping[str, Any], first: str) -> ReportTable:
     """A table of named entries: one column for every key that any of them has."""
     rows = {
         name: value if isinstance(value, Mapping) else {"value": value}
@@ -83,10 +86,10 @@ def records(entries: Mapping[str, Any], first: str) -> Table:
         for index, key in enumerate(keys)
         if any(isinstance(row.get(key), str) for row in rows.values())
     ]
-    return table(
+    return make_table(
         [first, *(key.replace("_", " ") for key in keys)],
         [
-            [Cell(name=name), *(shown(key, row.get(key)) for key in keys)]
+            [TableCell(name=name), *(format_value(key, row.get(key)) for key in keys)]
             for name, row in rows.items()
         ],
         words=(0, *words),

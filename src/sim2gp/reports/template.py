@@ -21,7 +21,7 @@ def breakable(name: object) -> Markup:
     return Markup(re.sub(r"([_/.])(?=\w)", r"\1<wbr>", str(escape(name))))
 
 
-def coded(text: object) -> Markup:
+def code_markup(text: object) -> Markup:
     """Text in which what stands between backticks is code."""
     return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))
 
@@ -37,7 +37,7 @@ def _environment() -> "Environment":
         trim_blocks=True,
         keep_trailing_newline=True,
     )
-    made.filters |= {"breakable": breakable, "coded": coded}
+    made.filters |= {"breakable": breakable, "coded": code_markup}
     return made
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from markupsafe import Markup
 
 from sim2gp.reports import svg
-from sim2gp.reports.numbers import number
+from sim2gp.reports.numbers import format_number
 from sim2gp.reports.parameters import Arrays, Section, Summary
 
 #: Drawings; more would make the page heavy, not clearer.
@@ -69,7 +69,9 @@ def _trace(
     if {"measured", "predicted"} <= curves.keys():
         gap = curves["predicted"] - curves["measured"]
         if np.isfinite(gap).any():
-            remark = f"rms difference {number(float(np.sqrt(np.nanmean(gap**2))))}"
+            remark = (
+                f"rms difference {format_number(float(np.sqrt(np.nanmean(gap**2))))}"
+            )
     kinds = " and ".join(kind for kind in ("measured", "predicted") if kind in curves)
     said = f"{kinds}, time {svg.extent(time, 's')}" + (f"; {remark}" if remark else "")
     return svg.chart(

@@ -53,7 +53,7 @@ def export_policy(policy: Policy, out: Path | str, system: AbstractSystem) -> No
         "format": FORMAT,
         "layers": len(policy.actor.weights),
         "angle": angle,
-        **_channels(system),
+        **_channel_entries(system),
     }
     plain = {name: np.asarray(x, np.float32) for name, x in arrays.items()}
     summary = {"title": "A trained policy", "policy": about}
@@ -112,7 +112,7 @@ def write_model(
 
     ``about`` says what it is a posterior of. Files as `export_model` has them.
     """
-    rows, central = _constants(posterior, system, draws, key)
+    rows, central = _draw_constants(posterior, system, draws, key)
     table = system.parameters
     units = dict(zip(table.names, table.units, strict=True))
     constants = {
@@ -128,7 +128,7 @@ def write_model(
         **about,
         "draws": draws,
         "constants": constants,
-        **_channels(system),
+        **_channel_entries(system),
     }
     summary = {"title": "A learned simulator", "model": model}
     with new_run(out, "export model") as writer:
@@ -142,7 +142,7 @@ def write_model(
 
 
 @in_float64
-def _constants(
+def _draw_constants(
     posterior: Gaussian, system: AbstractSystem, draws: int, key: Key
 ) -> tuple[dict[str, np.ndarray], dict[str, float]]:
     """Draws of every constant by name, and the one at the posterior's mean."""
@@ -195,7 +195,7 @@ def _compiled(belief: AbstractBelief, system: AbstractSystem) -> bytes:
         raise error("no_flatbuffers", got=str(caught)) from caught
 
 
-def _channels(system: AbstractSystem) -> dict[str, Any]:
+def _channel_entries(system: AbstractSystem) -> dict[str, Any]:
     """Names in the order of the arrays, and the unit of each."""
     states, actions = system.states, system.actions
     return {

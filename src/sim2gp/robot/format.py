@@ -25,47 +25,50 @@ _HALF = float(np.finfo(np.float32).max) / 2.0
 About = Mapping[str, Any]
 
 
-def _whole(x: Any, low: int, high: int) -> bool:
+def _is_whole(x: Any, low: int, high: int) -> bool:
     return type(x) is int and low <= x <= high
 
 
-def _text(x: Any) -> bool:
+def _is_name(x: Any) -> bool:
     return isinstance(x, str) and x.isprintable() and 0 < len(x.strip()) <= LONGEST
 
 
-def _names(x: Any) -> bool:
-    return isinstance(x, list) and x != [] and all(map(_text, x)) and _differ(x)
+def _are_names(x: Any) -> bool:
+    return isinstance(x, list) and x != [] and all(map(_is_name, x)) and _differ(x)
 
 
 def _differ(x: list[str]) -> bool:
     return len(set(x)) == len(x)
 
 
-def _channels(about: About) -> list[str]:
+def _channel_names(about: About) -> list[str]:
     return [*about["states"], *about["actions"]]
 
 
-def _units(x: Any, about: About) -> bool:
-    named = isinstance(x, dict) and sorted(x) == sorted(_channels(about))
-    return named and all(map(_text, x.values()))
+def _are_units(x: Any, about: About) -> bool:
+    named = isinstance(x, dict) and sorted(x) == sorted(_channel_names(about))
+    return named and all(map(_is_name, x.values()))
 
 
 def _angle(x: Any, about: About) -> bool:
     states = about["states"]
-    known = _whole(x, 0, len(states) - 1)
+    known = _is_whole(x, 0, len(states) - 1)
     return x is None or (known and about["units"][states[x]] == "rad")
 
 
 #: Fields of the header, each with its rule, which may ask of the fields above it.
 FIELDS: dict[str, tuple[Callable[[Any, About], bool], str]] = {
-    "format": (lambda x, _: _whole(x, FORMAT, FORMAT), f"{FORMAT}"),
-    "layers": (lambda x, _: _whole(x, 1, LAYERS), f"a whole number from 1 to {LAYERS}"),
-    "states": (lambda x, _: _names(x), "a list of different names"),
+    "format": (lambda x, _: _is_whole(x, FORMAT, FORMAT), f"{FORMAT}"),
+    "layers": (
+        lambda x, _: _is_whole(x, 1, LAYERS),
+        f"a whole number from 1 to {LAYERS}",
+    ),
+    "states": (lambda x, _: _are_names(x), "a list of different names"),
     "actions": (
-        lambda x, about: _names(x) and _differ([*about["states"], *x]),
+        lambda x, about: _are_names(x) and _differ([*about["states"], *x]),
         "a list of different names, none of a state",
     ),
-    "units": (_units, "a unit for each state and action"),
+    "units": (_are_units, "a unit for each state and action"),
     "angle": (_angle, "null, or the number of a state in rad"),
 }
 #: Rules of the arrays' values, next to being finite.
@@ -83,18 +86,18 @@ def header(summary: Mapping[str, Any], where: str) -> dict[str, Any]:
     """The checked table ``policy`` of a run's summary (E133, E185)."""
     about = summary.get("policy")
     if not isinstance(about, dict):
-        raise refused(where, "another run")
+        raise not_a_policy(where, "another run")
     number = about.get("format")
     if type(number) is int and number > FORMAT:
         raise error("newer_policy", where=where, got=number, newest=FORMAT)
     for name, (rule, expected) in FIELDS.items():
         if name not in about:
-            raise refused(where, f"no field {name}")
+            raise not_a_policy(where, f"no field {name}")
         if not rule(about[name], about):
-            raise refused(where, f"a field {name} that is not {expected}")
+            raise not_a_policy(where, f"a field {name} that is not {expected}")
     unknown = sorted(set(about) - set(FIELDS))
     if unknown:
-        raise refused(where, f"an unknown field {unknown[0][:LONGEST]!r}")
+        raise not_a_policy(where, f"an unknown field {unknown[0][:LONGEST]!r}")
     return about
 
 
@@ -103,14 +106,14 @@ def check_shapes(about: About, found: Mapping[str, Declared], where: str) -> Non
     expected = _shapes(about, found)
     for name in sorted(set(found) | set(expected)):
         if name not in found:
-            raise refused(where, f"no array {name}")
+            raise not_a_policy(where, f"no array {name}")
         if name not in expected:
-            raise refused(where, f"an unknown array {name[:LONGEST]!r}")
+            raise not_a_policy(where, f"an unknown array {name[:LONGEST]!r}")
         if found[name].dtype != np.float32:
-            raise refused(where, f"array {name} of {found[name].dtype}")
+            raise not_a_policy(where, f"array {name} of {found[name].dtype}")
         if found[name].shape != expected[name] or 0 in expected[name]:
             got = f"array {name} of shape {found[name].shape}"
-            raise refused(where, f"{got}, not {expected[name]}")
+            raise not_a_policy(where, f"{got}, not {expected[name]}")
 
 
 def _shapes(about: About, found: Mapping[str, Declared]) -> dict[str, tuple[int, ...]]:
@@ -136,9 +139,9 @@ def check_values(arrays: Mapping[str, np.ndarray], where: str) -> None:
             raise error("policy_not_finite", where=place, got=got)
     for rule, expected in VALUES:
         if not rule(arrays):
-            raise refused(where, f"arrays without {expected}")
+            raise not_a_policy(where, f"arrays without {expected}")
 
 
-def refused(where: str, got: str) -> InputError:
+def not_a_policy(where: str, got: str) -> InputError:
     """E133: what is there is no policy of this format."""
     return error("not_a_policy", where=where, got=got, number=FORMAT)

@@ -46,14 +46,14 @@ def register() -> None:
         if known not in gymnasium.registry:
             gymnasium.register(
                 known,
-                entry_point=f"{__name__}:environment",
-                vector_entry_point=f"{__name__}_vector:environments",
+                entry_point=f"{__name__}:make_environment",
+                vector_entry_point=f"{__name__}_vector:make_environments",
                 max_episode_steps=Task.horizon,
                 kwargs={"machine": machine},
             )
 
 
-def environment(
+def make_environment(
     machine: str,
     *,
     truth: str = PUBLISHED,
@@ -71,22 +71,22 @@ def environment(
     Raises `InputError` E135 without Gymnasium, E145 for an unknown truth, constant or
     effect, E101 for a constant that is not finite.
     """
-    made = hidden(machine, truth, params or {}, effects)
+    made = make_machine_spec(machine, truth, params or {}, effects)
     try:
-        return _kind()(made)
+        return _environment_class()(made)
     except ImportError as error:
         what = "an environment cannot be made"
         raise missing_extra(what, error, "gym") from error
 
 
 @functools.cache
-def _kind() -> Any:
+def _environment_class() -> Any:
     """The one class of environments; it exists where Gymnasium does."""
     import gymnasium
     from gymnasium.spaces import Box
 
     class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
-        """A task, one step at a time; `Seen` says what each step tells.
+        """A task, one step at a time; `StepOutcome` says what each step tells.
 
         Terminated where a state leaves the task's bounds, at which it is then seen;
         truncated when the task's time is up.
@@ -95,7 +95,7 @@ def _kind() -> Any:
         metadata = {"render_modes": [], "render_fps": round(1.0 / Task.dt)}  # noqa: RUF012
         render_mode = None
 
-        def __init__(self, made: Hidden) -> None:
+        def __init__(self, made: MachineSpec) -> None:
             self.made = made
             self.task = made.published()
             self.bound = bound_of(self.task, made.machine)
@@ -121,7 +121,7 @@ def _kind() -> Any:
                 self.task = self.made.task(self.key)
             self.episode, self.steps = self.episode + 1, 0
             self.flying = key_for(self.key, self.episode, Purpose.EPISODE)
-            self.state, seen = first(self.task, self.bound, self.flying)
+            self.state, seen = reset_task(self.task, self.bound, self.flying)
             return np.array(seen), {"status": "running"}
 
         def step(
@@ -130,17 +130,17 @@ def _kind() -> Any:
             """One period. Raises E140, E101 for an action, E203 for a state."""
             if self.state is None:
                 raise gymnasium.error.ResetNeeded("call reset before step")
-            u = checked(action, self.task.actions.low.shape)
+            u = validate_action(action, self.task.actions.low.shape)
             t = np.asarray(self.steps, np.int32)
-            met = after(self.task, self.bound, self.state, u, t, self.flying)
+            met = step_task(self.task, self.bound, self.state, u, t, self.flying)
             self.state, self.steps = met.state, self.steps + 1
-            return told(met, self.steps == self.task.horizon)
+            return step_result(met, self.steps == self.task.horizon)
 
     return TaskEnv
 
 
 @dataclass(frozen=True)
-class Hidden:
+class MachineSpec:
     """What a machine is made of, but for what a seed draws."""
 
     machine: str
@@ -163,12 +163,12 @@ class Hidden:
         return preset(vars(drawn) | dict(self.params), self.effects)
 
 
-def hidden(
+def make_machine_spec(
     machine: str,
     truth: str,
     params: Mapping[str, float],
     effects: Sequence[AbstractPart | str],
-) -> Hidden:
+) -> MachineSpec:
     """The same, checked; words name effects of the catalogue and their strength.
 
     Raises `InputError` E145 for an unknown truth, constant or effect, E101 for a
@@ -185,7 +185,7 @@ def hidden(
             where = f"params of {machine}"
             raise error("constant_not_finite", where=where, got=value, name=name)
     made = tuple(_effect(machine, e) if isinstance(e, str) else e for e in effects)
-    return Hidden(machine, truth, dict(params), made)
+    return MachineSpec(machine, truth, dict(params), made)
 
 
 def _effect(machine: str, words: str) -> AbstractPart:
@@ -193,7 +193,7 @@ def _effect(machine: str, words: str) -> AbstractPart:
     return effect(machine, name, strength)
 
 
-class Seen(eqx.Module):
+class StepOutcome(eqx.Module):
     """A step as it is told: the machine's state and what is seen of it."""
 
     state: Float[Array, " k"]
@@ -205,16 +205,16 @@ class Seen(eqx.Module):
 
 
 @eqx.filter_jit
-def first(task: Task, bound: AnyArray, key: Key) -> tuple[State, Array]:
+def reset_task(task: Task, bound: AnyArray, key: Key) -> tuple[State, Array]:
     """The start of an episode, and what is seen of it."""
     s = task.reset(jax.random.fold_in(key, Purpose.RESET))
     return s, jnp.clip(s[: task.size], -bound, bound)
 
 
 @eqx.filter_jit
-def after(
+def step_task(
     task: Task, bound: AnyArray, s: State, u: AnyArray, t: AnyArray, key: Key
-) -> Seen:
+) -> StepOutcome:
     """Step ``t`` of an episode under a share of the inputs' range."""
     a = task.limit(from_unit(u[None], task.actions)[0])
     noise = jax.random.fold_in(jax.random.fold_in(key, Purpose.NOISE), t)
@@ -222,7 +222,7 @@ def after(
     seen = s2[: task.size]
     terms: Any = getattr(task.reward, "terms", lambda *_: {})
     # Judged before it is clipped; NaN is no "outside", the host raises.
-    return Seen(
+    return StepOutcome(
         s2,
         jnp.clip(seen, -bound, bound),
         task.reward(s, a, s2),
@@ -232,7 +232,9 @@ def after(
     )
 
 
-def told(met: Seen, over: bool) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+def step_result(
+    met: StepOutcome, over: bool
+) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
     """A step as Gymnasium tells it (`NotFinite` E203 where it is not finite)."""
     met = jax.device_get(met)
     check_met(met.state, met.reward)
@@ -252,7 +254,7 @@ def check_met(state: AnyArray, reward: AnyArray) -> None:
         )
 
 
-def checked(action: Any, shape: tuple[int, ...]) -> np.ndarray:
+def validate_action(action: Any, shape: tuple[int, ...]) -> np.ndarray:
     """An action in float32 (E140 for another shape, E101 where it is not finite)."""
     u = np.asarray(action, np.float32)
     if u.shape != shape:

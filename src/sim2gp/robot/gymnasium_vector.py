@@ -21,21 +21,21 @@ from sim2gp.planning.tasks import Task
 from sim2gp.robot.gymnasium import (
     PUBLISHED,
     SEEDS,
-    Hidden,
-    Seen,
-    after,
+    MachineSpec,
+    StepOutcome,
     bound_of,
     check_met,
-    checked,
-    first,
-    hidden,
     key_of,
+    make_machine_spec,
+    reset_task,
+    step_task,
+    validate_action,
 )
 from sim2gp.systems import AbstractPart
 from sim2gp.types import AnyArray, Key
 
 
-def environments(
+def make_environments(
     machine: str,
     num_envs: int = 1,
     *,
@@ -47,11 +47,11 @@ def environments(
 ) -> Any:
     """So many swing-ups of a machine as a `gymnasium.vector.VectorEnv`.
 
-    Options and errors are those of `sim2gp.robot.gymnasium.environment`.
+    Options and errors are those of `sim2gp.robot.gymnasium.make_environment`.
     """
-    made = hidden(machine, truth, params or {}, effects)
+    made = make_machine_spec(machine, truth, params or {}, effects)
     try:
-        return _kind()(made, num_envs, max_episode_steps)
+        return _vector_class()(made, num_envs, max_episode_steps)
     except ImportError as error:
         what = "environments cannot be made"
         raise missing_extra(what, error, "gym") from error
@@ -66,7 +66,7 @@ class Batch(eqx.Module):
 
 
 @eqx.filter_jit
-def begun(
+def reset_batch(
     tasks: Task, bound: AnyArray, keys: Array, episode: Int[AnyArray, " N"]
 ) -> tuple[Array, Array]:
     """The starts of these episodes, and what is seen of them."""
@@ -74,19 +74,23 @@ def begun(
 
     def one(arrays: Task, key: Key, e: Array) -> tuple[Array, Array]:
         flying = key_for(key, e, Purpose.EPISODE)
-        return first(eqx.combine(arrays, rest), bound, flying)
+        return reset_task(eqx.combine(arrays, rest), bound, flying)
 
     return jax.vmap(one)(arrays, keys, episode)
 
 
 @eqx.filter_jit
-def stepped(tasks: Task, bound: AnyArray, keys: Array, now: Batch, U: AnyArray) -> Seen:
+def step_batch(
+    tasks: Task, bound: AnyArray, keys: Array, now: Batch, U: AnyArray
+) -> StepOutcome:
     """One step of each."""
     arrays, rest = eqx.partition(tasks, eqx.is_array)
 
-    def one(arrays: Task, key: Key, s: Array, e: Array, t: Array, u: Array) -> Seen:
+    def one(
+        arrays: Task, key: Key, s: Array, e: Array, t: Array, u: Array
+    ) -> StepOutcome:
         flying = key_for(key, e, Purpose.EPISODE)
-        return after(eqx.combine(arrays, rest), bound, s, u, t, flying)
+        return step_task(eqx.combine(arrays, rest), bound, s, u, t, flying)
 
     return jax.vmap(one)(arrays, keys, now.state, now.episode, now.step, U)
 
@@ -94,7 +98,7 @@ def stepped(tasks: Task, bound: AnyArray, keys: Array, now: Batch, U: AnyArray) 
 class Fleet:
     """The machines and where they are, without Gymnasium."""
 
-    def __init__(self, made: Hidden, count: int, longest: int) -> None:
+    def __init__(self, made: MachineSpec, count: int, longest: int) -> None:
         self.made, self.count = made, count
         self.task = made.published()
         self.bound = bound_of(self.task, made.machine)
@@ -116,9 +120,9 @@ class Fleet:
             self.keys[i], self.each[i] = key, self.made.task(key)
             self.episode[i] = 0
         self.episode = self.episode + np.int32(1)
-        self.tasks = stacked(self.each)
+        self.tasks = stack_tasks(self.each)
         self.key = jnp.stack([key for key in self.keys if key is not None])
-        state, seen = begun(self.tasks, self.bound, self.key, self.episode)
+        state, seen = reset_batch(self.tasks, self.bound, self.key, self.episode)
         self.now = Batch(state, self.episode, np.zeros(self.count, np.int32))
         self.over = np.zeros(self.count, bool)
         return np.array(seen)
@@ -126,12 +130,12 @@ class Fleet:
     def step(self, now: Batch, U: np.ndarray) -> Any:
         """One period of each; its start anew where an episode was over."""
         again = self.over
-        met = stepped(self.tasks, self.bound, self.key, now, U)
+        met = step_batch(self.tasks, self.bound, self.key, now, U)
         state, seen = met.state, met.observation
         self.episode = self.episode + again.astype(np.int32)
         step = np.where(again, 0, np.asarray(now.step) + 1).astype(np.int32)
         if again.any():
-            fresh = begun(self.tasks, self.bound, self.key, self.episode)
+            fresh = reset_batch(self.tasks, self.bound, self.key, self.episode)
             state, seen = (
                 jnp.where(again[:, None], new, old)
                 for new, old in zip(fresh, (state, seen), strict=True)
@@ -140,11 +144,11 @@ class Fleet:
         ended = np.asarray(met.outside) & ~again
         late = (step == self.longest) & ~again
         self.over = ended | late
-        return told(met, np.array(seen), again, ended, late)
+        return batch_step_result(met, np.array(seen), again, ended, late)
 
 
 @functools.cache
-def _kind() -> Any:
+def _vector_class() -> Any:
     """The one class of vectors of environments."""
     import gymnasium
     from gymnasium.spaces import Box
@@ -161,7 +165,7 @@ def _kind() -> Any:
         }
         render_mode = None
 
-        def __init__(self, made: Hidden, count: int, longest: int) -> None:
+        def __init__(self, made: MachineSpec, count: int, longest: int) -> None:
             self.fleet = Fleet(made, count, longest)
             self.num_envs = count
             m, bound = self.fleet.task.actions.low.size, self.fleet.bound
@@ -190,7 +194,7 @@ def _kind() -> Any:
             if self.fleet.now is None:
                 raise gymnasium.error.ResetNeeded("call reset before step")
             m = self.fleet.task.actions.low.size
-            U = checked(actions, (self.num_envs, m))
+            U = validate_action(actions, (self.num_envs, m))
             return self.fleet.step(self.fleet.now, U)
 
     return TaskVectorEnv
@@ -207,15 +211,15 @@ def seeds_of(seed: int | Sequence[int | None] | None, count: int) -> list[int | 
     return list(seed)
 
 
-def stacked(tasks: Sequence[Task]) -> Task:
+def stack_tasks(tasks: Sequence[Task]) -> Task:
     """Tasks of one kind as one, whose arrays have another axis in front."""
     rest = eqx.filter(tasks[0], eqx.is_array, inverse=True)
     arrays = [eqx.filter(task, eqx.is_array) for task in tasks]
     return eqx.combine(jax.tree.map(lambda *x: jnp.stack(x), *arrays), rest)
 
 
-def told(
-    met: Seen,
+def batch_step_result(
+    met: StepOutcome,
     seen: np.ndarray,
     again: Bool[np.ndarray, " N"],
     ended: Bool[np.ndarray, " N"],

@@ -12,7 +12,7 @@ from sim2gp.robot.format import (
     check_shapes,
     check_values,
     header,
-    refused,
+    not_a_policy,
 )
 from sim2gp.runs.archive import declarations, load_arrays
 from sim2gp.runs.store import read_run
@@ -85,7 +85,7 @@ def load_policy(folder: Path | str) -> NumpyPolicy:
         check_shapes(about, declarations(content, LARGEST), where=str(run.path))
         x = load_arrays(content)
     except ValueError as error:
-        raise refused(str(run.path), str(error)) from error
+        raise not_a_policy(str(run.path), str(error)) from error
     check_values(x, where=str(run.path))
     layers = range(about["layers"])
     return NumpyPolicy(

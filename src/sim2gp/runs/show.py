@@ -56,16 +56,16 @@ def print_summary(
     headline = str(summary.get("headline") or "")
     if headline:
         console.print(headline, markup=False)
-    groups = dict(_groups(summary))
+    groups = dict(_summary_groups(summary))
     tables = summary.get("tables", ())
     if verbose or not ("parameters" in groups or tables):
         for name, rows in groups.items():
-            console.print(_table(name, rows, _HIDDEN_COLUMNS.get(name, ())))
+            console.print(_rich_table(name, rows, _HIDDEN_COLUMNS.get(name, ())))
         _print_singles(console, summary, title)
     elif "parameters" in groups:
         rows = groups["parameters"]
         known = {key for row in rows.values() for key in row}
-        console.print(_table("parameters", rows, known - _MAIN))
+        console.print(_rich_table("parameters", rows, known - _MAIN))
     if verbose or not answers:
         _print_tables(console, tables)
     for question, answer in (answers or {}).items():
@@ -75,7 +75,7 @@ def print_summary(
         console.print(f"Written: {file}", markup=False, soft_wrap=True)
 
 
-def _table(name: str, rows: Mapping[str, Any], hidden: Collection[str]) -> Any:
+def _rich_table(name: str, rows: Mapping[str, Any], hidden: Collection[str]) -> Any:
     from rich.table import Table
 
     columns = list(dict.fromkeys(key for row in rows.values() for key in row))
@@ -84,7 +84,7 @@ def _table(name: str, rows: Mapping[str, Any], hidden: Collection[str]) -> Any:
     table = Table("", *shown, title=name, title_justify="left")
     for label, row in rows.items():
         cells = [row.get(column) for column in shown]
-        table.add_row(label, *(_text(c) if _is_short(c) else "" for c in cells))
+        table.add_row(label, *(_cell_text(c) if _is_short(c) else "" for c in cells))
     return table
 
 
@@ -104,7 +104,7 @@ def _print_tables(console: Any, tables: Iterable[Mapping[str, Any]]) -> None:
     for said in tables:
         table = Table(*said["columns"], title=said["title"], title_justify="left")
         for row in said["rows"]:
-            table.add_row(*(_text(cell) for cell in row))
+            table.add_row(*(_cell_text(cell) for cell in row))
         console.print(table)
         if said.get("note"):
             console.print(said["note"])
@@ -115,12 +115,12 @@ def _singles(summary: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str
         if prefix + key in _HIDDEN:
             continue
         if _is_short(value):
-            yield prefix + key, _text(value)
+            yield prefix + key, _cell_text(value)
         elif isinstance(value, Mapping) and not _is_group(value):
             yield from _singles(value, f"{prefix}{key}.")
 
 
-def _groups(
+def _summary_groups(
     summary: Mapping[str, Any], prefix: str = ""
 ) -> Iterator[tuple[str, dict[str, Mapping[str, Any]]]]:
     for key, value in summary.items():
@@ -129,7 +129,7 @@ def _groups(
         if isinstance(value, Mapping) and _is_group(value):
             yield prefix + key, dict(value)
         elif isinstance(value, Mapping):
-            yield from _groups(value, f"{prefix}{key}.")
+            yield from _summary_groups(value, f"{prefix}{key}.")
         elif isinstance(value, list) and value and isinstance(value[0], Mapping):
             yield prefix + key, {str(i + 1): row for i, row in enumerate(value)}
 
@@ -145,11 +145,11 @@ def _is_short(value: Any) -> bool:
     return not isinstance(value, Mapping)
 
 
-def _text(value: Any) -> str:
+def _cell_text(value: Any) -> str:
     if value is None:
         return "-"
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, list | tuple):
-        return "  ".join(_text(v) for v in value)
+        return "  ".join(_cell_text(v) for v in value)
     return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -20,7 +20,7 @@ def claim(holds: bool, figure: str, text: str) -> dict[str, Any]:
     return {"holds": bool(holds), "figure": figure, "text": text}
 
 
-def resampled(
+def bootstrap_weights(
     seeds: int, rng: np.random.Generator
 ) -> Float[np.ndarray, "resamples seeds"]:
     """How often each seed is drawn, in `RESAMPLES` draws of as many as there are."""
@@ -28,13 +28,13 @@ def resampled(
     return rng.multinomial(seeds, share, size=RESAMPLES).astype(float)
 
 
-def interval(
+def bootstrap_interval(
     difference: Float[np.ndarray, " seeds"],
     rng: np.random.Generator,
     level: float = LEVEL,
 ) -> tuple[float, float]:
     """Central share ``level`` of the bootstrap distribution of a mean over seeds."""
-    means = resampled(len(difference), rng) @ difference / len(difference)
+    means = bootstrap_weights(len(difference), rng) @ difference / len(difference)
     return central(means, level)
 
 
@@ -49,14 +49,14 @@ def central(
     return float(low), float(high)
 
 
-def of_median(
+def bootstrap_median(
     each: Float[np.ndarray, " seeds"], rng: np.random.Generator
 ) -> tuple[float, float, float]:
     """The median over seeds, and the central share `LEVEL` of its bootstrap.
 
     A seed may be infinite, for never: the ends are medians that were drawn.
     """
-    weights = resampled(len(each), rng).astype(int)
+    weights = bootstrap_weights(len(each), rng).astype(int)
     medians = np.asarray([np.median(np.repeat(each, w)) for w in weights])
     return float(np.median(each)), *central(medians, method="nearest")
 
@@ -87,7 +87,7 @@ def at_least_as_good(
             return claim(False, f"no score on {lost} seeds, {other} has one", text)
         if other != name and kept.any():
             difference = scores[name][kept] - score[kept]
-            low, high = interval(difference, rng)
+            low, high = bootstrap_interval(difference, rng)
             if high < worst:
                 worst, figure = (
                     high,
@@ -112,7 +112,7 @@ def better_somewhere(
     level = 1.0 - (1.0 - LEVEL) / len(pairs)
     for place, (one, other) in pairs.items():
         difference = one - other
-        low, high = interval(difference, rng, level)
+        low, high = bootstrap_interval(difference, rng, level)
         if low > best:
             best, figure = low, f"{place}: {difference_in_words(difference, low, high)}"
     return claim(best > 0.0, figure, text)

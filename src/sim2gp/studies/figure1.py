@@ -24,10 +24,10 @@ from sim2gp.studies.two_link import (
     LOCKED,
     NOISE,
     STEPS,
-    Cell,
-    Learned,
-    band,
-    covered,
+    ArmCell,
+    LearnedArm,
+    coverage,
+    coverage_band,
     learn,
     nominal_truth,
 )
@@ -51,16 +51,16 @@ class TwoLinkArm(Study):
     size = (200, None)
     quick_size = (20, None)
 
-    def rows(self) -> dict[Key, list[Cell]]:
+    def rows(self) -> dict[Key, list[ArmCell]]:
         """Arms drawn from the prior, and other recordings of the nominal arm."""
         recordings = max(self.count // ARMS_PER_RECORDING, 1)
         return {
-            ("prior",): [Cell("prior", self.seed, i) for i in range(self.count)],
-            ("nominal",): [Cell("nominal", self.seed, i) for i in range(recordings)],
+            ("prior",): [ArmCell("prior", self.seed, i) for i in range(self.count)],
+            ("nominal",): [ArmCell("nominal", self.seed, i) for i in range(recordings)],
         }
 
     @cached_property
-    def learned(self) -> Learned:
+    def learned(self) -> LearnedArm:
         """The arm that is drawn."""
         key = jax.random.fold_in(jax.random.key(self.seed), 0)
         return learn(nominal_truth(), key=key)
@@ -99,11 +99,12 @@ class TwoLinkArm(Study):
         claims = with_others(arm_claims(learned.sd, learned.z), others)
         claims["intervals_cover"] = coverage_claim(z, failed)
         held = sum(claim["holds"] for claim in claims.values())
+        taught = _arm_sentence(learned.sd)
         return {
             "title": "Figure 1: a two-link arm learned from two data sets",
             "figure": "fig1",
             "quick": self.quick,
-            "headline": f"{held} of {len(claims)} claims hold. {_sentence(learned.sd)}",
+            "headline": f"{held} of {len(claims)} claims hold. {taught}",
             "claims": claims,
             "curves": {
                 "transitions": [0, STEPS, 2 * STEPS],
@@ -116,9 +117,9 @@ class TwoLinkArm(Study):
             "coverage_arms": len(z),
             "n_transitions": 2 * STEPS,
             "noise": _noise(learned),
-            "tables": [_table(learned), _coverage_table(table.names, z)],
-            "figure1": _figure(learned),
-            **_parameters(learned),
+            "tables": [_belief_table(learned), _coverage_table(table.names, z)],
+            "figure1": _figure_entries(learned),
+            **_parameter_summary(learned),
         }
 
     def pictures(
@@ -130,7 +131,7 @@ class TwoLinkArm(Study):
         return {"figure1": figure1(arrays, summary)}
 
 
-def figure_arrays(learned: Learned, *, key: RandomKey) -> dict[str, np.ndarray]:
+def figure_arrays(learned: LearnedArm, *, key: RandomKey) -> dict[str, np.ndarray]:
     """Everything that `sim2gp.reports.figure1` draws."""
     arrays = {"figure1/truth": np.asarray(learned.truth)}
     for name in ("prior", "posterior1", "posterior2"):
@@ -181,14 +182,14 @@ def _rollouts(draws: Dynamics, action: Float[Array, "T 2"]) -> np.ndarray:
 
 def _coverage(names: Sequence[str], z: np.ndarray) -> dict[str, dict[str, float]]:
     """Share of arms inside each interval, by parameter."""
-    shares = {f"{level} %": covered(z, level) for level in LEVELS}
+    shares = {f"{level} %": coverage(z, level) for level in LEVELS}
     return {
         name: {level: float(share[i]) for level, share in shares.items()}
         for i, name in enumerate(names)
     }
 
 
-def _figure(learned: Learned) -> dict[str, Any]:
+def _figure_entries(learned: LearnedArm) -> dict[str, Any]:
     """What the figure's panels say."""
     table = learned.prior.system.parameters
     return {
@@ -201,7 +202,7 @@ def _figure(learned: Learned) -> dict[str, Any]:
 
 
 @in_float64
-def _parameters(learned: Learned) -> dict[str, Any]:
+def _parameter_summary(learned: LearnedArm) -> dict[str, Any]:
     """Posterior and truth of each parameter, in its unit."""
     table = learned.prior.system.parameters
     found = diagnose.summary(
@@ -217,7 +218,7 @@ def _parameters(learned: Learned) -> dict[str, Any]:
 
 
 @in_float64
-def information_of(learned: Learned) -> Float[Array, "r p"]:
+def information_of(learned: LearnedArm) -> Float[Array, "r p"]:
     """Both data sets' square-root information, whitened by the first prior."""
     onto = jnp.linalg.solve(learned.middle.prior.scale, learned.prior.prior.scale)
     rows = [learned.posterior1.information, learned.posterior2.information @ onto]
@@ -280,7 +281,7 @@ def coverage_claim(z: Float[np.ndarray, "seeds p"], failed: int) -> dict[str, An
     """Whether the shares of all parameters lie in the bands, at all levels."""
     holds, shares = True, []
     for level in LEVELS:
-        inside, (low, high) = covered(z, level), band(level, len(z))
+        inside, (low, high) = coverage(z, level), coverage_band(level, len(z))
         holds = holds and bool(np.all((low <= inside) & (inside <= high)))
         shares.append(
             f"{level} %: {inside.min():.3f} to {inside.max():.3f} "
@@ -294,7 +295,7 @@ def coverage_claim(z: Float[np.ndarray, "seeds p"], failed: int) -> dict[str, An
     }
 
 
-def _sentence(sd: np.ndarray) -> str:
+def _arm_sentence(sd: np.ndarray) -> str:
     return (
         f"The first data set teaches link 2 (sd {sd[1, 2:].max():.3f}) and leaves "
         f"link 1 at the prior (sd {sd[1, :2].min():.2f} of {sd[0, 0]:.2f}); "
@@ -302,7 +303,7 @@ def _sentence(sd: np.ndarray) -> str:
     )
 
 
-def _noise(learned: Learned) -> dict[str, dict[str, float]]:
+def _noise(learned: LearnedArm) -> dict[str, dict[str, float]]:
     """What EM found on each data set; a locked joint has no noise to find."""
     channels = [channel.name for channel in learned.prior.system.physical_states]
     first, second = learned.posterior1.noise.tolist(), learned.posterior2.noise.tolist()
@@ -316,7 +317,7 @@ def _noise(learned: Learned) -> dict[str, dict[str, float]]:
     return rows
 
 
-def _table(learned: Learned) -> dict[str, Any]:
+def _belief_table(learned: LearnedArm) -> dict[str, Any]:
     """The beliefs in virtual space, one row for each parameter."""
     stages = learned.prior, learned.posterior1, learned.posterior2
     mean = [np.asarray(belief.parameters()[0]) for belief in stages]
@@ -333,12 +334,12 @@ def _table(learned: Learned) -> dict[str, Any]:
 
 
 def _coverage_table(names: Sequence[str], z: np.ndarray) -> dict[str, Any]:
-    shares = {level: covered(z, level) for level in LEVELS}
+    shares = {level: coverage(z, level) for level in LEVELS}
     rows: list[list[Any]] = [
         [name, *(f"{shares[level][i]:.3f}" for level in LEVELS)]
         for i, name in enumerate(names)
     ]
-    bands = [band(level, len(z)) for level in LEVELS]
+    bands = [coverage_band(level, len(z)) for level in LEVELS]
     rows.append(["band", *(f"{low:.3f} to {high:.3f}" for low, high in bands)])
     return {
         "title": f"Share of {len(z)} arms inside the interval, after both data sets",

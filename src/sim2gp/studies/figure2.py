@@ -16,9 +16,9 @@ from sim2gp.studies.claims import (
     SAMPLING_PAYS,
     at_least_as_good,
     better_somewhere,
+    bootstrap_interval,
     claim,
     difference_in_words,
-    interval,
 )
 from sim2gp.studies.learners import CONDITIONS, METHODS, TRAINED, WITH_TERM
 from sim2gp.studies.study import AbstractCell, Arrays, Key, Study, Values
@@ -85,7 +85,7 @@ class PosteriorSampling(Study):
         """The claims of figure 2 or of figure 4."""
         number, title, _, methods = FIGURES[self.name]
         table = {key: arrays[f"figure2/{'/'.join(key)}"] for key in self.rows()}
-        check = claims if self.name == "fig2" else off_policy_claims
+        check = swing_up_claims if self.name == "fig2" else off_policy_claims
         return {
             "title": f"Figure {number}: {title}",
             "figure2": {
@@ -97,7 +97,7 @@ class PosteriorSampling(Study):
             },
             "claims": check(table, self.rng),
             **returns_of(values),
-            "tables": [_table(table, methods)],
+            "tables": [_median_score_table(table, methods)],
         }
 
     def pictures(
@@ -109,7 +109,9 @@ class PosteriorSampling(Study):
         return {f"figure{summary['figure2']['number']}": figure2(arrays, summary)}
 
 
-def claims(table: Table, rng: np.random.Generator) -> dict[str, dict[str, Any]]:
+def swing_up_claims(
+    table: Table, rng: np.random.Generator
+) -> dict[str, dict[str, Any]]:
     """The paper's claims and ours, on paired seeds; a figure beside each verdict.
 
     Learners are compared by the mean best-seen score over the first five episodes; an
@@ -154,7 +156,7 @@ def claims(table: Table, rng: np.random.Generator) -> dict[str, dict[str, Any]]:
 def off_policy_claims(
     table: Table, rng: np.random.Generator
 ) -> dict[str, dict[str, Any]]:
-    """As `claims`, of policies that were trained in the sampled world."""
+    """As `swing_up_claims`, of policies that were trained in the sampled world."""
     early = _early(table)
     out: dict[str, dict[str, Any]] = {}
     for machine in MACHINES:
@@ -173,7 +175,7 @@ def off_policy_claims(
                 name, {m: early[*wrong, m] for m in RIVALS}, rng, "under mismatch"
             )
         gain = early[*nominal, "SIM2GP"] - early[*nominal, "domain randomisation"]
-        low, high = interval(gain, rng)
+        low, high = bootstrap_interval(gain, rng)
         out[f"{machine}_the_posterior_beats_domain_randomisation"] = claim(
             low > 0.0,
             difference_in_words(gain, low, high),
@@ -215,7 +217,7 @@ def _best(
     return at_least_as_good(name, early, rng, f"{text} {score}")
 
 
-def _table(table: Table, methods: tuple[str, ...]) -> dict[str, Any]:
+def _median_score_table(table: Table, methods: tuple[str, ...]) -> dict[str, Any]:
     """Median episodes to 95 %, and the median best score of the last episode."""
     groups = [(m, c) for m in MACHINES for c in CONDITIONS]
     rows = []

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sim2gp.planning.tasks import MACHINES
-from sim2gp.studies.claims import at_least_as_good, claim, of_median
+from sim2gp.studies.claims import at_least_as_good, bootstrap_median, claim
 from sim2gp.studies.exploring import METHODS, QUANTITIES, Cell
 from sim2gp.studies.learners import CONDITIONS
 from sim2gp.studies.study import AbstractCell, Arrays, Key, Study, Values
@@ -62,7 +62,7 @@ class Exploration(Study):
         for key, row in self.rows().items():
             found = [values[cell] for cell in row]
             place = f"figure3/{'/'.join(key)}"
-            for name, column in _columns(found, self.episodes).items():
+            for name, column in _episode_columns(found, self.episodes).items():
                 arrays[f"{place}/{name}"] = column
             arrays[f"{place}/early"] = _beginnings(found)
         return arrays
@@ -89,8 +89,8 @@ class Exploration(Study):
                 "episodes": self.episodes,
                 "shown": FIGURES[self.name],
             },
-            "claims": claims(table, early, self.rng),
-            "tables": _tables(table, self.methods),
+            "claims": exploration_claims(table, early, self.rng),
+            "tables": _median_tables(table, self.methods),
         }
 
     def pictures(
@@ -102,7 +102,7 @@ class Exploration(Study):
         return {name: figure3(arrays, summary, x) for name, x in FIGURES.items()}
 
 
-def _columns(
+def _episode_columns(
     values: Sequence[Values], episodes: int
 ) -> dict[str, Float[np.ndarray, "seeds E"]]:
     """Each quantity of each seed and episode; NaN where nothing was run."""
@@ -124,7 +124,7 @@ def _beginnings(values: Sequence[Values]) -> Float[np.ndarray, "seeds looks two"
     return out
 
 
-def needed(
+def transitions_needed(
     early: Float[np.ndarray, "looks two"], rmse: Float[np.ndarray, " E"], error: float
 ) -> float:
     """Transitions until the error is first at most ``error``; infinite if never.
@@ -144,7 +144,7 @@ def needed(
     return float("inf")
 
 
-def claims(
+def exploration_claims(
     table: Table,
     early: Mapping[Key, Float[np.ndarray, "seeds looks two"]],
     rng: np.random.Generator,
@@ -156,7 +156,7 @@ def claims(
             table, early, rng, machine, "nominal"
         )
         final = {
-            m: -_last(table[machine, "mismatch", m]["nll"])
+            m: -_last_values(table[machine, "mismatch", m]["nll"])
             for m, explorer in METHODS.items()
             if explorer.signal is None
             and explorer.together
@@ -201,11 +201,15 @@ def _halved(
     for i, rmse in enumerate(table[other]["rmse"]):
         found = rmse[np.isfinite(rmse)]
         if found.size:  # else random input lost the seed: there is nothing to reach
-            mine = needed(early[one][i], table[one]["rmse"][i], float(found[-1]))
-            ratios.append(mine / needed(early[other][i], rmse, float(found[-1])))
+            mine = transitions_needed(
+                early[one][i], table[one]["rmse"][i], float(found[-1])
+            )
+            ratios.append(
+                mine / transitions_needed(early[other][i], rmse, float(found[-1]))
+            )
     if not ratios:
         return claim(False, "no seed on which random input has an error", text)
-    median, low, high = of_median(np.asarray(ratios), rng)
+    median, low, high = bootstrap_median(np.asarray(ratios), rng)
     return claim(
         median <= SHARE,
         f"{median:.2f} of its transitions [{low:.2f}, {high:.2f}]",
@@ -213,13 +217,13 @@ def _halved(
     )
 
 
-def _last(values: Float[np.ndarray, "seeds E"]) -> Float[np.ndarray, " seeds"]:
+def _last_values(values: Float[np.ndarray, "seeds E"]) -> Float[np.ndarray, " seeds"]:
     """The last number of each seed; infinite where there is none."""
     found = [row[np.isfinite(row)] for row in values]
     return np.asarray([row[-1] if row.size else np.inf for row in found])
 
 
-def _tables(table: Table, methods: list[str]) -> list[dict[str, Any]]:
+def _median_tables(table: Table, methods: list[str]) -> list[dict[str, Any]]:
     """Medians after the first and the last episode."""
     groups = [(m, c) for m in MACHINES for c in CONDITIONS]
     titles = {
@@ -233,7 +237,7 @@ def _tables(table: Table, methods: list[str]) -> list[dict[str, Any]]:
             row = [method]
             for group in groups:
                 values = table[*group, method][name]
-                first, last = np.median(values[:, 0]), np.median(_last(values))
+                first, last = np.median(values[:, 0]), np.median(_last_values(values))
                 row.append(f"{first:.2f} to {last:.2f}")
             rows.append(row)
         out.append(

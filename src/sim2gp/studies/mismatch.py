@@ -15,9 +15,9 @@ from sim2gp.planning.tasks import SOLVED
 from sim2gp.studies.claims import (
     SAMPLING_PAYS,
     better_somewhere,
+    bootstrap_weights,
     central,
     claim,
-    resampled,
 )
 from sim2gp.studies.learners import METHODS, WITH_TERM
 from sim2gp.studies.study import AbstractCell, Arrays, Key, Study, Values
@@ -79,7 +79,7 @@ class MismatchMap(Study):
                 "methods": list(METHODS),
             },
             "regret": regrets(table),
-            "claims": claims(table, self.rng),
+            "claims": mismatch_claims(table, self.rng),
             **returns_of(values),
             "tables": tables(table),
         }
@@ -93,7 +93,7 @@ class MismatchMap(Study):
         return {"mismatch": mismatch_map(arrays, summary)}
 
 
-def lost(table: Table) -> dict[str, Float[np.ndarray, " seeds"]]:
+def regret_by_seed(table: Table) -> dict[str, Float[np.ndarray, " seeds"]]:
     """Regret of each learner and seed: lost score, summed over the map's episodes.
 
     An episode that was not run lost all of it; better than the oracle is no gain.
@@ -107,17 +107,19 @@ def lost(table: Table) -> dict[str, Float[np.ndarray, " seeds"]]:
 
 def regrets(table: Table) -> dict[str, float]:
     """Cumulative regret of each learner, over all seeds."""
-    return {method: float(each.sum()) for method, each in lost(table).items()}
+    return {method: float(each.sum()) for method, each in regret_by_seed(table).items()}
 
 
-def claims(table: Table, rng: np.random.Generator) -> dict[str, dict[str, Any]]:
+def mismatch_claims(
+    table: Table, rng: np.random.Generator
+) -> dict[str, dict[str, Any]]:
     """Whether choosing costs more than having known the best model in advance.
 
     And whether sampling pays anywhere, by the mean score of the episodes.
     """
-    each, regret = lost(table), regrets(table)
+    each, regret = regret_by_seed(table), regrets(table)
     best = min(FIXED, key=lambda m: regret[m])
-    weights = resampled(len(each[best]), rng)
+    weights = bootstrap_weights(len(each[best]), rng)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = regret["Auto"] / np.float64(regret[best])
         low, high = central((weights @ each["Auto"]) / (weights @ each[best]))

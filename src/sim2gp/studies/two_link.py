@@ -37,7 +37,7 @@ LEVELS = (50, 90, 95)
 BAND = 0.999  # acceptance of each coverage count, if the intervals are right
 
 
-class Recording(eqx.Module):
+class ArmRecording(eqx.Module):
     """One data set: the arm from rest, and the torques that moved it."""
 
     state: Float[Array, "T1 4"]
@@ -49,15 +49,15 @@ class Recording(eqx.Module):
         return Transitions.of(s[:-1], np.asarray(self.action), s[1:])
 
 
-class Learned(eqx.Module):
+class LearnedArm(eqx.Module):
     """Both data sets of one arm, and the belief that each stage starts and ends with.
 
     ``middle`` is posterior 1 as the prior of the free arm.
     """
 
     truth: Float[Array, " p"]
-    first: Recording
-    second: Recording
+    first: ArmRecording
+    second: ArmRecording
     prior: Sim2GPBelief
     posterior1: Sim2GPBelief
     middle: Sim2GPBelief
@@ -85,7 +85,7 @@ def nominal_truth() -> Float[Array, " p"]:
 
 
 @eqx.filter_jit
-def record(arm: UniformRodArm, truth: Float[Array, " p"], *, key: Key) -> Recording:
+def record(arm: UniformRodArm, truth: Float[Array, " p"], *, key: Key) -> ArmRecording:
     """Excite the free joints of an arm; a locked joint gets no torque and no noise."""
     free = jnp.asarray([0.0 if locked else 1.0 for locked in arm.locked], truth.dtype)
     noise = jnp.asarray(NOISE, truth.dtype) * jnp.concatenate([free, free])
@@ -106,11 +106,11 @@ def record(arm: UniformRodArm, truth: Float[Array, " p"], *, key: Key) -> Record
 
     rest = jnp.zeros(4, truth.dtype)
     _, path = jax.lax.scan(step, rest, (action, disturbance))
-    return Recording(jnp.concatenate([rest[None], path]), action)
+    return ArmRecording(jnp.concatenate([rest[None], path]), action)
 
 
 @in_float64
-def learn(truth: Float[Array, " p"], *, key: Key) -> Learned:
+def learn(truth: Float[Array, " p"], *, key: Key) -> LearnedArm:
     """Record and learn both data sets in turn; raises what `Sim2GP.fit` raises."""
     one, two, fit1, fit2 = jax.random.split(key, 4)
     locked, free = UniformRodArm(locked=LOCKED), UniformRodArm()
@@ -121,11 +121,11 @@ def learn(truth: Float[Array, " p"], *, key: Key) -> Learned:
     model = Sim2GP(free, dt=DT).with_prior(posterior1.posterior)
     middle = model.init(fit2)
     posterior2 = model.fit(middle, second.transitions(), key=fit2)
-    return Learned(truth, first, second, prior, posterior1, middle, posterior2)
+    return LearnedArm(truth, first, second, prior, posterior1, middle, posterior2)
 
 
 @dataclass(frozen=True)
-class Cell(AbstractCell):
+class ArmCell(AbstractCell):
     """One arm, recorded and learned; ``index`` counts the arms of a seed.
 
     method: ``prior``, an arm drawn from the prior, or ``nominal``, another recording of
@@ -176,7 +176,7 @@ class Cell(AbstractCell):
         return given | found | {"seconds": time.perf_counter() - started}
 
 
-def band(level: int, count: int) -> tuple[float, float]:
+def coverage_band(level: int, count: int) -> tuple[float, float]:
     """Shares of ``count`` arms that right intervals of ``level`` per cent hold.
 
     Binomial, central 99.9 %: what lies outside is no accident.
@@ -185,7 +185,7 @@ def band(level: int, count: int) -> tuple[float, float]:
     return float(low) / count, float(high) / count
 
 
-def covered(z: Float[np.ndarray, "seeds p"], level: int) -> Float[np.ndarray, " p"]:
+def coverage(z: Float[np.ndarray, "seeds p"], level: int) -> Float[np.ndarray, " p"]:
     """Share of arms whose truth lies in the central interval of each parameter."""
     limit = scipy.stats.norm.ppf(0.5 + level / 200.0)
     return np.asarray(np.mean(np.abs(z) <= limit, axis=0))

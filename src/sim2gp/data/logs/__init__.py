@@ -1,7 +1,7 @@
 """Robot logs: files on disk become typed recordings in the system's names and units."""
 
 from sim2gp.data.logs.budget import Budget as Budget
-from sim2gp.data.logs.checks import none_unused as none_unused
+from sim2gp.data.logs.checks import check_all_used as check_all_used
 from sim2gp.data.logs.checks import period_matches as period_matches
 from sim2gp.data.logs.checks import shared_rows as shared_rows
 from sim2gp.data.logs.formats import columns_of as columns_of

@@ -30,7 +30,7 @@ EARLY = 0.85, 0.5  # k < 0: least R^2, and most of it at k = 0
 Values = Float[np.ndarray, " N"]
 
 
-def misaligned(
+def alignment_notes(
     log: Log, states: Sequence[ChannelLike], delay: float = 0.0
 ) -> list[Note]:
     """Whether commands explain the motion best some rows from where they stand (W118).
@@ -79,7 +79,7 @@ class _Regression:
         inputs: Mapping[str, Values],
         angles: Sequence[str],
     ) -> None:
-        some = _liveliest(np.stack(list(inputs.values()), axis=1))
+        some = _busiest_rows(np.stack(list(inputs.values()), axis=1))
         self.t = log.time[some]
         self.names = list(joints)
         self.u = [u[some] for u in inputs.values()]
@@ -97,7 +97,7 @@ class _Regression:
             acts += [v, np.tanh(10.0 * v / max(float(np.std(v)), 1e-300))]
             acts += [np.sin(q[m]) * v**2 for m in q if m in angles]
             acts += [] if n in angles else [q[n]]
-        self.states = _basis(self._columns(acts))
+        self.states = _unit_column_basis(self._columns(acts))
         self.y = self._left(np.stack([self._second(x) for x in q.values()], axis=1))
 
     def best(self) -> tuple[str, int, float, float] | None:
@@ -121,7 +121,7 @@ class _Regression:
         """R^2 of the commands, ``lag`` rows later, of what the states leave open."""
         shifted = [np.roll(u, lag) for u in self.u]  # its ends are not looked at
         acts = [u * turn for u in shifted for turn in (1.0, *self.turns)]
-        explained = _basis(self._left(self._columns(acts))).T @ self.y
+        explained = _unit_column_basis(self._left(self._columns(acts))).T @ self.y
         total = np.maximum(np.sum(self.y**2, axis=0), 1e-300)
         return np.asarray(np.sum(explained**2, axis=0) / total)
 
@@ -146,7 +146,7 @@ class _Regression:
         return x - self.states @ (self.states.T @ x)
 
 
-def _basis(columns: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n r"]:
+def _unit_column_basis(columns: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n r"]:
     """An orthonormal basis of what the columns span."""
     norm = np.linalg.norm(columns, axis=0)
     unit = columns[:, norm > 0.0] / norm[norm > 0.0]
@@ -161,7 +161,7 @@ def _rate(log: Log, name: str, some: slice) -> Values:
     return measured[some]
 
 
-def _liveliest(u: Float[np.ndarray, "N m"]) -> slice:
+def _busiest_rows(u: Float[np.ndarray, "N m"]) -> slice:
     """The rows in which commands change most, where there are too many."""
     if len(u) <= ROWS:
         return slice(0, len(u))

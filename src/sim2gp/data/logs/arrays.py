@@ -16,7 +16,7 @@ from jaxtyping import Float, Shaped
 
 from sim2gp.data.logs.budget import Meter
 from sim2gp.data.logs.log import Note
-from sim2gp.data.logs.table import Rows, Table
+from sim2gp.data.logs.table import LogTable, Rows
 from sim2gp.errors import InputError, error, nearest
 
 MAX_WIDTH = 256  # columns of one array; above, it is a picture or a cloud of points
@@ -24,7 +24,7 @@ EXACT = 2**53  # whole numbers beyond lose digits in float64
 
 
 @dataclass(frozen=True)
-class Entry:
+class LazyArray:
     """An array of a file that is not read yet, rows first; ``labels`` its columns."""
 
     shape: tuple[int, ...]
@@ -53,14 +53,14 @@ class Entry:
         return len(self.shape) in (1, 2)
 
 
-def table_of(
-    entries: Mapping[str, Entry],
+def read_columns(
+    entries: Mapping[str, LazyArray],
     source: str,
     wanted: Sequence[str] | None,
     *,
     time: str | None,
     meter: Meter,
-) -> Table:
+) -> LogTable:
     """Read the wanted columns (None: all that are numbers) as float64.
 
     Nothing is read of the others. Raises `InputError` E103, E115, E121, E123, E124,
@@ -77,10 +77,12 @@ def table_of(
         wanted = [n for n, (base, _) in places.items() if entries[base].is_numeric]
     for name in wanted:
         if name not in places:
-            raise missing(name, header, source, name == time)
+            raise missing_column(name, header, source, name == time)
         _check_kind(entries[places[name][0]], name, source)
     bases = list(dict.fromkeys(places[name][0] for name in wanted))
-    rows = _count(entries, bases, places[time][0] if time in places else None, source)
+    rows = _row_count(
+        entries, bases, places[time][0] if time in places else None, source
+    )
     used = [entries[base] for base in bases]
     meter.place = ""
     meter.claim(sum(math.prod(e.shape) * max(e.dtype.itemsize, 8) for e in used))
@@ -94,14 +96,14 @@ def table_of(
         read = entries[base].read()
         for name in names:
             raw = read if read.ndim == 1 else read[:, places[name][1]]
-            columns[name], said = _numbers(raw, name, source, name == time)
+            columns[name], said = _as_float64(raw, name, source, name == time)
             notes += said
     meter.place = ""
     table_rows = Rows(source, np.arange(rows), "row")
-    return Table(table_rows, header, columns, notes=tuple(notes))
+    return LogTable(table_rows, header, columns, notes=tuple(notes))
 
 
-def missing(
+def missing_column(
     name: str, header: Sequence[str], source: str, is_time: bool = False
 ) -> InputError:
     """E103 for a column, with the name that was probably meant."""
@@ -130,7 +132,7 @@ def distinct(names: Sequence[str], source: str) -> None:
         )
 
 
-def _check_kind(entry: Entry, name: str, source: str) -> None:
+def _check_kind(entry: LazyArray, name: str, source: str) -> None:
     """Real numbers with digits enough, in rows and columns (E121, E123, E124, E140)."""
     where, kind = f"{source}:column {name}", entry.dtype.kind
     if kind == "O":
@@ -145,8 +147,11 @@ def _check_kind(entry: Entry, name: str, source: str) -> None:
         raise error("not_a_table", where=where, got=f"shape {entry.shape}")
 
 
-def _count(
-    entries: Mapping[str, Entry], bases: Sequence[str], time: str | None, source: str
+def _row_count(
+    entries: Mapping[str, LazyArray],
+    bases: Sequence[str],
+    time: str | None,
+    source: str,
 ) -> int:
     """The number of rows of all arrays (E115, E140)."""
     shapes = {base: entries[base].shape for base in bases}
@@ -177,7 +182,7 @@ def _count(
     )
 
 
-def _numbers(
+def _as_float64(
     raw: Shaped[np.ndarray, " N"], name: str, source: str, is_time: bool
 ) -> tuple[Float[np.ndarray, " N"], list[Note]]:
     """As float64; dates, and whole numbers too large for it, count from the first."""
@@ -197,7 +202,7 @@ def _numbers(
     return values, [Note("W154", text + (", in s" if dated else ""))]
 
 
-def split(table: Table, episode: str) -> list[tuple[int, Table]]:
+def split(table: LogTable, episode: str) -> list[tuple[int, LogTable]]:
     """Cut at the borders of episodes, by their ids in a column (E127)."""
     ids = table.columns[episode]
     bad = np.flatnonzero(~(np.isfinite(ids) & (ids == np.round(ids))))
@@ -205,7 +210,7 @@ def split(table: Table, episode: str) -> list[tuple[int, Table]]:
         where, got = table.rows.at(int(bad[0])), f"{ids[bad[0]]:g}"
         raise error("episode_id_missing", where=where, got=got)
     edges = [0, *(np.flatnonzero(np.diff(ids)) + 1).tolist(), len(ids)]
-    pieces: dict[int, Table] = {}
+    pieces: dict[int, LogTable] = {}
     for start, end in pairwise(edges):
         number = int(ids[start])
         if number in pieces:

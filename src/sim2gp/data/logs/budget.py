@@ -145,7 +145,7 @@ def readable(meter: Meter) -> Iterator[None]:
     loop: after the budget's seconds the thread is interrupted (E126). Errors of ours
     and interrupts of the user pass through.
     """
-    watch = _Watch(meter)
+    watch = _TimeWatch(meter)
     try:
         try:
             yield
@@ -169,7 +169,7 @@ def readable(meter: Meter) -> Iterator[None]:
         ) from caught
 
 
-class _Watch:
+class _TimeWatch:
     """Raises `_OutOfTime` in the thread that made it when the seconds are over.
 
     A second thread asks the interpreter to do so, which works wherever Python code runs

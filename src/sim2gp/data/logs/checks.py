@@ -34,7 +34,7 @@ _FACTORS = {  # slope of displacement on integrated velocity -> what it betrays
 }
 
 
-def finite(columns: Mapping[str, Values], rows: Rows, skip: Mask) -> None:
+def check_finite_columns(columns: Mapping[str, Values], rows: Rows, skip: Mask) -> None:
     """No NaN or infinity in a used column outside the skipped rows (E101)."""
     bad = {name: ~np.isfinite(v) & ~skip for name, v in columns.items()}
     count = sum(int(b.sum()) for b in bad.values())
@@ -264,7 +264,7 @@ def excitation(
     return notes
 
 
-def unused(names: Sequence[str], source: str) -> list[Note]:
+def unused_columns(names: Sequence[str], source: str) -> list[Note]:
     """Columns of a file that nothing takes: perhaps one was forgotten (W105)."""
     if not names:
         return []
@@ -273,7 +273,7 @@ def unused(names: Sequence[str], source: str) -> list[Note]:
     return [Note("W105", f"columns of {source} that nothing takes: {text}")]
 
 
-def none_unused(logs: Sequence[Log]) -> None:
+def check_all_used(logs: Sequence[Log]) -> None:
     """Whoever is strict takes every column (E105)."""
     for log in logs:
         for note in log.notes:
@@ -307,7 +307,7 @@ def shared_rows(train: Sequence[Log], test: Sequence[Log]) -> list[Note]:
     return notes
 
 
-def check_names(
+def check_column_names(
     columns: Mapping[str, object],
     states: Sequence[ChannelLike],
     actions: Sequence[ChannelLike],

@@ -24,11 +24,11 @@ def check_mcap(path: Path, meter: Meter) -> str:
     size = path.stat().st_size
     with path.open("rb") as file:
         file.seek(8)
-        first, length = _record(file)
+        first, length = _record_header(file)
         if first != _HEADER:
             raise ValueError("no header record")
         meter.piece(length, "record")
-        profile = _text(file)
+        profile = _read_text(file)
         file.seek(17 + length)
         chunks, attached = _chunks(file, size, meter)
         indexes = _indexes(file, size, meter)
@@ -48,12 +48,12 @@ def check_mcap(path: Path, meter: Meter) -> str:
     return profile
 
 
-def _record(file: BinaryIO) -> tuple[int, int]:
+def _record_header(file: BinaryIO) -> tuple[int, int]:
     opcode, length = struct.unpack("<BQ", file.read(9))
     return opcode, length
 
 
-def _text(file: BinaryIO) -> str:
+def _read_text(file: BinaryIO) -> str:
     (length,) = struct.unpack("<I", file.read(4))
     if length > 4096:
         raise ValueError(f"a name of {length} bytes")
@@ -70,12 +70,12 @@ def _chunks(file: BinaryIO, size: int, meter: Meter) -> tuple[dict[int, _Chunk],
     attached = 0
     while (place := file.tell()) < size - 8:
         meter.tick()
-        opcode, length = _record(file)
+        opcode, length = _record_header(file)
         if opcode in (_FOOTER, _DATA_END):
             break
         if opcode == _CHUNK:
             _, _, declared, _ = struct.unpack("<QQQI", file.read(28))
-            kind = _text(file)
+            kind = _read_text(file)
             (stored,) = struct.unpack("<Q", file.read(8))
             found[place] = stored, declared, kind
         elif opcode == _ATTACHMENT:
@@ -89,7 +89,7 @@ def _chunks(file: BinaryIO, size: int, meter: Meter) -> tuple[dict[int, _Chunk],
 def _indexes(file: BinaryIO, size: int, meter: Meter) -> list[tuple[int, _Chunk]]:
     """What the summary at the end of an MCAP file says of its chunks, if any."""
     file.seek(size - 8 - 29)
-    opcode, _ = _record(file)
+    opcode, _ = _record_header(file)
     (start,) = struct.unpack("<Q", file.read(8))
     found: list[tuple[int, _Chunk]] = []
     if opcode != _FOOTER or start == 0:
@@ -97,7 +97,7 @@ def _indexes(file: BinaryIO, size: int, meter: Meter) -> list[tuple[int, _Chunk]
     file.seek(start)
     while (place := file.tell()) < size - 8:
         meter.tick()
-        opcode, length = _record(file)
+        opcode, length = _record_header(file)
         if opcode == _FOOTER:
             break
         meter.piece(length, "record")
@@ -105,7 +105,7 @@ def _indexes(file: BinaryIO, size: int, meter: Meter) -> list[tuple[int, _Chunk]
             meter.claim(_ENTRY * len(found))
             _, _, chunk, _, offsets = struct.unpack("<QQQQI", file.read(36))
             file.seek(offsets + 8, 1)
-            kind = _text(file)
+            kind = _read_text(file)
             found.append((chunk, (*struct.unpack("<QQ", file.read(16)), kind)))
         file.seek(place + 9 + length)
     return found
@@ -115,7 +115,7 @@ def check_bag(path: Path, meter: Meter) -> None:
     """Measure the chunks that the index of a rosbag1 names (E126)."""
     with path.open("rb") as file:
         file.readline(64)
-        fields = _fields(file, meter)
+        fields = _header_fields(file, meter)
         (start,) = struct.unpack("<Q", fields[b"index_pos"])
         connections, infos = (
             struct.unpack("<I", fields[name])[0]
@@ -125,12 +125,12 @@ def check_bag(path: Path, meter: Meter) -> None:
             return  # not indexed, which its reader says
         file.seek(start)
         for _ in range(connections):
-            _fields(file, meter)
+            _header_fields(file, meter)
             _skip(file, meter)
         places: list[tuple[int, int]] = []
         for _ in range(infos):
             meter.claim(_ENTRY * len(places))
-            about = _fields(file, meter)
+            about = _header_fields(file, meter)
             (count,) = struct.unpack("<I", about[b"count"])
             places.append((struct.unpack("<Q", about[b"chunk_pos"])[0], count))
             _skip(file, meter)
@@ -138,13 +138,13 @@ def check_bag(path: Path, meter: Meter) -> None:
             file.seek(place)
             _measure_bag_chunk(file, meter)
             for _ in range(count):
-                entries = struct.unpack("<I", _fields(file, meter)[b"count"])[0]
+                entries = struct.unpack("<I", _header_fields(file, meter)[b"count"])[0]
                 meter.spend(_ENTRY * entries, "index entries")
                 _skip(file, meter)
 
 
 def _measure_bag_chunk(file: BinaryIO, meter: Meter) -> None:
-    fields = _fields(file, meter)
+    fields = _header_fields(file, meter)
     kind = fields[b"compression"].decode()
     (declared,) = struct.unpack("<I", fields[b"size"])
     (stored,) = struct.unpack("<I", file.read(4))
@@ -154,7 +154,7 @@ def _measure_bag_chunk(file: BinaryIO, meter: Meter) -> None:
         meter.measure(pieces(content, kind, "a rosbag"), declared, "chunk")
 
 
-def _fields(file: BinaryIO, meter: Meter) -> dict[bytes, bytes]:
+def _header_fields(file: BinaryIO, meter: Meter) -> dict[bytes, bytes]:
     """The header of a record of rosbag1."""
     (length,) = struct.unpack("<I", file.read(4))
     meter.piece(length, "record")

@@ -114,7 +114,7 @@ class Definitions:
         )
 
 
-def parsed(text: str, name: str, meter: Meter) -> Definitions:
+def parse_definition(text: str, name: str, meter: Meter) -> Definitions:
     """The definition of the type ``name`` (E126 for its size, E136 for its form)."""
     if len(text) > MAX_TEXT:
         raise meter.over(
@@ -131,7 +131,7 @@ def parsed(text: str, name: str, meter: Meter) -> Definitions:
         if line == _SEPARATOR:
             head = next(lines, "").strip(" \t\r")
             if not head.startswith("MSG: "):
-                raise _refused(head, "MSG: and the name of a type", meter)
+                raise _definition_refused(head, "MSG: and the name of a type", meter)
             current = _begin(head.removeprefix("MSG: ").strip(), types, meter)
         elif line and not line.startswith("#") and not re.fullmatch("@[a-z]+", line):
             fields += _add_line(line, current, meter)
@@ -159,9 +159,9 @@ def full_name(name: str) -> str | None:
 def _begin(name: str, types: dict[str, Definition], meter: Meter) -> Definition:
     full = full_name(name)
     if full is None:
-        raise _refused(name, "package/Type", meter)
+        raise _definition_refused(name, "package/Type", meter)
     if full in types:
-        raise _refused(name, "each type once", meter)
+        raise _definition_refused(name, "each type once", meter)
     types[full] = Definition(full)
     return types[full]
 
@@ -170,21 +170,21 @@ def _add_line(line: str, into: Definition, meter: Meter) -> int:
     """Take over a field or a constant; how many fields it counts as."""
     found = _FIELD.match(line)
     if not found:
-        raise _refused(line, "TYPE NAME, or TYPE NAME=NUMBER", meter)
+        raise _definition_refused(line, "TYPE NAME, or TYPE NAME=NUMBER", meter)
     kind, array, name = found["type"], found["array"], found["name"]
     rest = line[found.end() :].strip(" \t")
     if name in into.names:
-        raise _refused(line, "each name once", meter)
+        raise _definition_refused(line, "each name once", meter)
     into.names.add(name)
     is_text = kind.startswith("string")
     if rest.startswith("="):
         value = rest[1:].strip(" \t")
         if array or not (is_text or kind in NUMBERS):
-            raise _refused(line, "a constant of a number or a text", meter)
+            raise _definition_refused(line, "a constant of a number or a text", meter)
         if not is_text:
             value = value.split("#")[0].strip(" \t")
             if not _NUMBER.fullmatch(value):
-                raise _refused(line, "a constant with a number", meter)
+                raise _definition_refused(line, "a constant with a number", meter)
         known = kind == "string" or not is_text
         if known and _CONSTANT.fullmatch(name) and _PRINTED.fullmatch(value or "#"):
             into.constants.append(f"{kind} {name}={value}")
@@ -192,10 +192,10 @@ def _add_line(line: str, into: Definition, meter: Meter) -> int:
             into.whole = False  # numbers alone are read: such a constant has no use
         return 1
     if rest and not rest.startswith("#") and not _is_default(rest, is_text):
-        raise _refused(line, "a default that is a literal", meter)
-    count, full = _count(array), _resolved(kind, into.name)
+        raise _definition_refused(line, "a default that is a literal", meter)
+    count, full = _array_length(array), _resolved(kind, into.name)
     if full is None:
-        raise _refused(line, "a type of ROS", meter)
+        raise _definition_refused(line, "a type of ROS", meter)
     plain = full in NUMBERS
     if count is not None and count > (MAX_ENTRIES if plain else MAX_FIELDS):
         raise meter.over(
@@ -207,7 +207,7 @@ def _add_line(line: str, into: Definition, meter: Meter) -> int:
     return 1 if plain else max(1, count or 0)
 
 
-def _count(array: str | None) -> int | None:
+def _array_length(array: str | None) -> int | None:
     if array is None:
         return None
     digits = array.strip("[]")
@@ -256,15 +256,19 @@ def _measure(
     if name in _BUILT_IN and name not in types:
         return Size(_BUILT_IN[name], 1, 1)
     if name not in types:
-        raise _refused(name, "a type that the definition holds", meter)
+        raise _definition_refused(name, "a type that the definition holds", meter)
     if name in above or len(above) >= MAX_DEPTH:
-        raise _refused(name, f"types in types, at most {MAX_DEPTH} deep", meter)
+        raise _definition_refused(
+            name, f"types in types, at most {MAX_DEPTH} deep", meter
+        )
     size, objects, depth = 0, 1, 1
-    for each, part in _parts(name, types, sizes, above, meter):
+    for each, part in _field_sizes(name, types, sizes, above, meter):
         if each.count == 0:
             size += 4
             if part.objects > part.bytes + 8:
-                raise _refused(f"{each.written} {each.name}", "entries of bytes", meter)
+                raise _definition_refused(
+                    f"{each.written} {each.name}", "entries of bytes", meter
+                )
         else:
             size += part.bytes * (1 if each.count is None else each.count)
             objects += part.objects * (1 if each.count is None else each.count)
@@ -279,7 +283,7 @@ def _measure(
     return sizes[name]
 
 
-def _parts(
+def _field_sizes(
     name: str,
     types: dict[str, Definition],
     sizes: dict[str, Size],
@@ -295,7 +299,7 @@ def _parts(
             yield each, _measure(each.type, types, sizes, (*above, name), meter)
 
 
-def _refused(got: str, expected: str, meter: Meter) -> InputError:
+def _definition_refused(got: str, expected: str, meter: Meter) -> InputError:
     return error(
         "message_definition_refused",
         where=meter.at,

@@ -15,13 +15,18 @@ from typing import Any
 import numpy as np
 from jaxtyping import Shaped
 
-from sim2gp.data.logs.arrays import Entry, split, table_of
+from sim2gp.data.logs.arrays import LazyArray, read_columns, split
 from sim2gp.data.logs.budget import Meter
-from sim2gp.data.logs.file import library, read_bytes, shown, steady
+from sim2gp.data.logs.file import (
+    display_path,
+    import_optional,
+    read_bytes,
+    unchanged_size,
+)
 from sim2gp.data.logs.hdf5 import entries_of
 from sim2gp.data.logs.log import Note
 from sim2gp.data.logs.parquet import read_parquet
-from sim2gp.data.logs.table import Rows, Table
+from sim2gp.data.logs.table import LogTable, Rows
 from sim2gp.errors import error
 
 MAX_JSON = 16 * 1024**2
@@ -35,14 +40,14 @@ def read_lerobot(
     time: str | None,
     stamped: bool,
     meter: Meter,
-) -> list[tuple[str, Table]]:
+) -> list[tuple[str, LogTable]]:
     """The episodes of a LeRobot folder, by number (E103 to E136).
 
     ``stamped``: the time is the file's own, which is ``frame_index / fps`` where the
     stamps agree with it (they are float32).
     """
     info = _json(path / "meta" / "info.json", meter)
-    where = shown(path)
+    where = display_path(path)
     version = str(info.get("codebase_version", ""))
     if info.get("storage_format", "parquet") != "parquet" or version[:2] not in (
         "v2",
@@ -62,17 +67,19 @@ def read_lerobot(
     asked = None if wanted is None else [*dict.fromkeys([*wanted, *own])]
     if asked is not None and not stamped:
         asked += ["episode_index"]
-    labels = _labels(info)
+    labels = _feature_labels(info)
     tables = [read_parquet(file, asked, time, meter, labels) for file in files]
-    pieces = split(_joined(tables, where), "episode_index")
+    pieces = split(_join_tables(tables, where), "episode_index")
     notes = _announced(info.get("total_episodes"), [n for n, _ in pieces], where)
-    pieces = [(n, _timed(t, info, stamped)) for n, t in sorted(pieces, key=_number)]
+    pieces = [
+        (n, _timed(t, info, stamped)) for n, t in sorted(pieces, key=_episode_number)
+    ]
     number, first = pieces[0]
     pieces[0] = (number, replace(first, notes=(*first.notes, *notes)))
     return [(str(n), table) for n, table in pieces]
 
 
-def _number(piece: tuple[int, Any]) -> int:
+def _episode_number(piece: tuple[int, Any]) -> int:
     return piece[0]
 
 
@@ -86,7 +93,7 @@ def _json(path: Path, meter: Meter) -> dict[str, Any]:
     return values
 
 
-def _labels(info: Mapping[str, Any]) -> dict[str, list[str]]:
+def _feature_labels(info: Mapping[str, Any]) -> dict[str, list[str]]:
     """The names of the entries of each feature, where the dataset gives them."""
     labels: dict[str, list[str]] = {}
     features = info.get("features")
@@ -100,7 +107,7 @@ def _labels(info: Mapping[str, Any]) -> dict[str, list[str]]:
     return labels
 
 
-def _joined(tables: Sequence[Table], where: str) -> Table:
+def _join_tables(tables: Sequence[LogTable], where: str) -> LogTable:
     """The rows of all files after each other, numbered as LeRobot's index does."""
     columns = {
         name: np.concatenate([table.columns[name] for table in tables])
@@ -108,10 +115,10 @@ def _joined(tables: Sequence[Table], where: str) -> Table:
     }
     rows = Rows(where, np.arange(len(columns["episode_index"])), "row")
     notes = tuple(note for table in tables for note in table.notes)
-    return Table(rows, tables[0].header, columns, notes=notes)
+    return LogTable(rows, tables[0].header, columns, notes=notes)
 
 
-def _timed(table: Table, info: Mapping[str, Any], stamped: bool) -> Table:
+def _timed(table: LogTable, info: Mapping[str, Any], stamped: bool) -> LogTable:
     """The episode with its clock: frames over their rate where the stamps agree."""
     if not stamped:
         return table
@@ -135,34 +142,34 @@ def _announced(total: Any, found: Sequence[int], where: str) -> list[Note]:
 
 def read_minari(
     path: Path, wanted: Sequence[str] | None, time: str | None, meter: Meter
-) -> list[tuple[str, Table]]:
+) -> list[tuple[str, LogTable]]:
     """The episodes of a Minari folder; the last action is held (E103 to E140).
 
     Columns are ``observations[0]`` or, of a space of names, ``observations/arm[0]``.
     """
     folder = path / "data" if (path / "data" / "metadata.json").is_file() else path
-    where = shown(path)
+    where = display_path(path)
     info = _json(folder / "metadata.json", meter)
     kind = info.get("data_format", "hdf5")
     if kind != "hdf5" or not (folder / "main_data.hdf5").is_file():
         raise error(
             "not_minari_format",
-            where=f"{shown(folder)}/metadata.json",
+            where=f"{display_path(folder)}/metadata.json",
             got=f"data_format {kind!r}",
         )
-    h5py = library("h5py", "hdf5", "a Minari dataset")
+    h5py = import_optional("h5py", "hdf5", "a Minari dataset")
     main = folder / "main_data.hdf5"
-    with steady(main), h5py.File(main, "r") as file:
-        episodes: dict[int, dict[str, Entry]] = {}
+    with unchanged_size(main), h5py.File(main, "r") as file:
+        episodes: dict[int, dict[str, LazyArray]] = {}
         for name, entry in entries_of(file, where, meter).items():
             if found := _EPISODE.match(name):
                 inner = episodes.setdefault(int(found[1]), {})
                 inner[name[found.end() :]] = entry
         pieces = []
-        for number, inner in sorted(episodes.items(), key=_number):
+        for number, inner in sorted(episodes.items(), key=_episode_number):
             source = f"{where} episode {number}"
             aligned = _aligned(inner, source)
-            table = table_of(aligned, source, wanted, time=time, meter=meter)
+            table = read_columns(aligned, source, wanted, time=time, meter=meter)
             pieces.append((str(number), table))
     notes = _announced(info.get("total_episodes"), [*episodes], where)
     if not pieces:
@@ -172,7 +179,7 @@ def read_minari(
     return pieces
 
 
-def _aligned(entries: Mapping[str, Entry], source: str) -> dict[str, Entry]:
+def _aligned(entries: Mapping[str, LazyArray], source: str) -> dict[str, LazyArray]:
     """Observations and actions in rows of one length: the last action is held (E140).
 
     Rewards and flags belong to the steps between the rows and are left out.
@@ -187,7 +194,7 @@ def _aligned(entries: Mapping[str, Entry], source: str) -> dict[str, Entry]:
             got=f"{rows} observations, {steps} actions",
         )
     kept = {n: e for n, e in entries.items() if _is(n, "observations", "infos")}
-    held = {n: _held(e) for n, e in entries.items() if _is(n, "actions")}
+    held = {n: _repeat_last(e) for n, e in entries.items() if _is(n, "actions")}
     return kept | held
 
 
@@ -195,7 +202,7 @@ def _is(name: str, *groups: str) -> bool:
     return name.split("/", 1)[0] in groups
 
 
-def _held(entry: Entry) -> Entry:
+def _repeat_last(entry: LazyArray) -> LazyArray:
     def values() -> Shaped[np.ndarray, "..."]:
         read = entry.read()
         return np.concatenate([read, read[-1:]])

@@ -41,7 +41,7 @@ _PICKLES = (".pkl", ".pickle", ".pt", ".pth", ".ckpt", ".joblib")
 PICKLED = tuple(bytes([0x80, protocol]) for protocol in range(2, 6))
 
 
-def shown(path: Path) -> str:
+def display_path(path: Path) -> str:
     """A path as the user would write it: relative when it lies below the folder."""
     try:
         return str(path.relative_to(Path.cwd()))
@@ -60,14 +60,14 @@ def kind_of(path: Path) -> str:
         for kind, marks in FOLDERS.items():
             if any((path / mark).is_file() for mark in marks):
                 return kind
-        raise _not_a_file(shown(path), stat.S_IFDIR)
+        raise _not_a_file(display_path(path), stat.S_IFDIR)
     if path.suffix.lower() in _PICKLES:
-        raise pickled(shown(path), path.suffix)
+        raise pickle_error(display_path(path), path.suffix)
     if path.suffix.lower() == ".safetensors":
-        raise _tensors(read_bytes(path, first=16), shown(path))
+        raise _tensors(read_bytes(path, first=16), display_path(path))
     kind = SUFFIXES.get(path.suffix.lower(), "csv")
     if kind in MAGIC:  # a format of text has no first bytes of its own
-        _check_magic(read_bytes(path, first=16), kind, shown(path))
+        _check_magic(read_bytes(path, first=16), kind, display_path(path))
     return kind
 
 
@@ -77,9 +77,9 @@ def _check_magic(first: bytes, kind: str, where: str) -> None:
     if not first:
         raise error("empty_recording", where=where, got="0 bytes", format=kind)
     if first.startswith(PICKLED):
-        raise pickled(where, "a pickle")
+        raise pickle_error(where, "a pickle")
     if first.startswith(COMPRESSED) and not first.startswith(MAGIC["npz"]):
-        raise compressed(where, first)
+        raise compression_error(where, first)
     other = [name for name, magic in MAGIC.items() if first.startswith(magic)]
     raise error(
         "not_what_its_name_says",
@@ -93,7 +93,7 @@ def _check_magic(first: bytes, kind: str, where: str) -> None:
 def _tensors(first: bytes, where: str) -> InputError:
     """E181: no header of a format that nothing here writes is believed."""
     if first.startswith((*PICKLED, MAGIC["npz"])):  # as PyTorch saves objects
-        return pickled(where, "a pickle")
+        return pickle_error(where, "a pickle")
     return error(
         "safetensors_refused",
         where=where,
@@ -102,12 +102,12 @@ def _tensors(first: bytes, where: str) -> InputError:
     )
 
 
-def pickled(where: str, got: str) -> InputError:
+def pickle_error(where: str, got: str) -> InputError:
     """E180: loading a pickle runs the code in it, so none is ever opened."""
     return error("pickle_refused", where=where, got=got)
 
 
-def compressed(where: str, first: bytes) -> InputError:
+def compression_error(where: str, first: bytes) -> InputError:
     """E126: what a compressed text would unpack to is not known."""
     return error("compressed_file", where=where, got=f"first bytes {first[:2].hex()}")
 
@@ -117,22 +117,22 @@ def read_bytes(path: Path, limit: int | None = None, first: int | None = None) -
 
     Folders, devices and pipes are refused.
     """
-    with steady(path, limit):
+    with unchanged_size(path, limit):
         try:
             if first is None:
                 return path.read_bytes()
             with path.open("rb") as file:
                 return file.read(first)
         except OSError as error:
-            raise _unreadable(path, error) from error
+            raise _file_unreadable(path, error) from error
 
 
 @contextmanager
-def steady(path: Path, limit: int | None = None) -> Iterator[int]:
+def unchanged_size(path: Path, limit: int | None = None) -> Iterator[int]:
     """The size of a regular file that is the same afterwards (E126, E129 to E131)."""
-    where = shown(path)
+    where = display_path(path)
     _check_nul(path)
-    before = _status(path)
+    before = _file_status(path)
     if not stat.S_ISREG(before.st_mode):
         raise _not_a_file(where, before.st_mode)
     if limit is not None and before.st_size > limit:
@@ -140,7 +140,7 @@ def steady(path: Path, limit: int | None = None) -> Iterator[int]:
             "file_too_large", where=where, got=f"{before.st_size} bytes", limit=limit
         )
     yield before.st_size
-    after = _status(path)
+    after = _file_status(path)
     if (before.st_size, before.st_mtime_ns) != (after.st_size, after.st_mtime_ns):
         raise error(
             "file_changed_while_read",
@@ -149,14 +149,14 @@ def steady(path: Path, limit: int | None = None) -> Iterator[int]:
         )
 
 
-def _status(path: Path) -> os.stat_result:
+def _file_status(path: Path) -> os.stat_result:
     try:
         return os.stat(path)
     except OSError as error:
-        raise _unreadable(path, error) from error
+        raise _file_unreadable(path, error) from error
 
 
-def library(module: str, extra: str, what: str) -> Any:
+def import_optional(module: str, extra: str, what: str) -> Any:
     """A module of an optional package, imported when a file needs it (E135)."""
     try:
         return importlib.import_module(module)
@@ -172,7 +172,9 @@ def library(module: str, extra: str, what: str) -> Any:
 
 def _check_nul(path: Path) -> None:
     if "\x00" in str(path):
-        raise error("nul_in_path", where=repr(shown(path)), got="a NUL character")
+        raise error(
+            "nul_in_path", where=repr(display_path(path)), got="a NUL character"
+        )
 
 
 def _not_a_file(where: str, mode: int) -> InputError:
@@ -188,7 +190,7 @@ def _not_a_file(where: str, mode: int) -> InputError:
     )
 
 
-def _unreadable(path: Path, caught: OSError) -> InputError:
+def _file_unreadable(path: Path, caught: OSError) -> InputError:
     folder = path.parent
     hint = "check the path"
     if isinstance(caught, FileNotFoundError):
@@ -202,7 +204,7 @@ def _unreadable(path: Path, caught: OSError) -> InputError:
         hint = "give yourself the right to read it"
     return error(
         "file_cannot_be_read",
-        where=shown(path),
+        where=display_path(path),
         got=(caught.strerror or str(caught)).lower(),
         fix=hint,
     )

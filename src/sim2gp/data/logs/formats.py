@@ -11,16 +11,16 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from sim2gp.data.logs.arrays import Entry, split, table_of
+from sim2gp.data.logs.arrays import LazyArray, read_columns, split
 from sim2gp.data.logs.budget import Budget, Meter, readable
 from sim2gp.data.logs.episodes import read_lerobot, read_minari
-from sim2gp.data.logs.file import kind_of, shown
+from sim2gp.data.logs.file import display_path, kind_of
 from sim2gp.data.logs.hdf5 import read_hdf5
 from sim2gp.data.logs.log import RawLog
 from sim2gp.data.logs.npz import read_npz
 from sim2gp.data.logs.parquet import read_parquet
 from sim2gp.data.logs.ros import read_bag
-from sim2gp.data.logs.table import Table, read_table
+from sim2gp.data.logs.table import LogTable, read_table
 from sim2gp.errors import error
 
 BAGS = ("rosbag1", "rosbag2", "mcap")
@@ -37,10 +37,10 @@ class Recording:
     """One episode: a table for each of its clocks; ``episode`` is its name or empty."""
 
     episode: str
-    tables: tuple[Table, ...]
+    tables: tuple[LogTable, ...]
 
 
-def recordings(
+def read_recordings(
     path: Path | RawLog,
     wanted: Sequence[str] | None,
     *,
@@ -58,7 +58,7 @@ def recordings(
     if isinstance(path, RawLog):
         kind, name = "memory", path.name
     else:
-        kind, name = kind_of(path), shown(path)
+        kind, name = kind_of(path), display_path(path)
     meter = Meter(name, budget or Budget())
     with readable(meter):
         return _recordings(path, kind, wanted, time, period, episode, meter)
@@ -75,7 +75,7 @@ def _recordings(
 ) -> tuple[Recording, ...]:
     clock = None if period is not None else (time or TIME)
     if isinstance(path, RawLog):
-        asked = _with(wanted, clock, episode)
+        asked = _wanted_with(wanted, clock, episode)
         pieces = [("", _in_memory(path, asked, clock, meter))]
         return _by_episode(pieces, episode)
     if kind in BAGS:
@@ -84,10 +84,10 @@ def _recordings(
     if kind == "lerobot":
         _check_no_episode(path, episode, kind)
         stamped = time is None and period is None
-        asked = _with(wanted, time)
+        asked = _wanted_with(wanted, time)
         found = read_lerobot(path, asked, time, stamped, meter)
         return tuple(Recording(name, (table,)) for name, table in found)
-    asked = _with(wanted, clock, episode)
+    asked = _wanted_with(wanted, clock, episode)
     if kind == "minari":
         _check_no_episode(path, episode, kind)
         pieces = read_minari(path, asked, clock, meter)
@@ -100,18 +100,18 @@ def _recordings(
 
 def _in_memory(
     log: RawLog, wanted: Sequence[str] | None, time: str | None, meter: Meter
-) -> Table:
+) -> LogTable:
     """Columns that are arrays already, checked as those of a file."""
 
-    def entry(values: np.ndarray) -> Entry:
-        return Entry(values.shape, values.dtype, lambda: values)
+    def entry(values: np.ndarray) -> LazyArray:
+        return LazyArray(values.shape, values.dtype, lambda: values)
 
     entries = {name: entry(values) for name, values in log.columns.items()}
-    return table_of(entries, log.name, wanted, time=time, meter=meter)
+    return read_columns(entries, log.name, wanted, time=time, meter=meter)
 
 
 def _by_episode(
-    pieces: list[tuple[str, Table]], episode: str | None
+    pieces: list[tuple[str, LogTable]], episode: str | None
 ) -> tuple[Recording, ...]:
     """Each piece cut at the borders of its episodes, where a column numbers them."""
     if episode is not None:
@@ -131,11 +131,11 @@ def columns_of(
     Columns of streams with clocks of their own have lengths of their own. Raises
     `InputError`, E126 for a file beyond the ``budget``, 2 GiB and 60 s if None.
     """
-    tables = recordings(Path(path), None, budget=budget)[0].tables
+    tables = read_recordings(Path(path), None, budget=budget)[0].tables
     return {name: v for table in tables for name, v in table.columns.items()}
 
 
-def _with(wanted: Sequence[str] | None, *names: str | None) -> list[str] | None:
+def _wanted_with(wanted: Sequence[str] | None, *names: str | None) -> list[str] | None:
     if wanted is None:
         return None
     return list(dict.fromkeys([*(n for n in names if n is not None), *wanted]))
@@ -147,12 +147,12 @@ def _check_bag(
     if period is not None:
         raise error(
             "period_with_stamps",
-            where=shown(path),
+            where=display_path(path),
             got=f"period = {period:g}",
             period=f"{period:g}",
         )
     if time is not None and time not in CLOCKS:
-        raise error("no_such_clock", where=shown(path), got=f"time = {time!r}")
+        raise error("no_such_clock", where=display_path(path), got=f"time = {time!r}")
     _check_no_episode(path, episode, "bag")
 
 
@@ -160,7 +160,7 @@ def _check_no_episode(path: Path, episode: str | None, kind: str) -> None:
     if episode is not None:
         raise error(
             "column_of_episodes_unneeded",
-            where=shown(path),
+            where=display_path(path),
             got=f"episode = {episode!r}",
             format=kind,
         )

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Shaped
 
-from sim2gp.data.logs.arrays import Entry, table_of
+from sim2gp.data.logs.arrays import LazyArray, read_columns
 from sim2gp.data.logs.budget import Meter
-from sim2gp.data.logs.file import library, shown, steady
-from sim2gp.data.logs.table import Table
-from sim2gp.data.logs.unpack import inflated, lzf_pieces
+from sim2gp.data.logs.file import display_path, import_optional, unchanged_size
+from sim2gp.data.logs.table import LogTable
+from sim2gp.data.logs.unpack import inflate, lzf_pieces
 from sim2gp.errors import error
 
 #: Groups whose names are one of these words and a number hold an episode each.
@@ -37,44 +37,44 @@ STEP = 2**22  # bytes that are read at once
 
 def read_hdf5(
     path: Path, wanted: Sequence[str] | None, time: str | None, meter: Meter
-) -> list[tuple[str, Table]]:
+) -> list[tuple[str, LogTable]]:
     """The wanted datasets, one table for each episode, with the episode's name.
 
     Columns are named by their path in the file, or in each episode's group. Raises
     `InputError` E103 to E126, E131, E140.
     """
-    where = shown(path)
-    h5py = library("h5py", "hdf5", "an HDF5 file")
-    with steady(path), h5py.File(path, "r") as file:
+    where = display_path(path)
+    h5py = import_optional("h5py", "hdf5", "an HDF5 file")
+    with unchanged_size(path), h5py.File(path, "r") as file:
         entries = entries_of(file, where, meter)
         bases = {re.sub(r"\[\d+\]$", "", name) for name in wanted or ()}
         groups = {} if bases & {*entries} else episodes_of(entries, bases)
         if not groups:
-            return [("", table_of(entries, where, wanted, time=time, meter=meter))]
+            return [("", read_columns(entries, where, wanted, time=time, meter=meter))]
         return [
             (
                 name.rsplit("/", 1)[-1],
-                table_of(inner, f"{where} {name}", wanted, time=time, meter=meter),
+                read_columns(inner, f"{where} {name}", wanted, time=time, meter=meter),
             )
             for name, inner in groups.items()
         ]
 
 
-def entries_of(file: Any, where: str, meter: Meter) -> dict[str, Entry]:
+def entries_of(file: Any, where: str, meter: Meter) -> dict[str, LazyArray]:
     """Every dataset with rows, by its path; hard links alone are followed."""
-    h5py = library("h5py", "hdf5", "an HDF5 file")
-    found: dict[str, Entry] = {}
+    h5py = import_optional("h5py", "hdf5", "an HDF5 file")
+    found: dict[str, LazyArray] = {}
 
     def visit(name: str, item: Any) -> None:
         meter.tick()
         if isinstance(item, h5py.Dataset) and item.shape:
-            found[name] = _entry(item, f"{where}:dataset {name}", meter)
+            found[name] = _lazy_dataset(item, f"{where}:dataset {name}", meter)
 
     file.visititems(visit)
     return found
 
 
-def _entry(dataset: Any, where: str, meter: Meter) -> Entry:
+def _lazy_dataset(dataset: Any, where: str, meter: Meter) -> LazyArray:
     def values() -> Shaped[np.ndarray, "..."]:
         if dataset.external or dataset.is_virtual:
             raise error(
@@ -98,9 +98,9 @@ def _entry(dataset: Any, where: str, meter: Meter) -> Entry:
 
     dtype = dataset.dtype
     if dtype.hasobject:  # texts, or rows of different lengths
-        is_text = library("h5py", "hdf5", where).check_string_dtype(dtype)
+        is_text = import_optional("h5py", "hdf5", where).check_string_dtype(dtype)
         dtype = np.dtype(str) if is_text else np.dtype([("field", "f8")])
-    return Entry(dataset.shape, dtype, values)
+    return LazyArray(dataset.shape, dtype, values)
 
 
 def _check_chunks(dataset: Any, where: str, meter: Meter) -> None:
@@ -134,14 +134,14 @@ def _check_chunks(dataset: Any, where: str, meter: Meter) -> None:
         _, content = dataset.id.read_direct_chunk(chunk.chunk_offset)
         if used[-1] == _CHECKSUM:
             content = content[:-4]
-        unpacked = inflated(content) if packed == [_GZIP] else lzf_pieces(content)
+        unpacked = inflate(content) if packed == [_GZIP] else lzf_pieces(content)
         # A checksum may lie inside. What is read is counted when it is read.
         meter.again().measure(unpacked, declared + 64, "chunk")
 
 
 def episodes_of(
-    entries: Mapping[str, Entry], bases: set[str]
-) -> dict[str, dict[str, Entry]]:
+    entries: Mapping[str, LazyArray], bases: set[str]
+) -> dict[str, dict[str, LazyArray]]:
     """Groups that hold the wanted datasets, by name, in the order of their numbers.
 
     Without wanted names, groups that are called episodes. One that lacks a dataset of
@@ -157,7 +157,7 @@ def episodes_of(
                 groups[group] = None
     top = min((name.count("/") for name in groups), default=0)
     names = sorted((n for n in groups if n.count("/") == top), key=_natural)
-    found: dict[str, dict[str, Entry]] = {name: {} for name in names}
+    found: dict[str, dict[str, LazyArray]] = {name: {} for name in names}
     for name, entry in entries.items():
         parts = name.split("/")
         group, inner = "/".join(parts[: top + 1]), "/".join(parts[top + 1 :])

@@ -14,7 +14,7 @@ from jaxtyping import Int
 from sim2gp.data.logs.arrays import MAX_WIDTH
 from sim2gp.data.logs.budget import Meter
 from sim2gp.data.logs.log import Note
-from sim2gp.data.logs.table import Rows, Table
+from sim2gp.data.logs.table import LogTable, Rows
 from sim2gp.errors import error
 
 NEAR = 1_000_000_000  # ns: clocks further apart than this are not one clock
@@ -45,7 +45,7 @@ class Stream:
     values: list[tuple[float, ...]] = field(default_factory=list)
 
 
-def collected(
+def collect_streams(
     messages: Iterator[Message], wanted: Sequence[str] | None, meter: Meter
 ) -> tuple[list[Stream], tuple[str, ...]]:
     """The streams, and the names of all fields that were seen.
@@ -60,7 +60,9 @@ def collected(
     for message in messages:
         topic = message.topic
         number = counts[topic] = counts.get(topic, -1) + 1
-        fields = _fields(message.content, topic, f"{where} {topic}:message {number}")
+        fields = _message_fields(
+            message.content, topic, f"{where} {topic}:message {number}"
+        )
         if asked is None or number == 0:
             seen |= dict.fromkeys(fields)
         # In one order, whatever that of the joints in this message.
@@ -93,13 +95,13 @@ def _check_steady_fields(streams: Sequence[Stream], where: str) -> None:
                 )
 
 
-def clocked(
+def assign_times(
     streams: Sequence[Stream],
     start: int,
     clock: str | None,
     where: str,
     seen: tuple[str, ...],
-) -> list[Table]:
+) -> list[LogTable]:
     """Tables in seconds since the start of the recording; what was taken is said.
 
     Header stamps and log times are mixed only where they are of one clock.
@@ -126,19 +128,19 @@ def clocked(
     first = min(int(t[0]) for t in times)
     origin = first if start < 0 or (far and all(use)) else start
     return [
-        _table(stream, time, origin, used, where, seen)
+        _stream_table(stream, time, origin, used, where, seen)
         for stream, time, used in zip(streams, times, use, strict=True)
     ]
 
 
-def _table(
+def _stream_table(
     stream: Stream,
     time: Int[np.ndarray, " N"],
     origin: int,
     headed: bool,
     where: str,
     seen: tuple[str, ...],
-) -> Table:
+) -> LogTable:
     what = "its headers" if headed else "its log times"
     text = f"time of {stream.topic} in {where} is that of {what}"
     values = np.asarray(stream.values, dtype=np.float64)
@@ -146,7 +148,7 @@ def _table(
     rows = Rows(f"{where} {stream.topic}", np.asarray(stream.numbers), "message")
     seconds = (time - origin) / 1e9
     notes = (Note("W154", text),)
-    return Table(rows, seen, columns, seconds, stream.topic, notes)
+    return LogTable(rows, seen, columns, seconds, stream.topic, notes)
 
 
 def _stamp(content: Any) -> int:
@@ -168,20 +170,20 @@ def _get(content: Any, name: str) -> Any:
     return getattr(content, name, None)
 
 
-def _fields(content: Any, topic: str, where: str) -> Fields:
+def _message_fields(content: Any, topic: str, where: str) -> Fields:
     """The numbers of a message by path; those of joints by the joint's name."""
     found: Fields = {}
     joints = _get(content, "name")
     named = isinstance(joints, list | tuple) and len(joints) > 0
     parts = [p for p in _JOINT if named and _get(content, p) is not None]
     if parts and all(isinstance(joint, str) for joint in joints):
-        _joints(content, joints, parts, topic, where, found)
+        _add_joints(content, joints, parts, topic, where, found)
         return found
     _walk(content, topic, found, top=True)
     return found
 
 
-def _joints(
+def _add_joints(
     content: Any,
     joints: Sequence[str],
     parts: Sequence[str],
@@ -202,10 +204,10 @@ def _joints(
                 got=f"{len(joints)} names, {len(values)} of {part}",
             )
         for joint, value in zip(joints, values, strict=True):
-            found[f"{topic}/{joint}/{part}"] = _number(value)
+            found[f"{topic}/{joint}/{part}"] = _number_or_nan(value)
 
 
-def _number(value: Any) -> float:
+def _number_or_nan(value: Any) -> float:
     return float("nan") if value is None else float(value)
 
 
@@ -214,7 +216,7 @@ def _walk(value: Any, path: str, found: Fields, *, top: bool = False) -> None:
     if isinstance(value, bool | str | bytes | np.bool_):
         return
     if value is None or isinstance(value, int | float | np.number):
-        found[path] = _number(value)
+        found[path] = _number_or_nan(value)
     elif isinstance(value, dict):
         for name, inner in value.items():
             if not (top and name in ("header", "timestamp")):

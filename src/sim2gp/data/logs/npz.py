@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Shaped
 
-from sim2gp.data.logs.arrays import Entry, distinct, table_of
+from sim2gp.data.logs.arrays import LazyArray, distinct, read_columns
 from sim2gp.data.logs.budget import Meter
-from sim2gp.data.logs.file import pickled, shown, steady
-from sim2gp.data.logs.table import Table
+from sim2gp.data.logs.file import display_path, pickle_error, unchanged_size
+from sim2gp.data.logs.table import LogTable
 from sim2gp.errors import error
 
 MAX_HEADER = 10_000  # bytes; numpy's own limit
@@ -40,27 +40,27 @@ _AXIS = re.compile(r" *([0-9]{1,19})L? *")
 
 def read_npz(
     path: Path, wanted: Sequence[str] | None, time: str | None, meter: Meter
-) -> Table:
+) -> LogTable:
     """The wanted arrays of an archive as columns (E103 to E126, E140, E180, E182)."""
-    where = shown(path)
-    with steady(path), zipfile.ZipFile(path) as archive:
-        members = [_checked(info, where) for info in archive.infolist()]
+    where = display_path(path)
+    with unchanged_size(path), zipfile.ZipFile(path) as archive:
+        members = [_check_member(info, where) for info in archive.infolist()]
         names = [info.filename.removesuffix(".npy") for info in members]
         distinct(names, where)
         entries = {}
         for name, info in zip(names, members, strict=True):
             meter.place = f"array {name[:60]}"
-            entries[name] = _entry(archive, info, meter)
-        return table_of(entries, where, wanted, time=time, meter=meter)
+            entries[name] = _lazy_member(archive, info, meter)
+        return read_columns(entries, where, wanted, time=time, meter=meter)
 
 
-def _checked(info: zipfile.ZipInfo, where: str) -> zipfile.ZipInfo:
+def _check_member(info: zipfile.ZipInfo, where: str) -> zipfile.ZipInfo:
     name = info.filename.replace("\\", "/")
     path = PurePosixPath(name)
     if path.is_absolute() or ".." in path.parts or ":" in path.parts[0]:
         raise error("entry_outside_archive", where=where, got=repr(info.filename)[:60])
     if path.suffix == ".pkl" or "data.pkl" in path.parts:
-        raise pickled(where, info.filename)
+        raise pickle_error(where, info.filename)
     if path.suffix != ".npy":
         raise error("member_not_an_array", where=where, got=repr(info.filename)[:60])
     if info.compress_type not in _PLAIN:
@@ -72,13 +72,15 @@ def _checked(info: zipfile.ZipInfo, where: str) -> zipfile.ZipInfo:
     return info
 
 
-def _entry(archive: zipfile.ZipFile, info: zipfile.ZipInfo, meter: Meter) -> Entry:
+def _lazy_member(
+    archive: zipfile.ZipFile, info: zipfile.ZipInfo, meter: Meter
+) -> LazyArray:
     """The array's shape and dtype, and how to read it."""
     meter.tick()
     with archive.open(info) as member:
-        shape, in_columns, dtype, start = _header(member, meter)
+        shape, in_columns, dtype, start = _array_header(member, meter)
     if dtype.hasobject or dtype.kind == "V":
-        return Entry(shape, dtype, lambda: np.empty(0))
+        return LazyArray(shape, dtype, lambda: np.empty(0))
     count = math.prod(shape)
     claimed = count * dtype.itemsize
     if claimed != info.file_size - start:
@@ -106,10 +108,12 @@ def _entry(archive: zipfile.ZipFile, info: zipfile.ZipInfo, meter: Meter) -> Ent
         flat = content.view(dtype)
         return flat.reshape(shape, order="F" if in_columns else "C")
 
-    return Entry(shape, dtype, values)
+    return LazyArray(shape, dtype, values)
 
 
-def _header(member: Any, meter: Meter) -> tuple[tuple[int, ...], bool, np.dtype, int]:
+def _array_header(
+    member: Any, meter: Meter
+) -> tuple[tuple[int, ...], bool, np.dtype, int]:
     """Shape, order, dtype and length of an array's header; ValueError for any other."""
     version = np.lib.format.read_magic(member)
     form = "<H" if version == (1, 0) else "<I"

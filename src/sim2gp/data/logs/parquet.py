@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Shaped
 
-from sim2gp.data.logs.arrays import Entry, distinct, table_of
+from sim2gp.data.logs.arrays import LazyArray, distinct, read_columns
 from sim2gp.data.logs.budget import Meter
-from sim2gp.data.logs.file import MAGIC, library, shown, steady
-from sim2gp.data.logs.table import Table
+from sim2gp.data.logs.file import MAGIC, display_path, import_optional, unchanged_size
+from sim2gp.data.logs.table import LogTable
 from sim2gp.errors import error
 
 Labels = Mapping[str, Sequence[str]]
@@ -27,30 +27,30 @@ def read_parquet(
     time: str | None,
     meter: Meter,
     labels: Labels | None = None,
-) -> Table:
+) -> LogTable:
     """The wanted columns of a file (E103 to E126, E140); ``labels`` names list entries.
 
     A footer that is not there is a recording that was cut off (E125).
     """
-    where = shown(path)
-    library("pyarrow", "parquet", "a Parquet file")
-    parquet = library("pyarrow.parquet", "parquet", "a Parquet file")
-    with steady(path) as size:
+    where = display_path(path)
+    import_optional("pyarrow", "parquet", "a Parquet file")
+    parquet = import_optional("pyarrow.parquet", "parquet", "a Parquet file")
+    with unchanged_size(path) as size:
         _check_end(path, size, where)
         with parquet.ParquetFile(path, page_checksum_verification=True) as file:
             meter.claim(8 * file.metadata.num_rows, "rows")
             distinct(file.schema_arrow.names, where)
             entries, leaf = {}, 0
             for field in file.schema_arrow:
-                leaves = range(leaf, leaf + _leaves(field.type))
+                leaves = range(leaf, leaf + _leaf_count(field.type))
                 found = (labels or {}).get(field.name)
-                entries[field.name] = _entry(file, field, leaves, meter, found)
+                entries[field.name] = _lazy_column(file, field, leaves, meter, found)
                 leaf = leaves.stop
             if leaf != file.metadata.num_columns:
                 raise ValueError(
                     f"{file.metadata.num_columns} columns, {leaf} in types"
                 )
-            return table_of(entries, where, wanted, time=time, meter=meter)
+            return read_columns(entries, where, wanted, time=time, meter=meter)
 
 
 def _check_end(path: Path, size: int, where: str) -> None:
@@ -61,20 +61,20 @@ def _check_end(path: Path, size: int, where: str) -> None:
         raise error("no_footer", where=where, got=f"{size} bytes without a footer")
 
 
-def _leaves(kind: Any) -> int:
+def _leaf_count(kind: Any) -> int:
     """How many columns of the file hold a field: those of a record count each."""
-    types = library("pyarrow.types", "parquet", "a Parquet file")
+    types = import_optional("pyarrow.types", "parquet", "a Parquet file")
     kind = getattr(kind, "storage_type", kind)
     if not types.is_nested(kind):
         return 1
-    return sum(_leaves(kind.field(i).type) for i in range(kind.num_fields))
+    return sum(_leaf_count(kind.field(i).type) for i in range(kind.num_fields))
 
 
-def _entry(
+def _lazy_column(
     file: Any, field: Any, leaves: range, meter: Meter, labels: Sequence[str] | None
-) -> Entry:
+) -> LazyArray:
     """A column's shape and dtype; the width of a list is what the footer counts."""
-    types = library("pyarrow.types", "parquet", "a Parquet file")
+    types = import_optional("pyarrow.types", "parquet", "a Parquet file")
     meter.tick()
     rows, kind = file.metadata.num_rows, field.type
     lists = (types.is_list, types.is_large_list, types.is_fixed_size_list)
@@ -82,14 +82,14 @@ def _entry(
     width = _width(file.metadata, leaves.start) if is_list else 1
 
     def values() -> Shaped[np.ndarray, "..."]:
-        return _column(file, field.name, leaves, width, meter)
+        return _read_column(file, field.name, leaves, width, meter)
 
     if not is_list:
-        return Entry((rows,), _dtype(kind), values)
+        return LazyArray((rows,), _dtype(kind), values)
     names = tuple(labels or ())
     if len(names) != width:
         names = ()
-    return Entry((rows, width), _dtype(kind.value_type), values, names)
+    return LazyArray((rows, width), _dtype(kind.value_type), values, names)
 
 
 def _width(metadata: Any, leaf: int) -> int:
@@ -103,7 +103,7 @@ def _width(metadata: Any, leaf: int) -> int:
 
 def _dtype(kind: Any) -> np.dtype:
     """The dtype that an Arrow type has in numpy; records and lists count as such."""
-    types = library("pyarrow.types", "parquet", "a Parquet file")
+    types = import_optional("pyarrow.types", "parquet", "a Parquet file")
     if types.is_nested(kind):
         return np.dtype([("field", "f8")])
     if types.is_dictionary(kind):
@@ -119,7 +119,7 @@ def _dtype(kind: Any) -> np.dtype:
     return np.dtype(kind.to_pandas_dtype())
 
 
-def _column(
+def _read_column(
     file: Any, name: str, leaves: range, width: int, meter: Meter
 ) -> Shaped[np.ndarray, "..."]:
     """All values of a column, and of no other that its name is a part of."""
@@ -143,15 +143,15 @@ def _column(
 
 def _array(chunk: Any, name: str, where: str) -> Shaped[np.ndarray, "..."]:
     """One chunk as numpy; nulls are NaN, lists are rows of one width (E140)."""
-    types = library("pyarrow.types", "parquet", "a Parquet file")
+    types = import_optional("pyarrow.types", "parquet", "a Parquet file")
     if not (types.is_nested(chunk.type)):
-        return _plain(chunk)
+        return _chunk_values(chunk)
     if chunk.null_count == 0:
         inner = chunk.flatten()
         width = len(inner) // len(chunk)
         widths = chunk.value_lengths() if hasattr(chunk, "value_lengths") else None
         if widths is None or set(widths.unique().to_pylist()) == {width}:
-            return _plain(inner).reshape(len(chunk), width)
+            return _chunk_values(inner).reshape(len(chunk), width)
     raise error(
         "lists_of_different_lengths",
         where=f"{where}:column {name}",
@@ -159,8 +159,8 @@ def _array(chunk: Any, name: str, where: str) -> Shaped[np.ndarray, "..."]:
     )
 
 
-def _plain(chunk: Any) -> Shaped[np.ndarray, " N"]:
-    types = library("pyarrow.types", "parquet", "a Parquet file")
+def _chunk_values(chunk: Any) -> Shaped[np.ndarray, " N"]:
+    types = import_optional("pyarrow.types", "parquet", "a Parquet file")
     if types.is_dictionary(chunk.type):
         chunk = chunk.dictionary_decode()
     if types.is_decimal(chunk.type):

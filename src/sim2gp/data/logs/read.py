@@ -16,14 +16,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from sim2gp.data.logs import checks
-from sim2gp.data.logs.alignment import misaligned
+from sim2gp.data.logs.alignment import alignment_notes
 from sim2gp.data.logs.budget import Budget
-from sim2gp.data.logs.file import shown
-from sim2gp.data.logs.formats import BOOKKEEPING, TIME, Recording, recordings
+from sim2gp.data.logs.file import display_path
+from sim2gp.data.logs.formats import BOOKKEEPING, TIME, Recording, read_recordings
 from sim2gp.data.logs.log import ChannelLike, Column, Log, Note, RawLog
-from sim2gp.data.logs.resample import Resample, Track, joined
-from sim2gp.data.logs.table import Rows, Table
-from sim2gp.data.logs.units import factor
+from sim2gp.data.logs.resample import Resample, Track, join_tracks
+from sim2gp.data.logs.table import LogTable, Rows
+from sim2gp.data.logs.units import unit_factor
 from sim2gp.errors import InputError, error
 
 Values = Float[np.ndarray, " N"]
@@ -45,7 +45,7 @@ class _Plan:
     keep_first: bool
     limits: Mapping[str, tuple[float, float]]
 
-    def held(self, among: Sequence[ChannelLike], table: Table) -> dict[str, Column]:
+    def held(self, among: Sequence[ChannelLike], table: LogTable) -> dict[str, Column]:
         """The columns of some channels that stand in a table."""
         found = {c.name: self.columns.get(c.name) for c in among}
         return {
@@ -85,8 +85,8 @@ def read_log(
     Raises `InputError` with the codes of bad recordings (E101 to E141, E180, E182).
     """
     path = path if isinstance(path, RawLog) else Path(path)
-    place = path.name if isinstance(path, RawLog) else shown(path)
-    checks.check_names(columns, states, actions, place)
+    place = path.name if isinstance(path, RawLog) else display_path(path)
+    checks.check_column_names(columns, states, actions, place)
     named = time.column if isinstance(time, Column) else time
     clock = time if isinstance(time, Column) else Column(time or TIME, "s")
     plan = _Plan(
@@ -96,20 +96,20 @@ def read_log(
     specs = [spec for spec in columns.values() if isinstance(spec, Column)]
     wanted = list(dict.fromkeys(spec.column for spec in specs))
     try:
-        found = recordings(
+        found = read_recordings(
             path, wanted, time=named, period=period, episode=episode, budget=budget
         )
     except InputError as error:
         raise _or_constant(error, plan) from error
-    about = checks.unused(_left(found[0].tables), place)
-    logs = _episodes(found, plan, path, dict(fixed or {}), group, about)
+    about = checks.unused_columns(_unread_columns(found[0].tables), place)
+    logs = _logs_of_recordings(found, plan, path, dict(fixed or {}), group, about)
     if not logs:
         raise _too_short(place, 1)
-    about += misaligned(max(logs, key=len), states, longest_delay)
+    about += alignment_notes(max(logs, key=len), states, longest_delay)
     return (replace(logs[0], notes=(*logs[0].notes, *about)), *logs[1:])
 
 
-def _episodes(
+def _logs_of_recordings(
     found: Sequence[Recording],
     plan: _Plan,
     path: Path | RawLog,
@@ -139,7 +139,7 @@ def _assembled(
     source = recording.tables[0].rows.source
     if recording.tables[0].stream:
         source = source.removesuffix(f" {recording.tables[0].stream}")
-    whole, said = joined(tracks, plan.resample, source)
+    whole, said = join_tracks(tracks, plan.resample, source)
     inputs = dict(whole.inputs)
     for action in plan.actions:
         constant = plan.columns[action.name]
@@ -163,10 +163,10 @@ def _assembled(
         group,
         tuple(notes),
     )  # fmt: skip
-    return _cut(log, whole.cuts, whole.rows)
+    return _split_at_gaps(log, whole.cuts, whole.rows)
 
 
-def _left(tables: Sequence[Table]) -> list[str]:
+def _unread_columns(tables: Sequence[LogTable]) -> list[str]:
     """The columns that were not read, but for a format's own.
 
     A message of a bag has the fields of its type, whoever needs them.
@@ -180,20 +180,20 @@ def _left(tables: Sequence[Table]) -> list[str]:
     ]
 
 
-def _track(table: Table, plan: _Plan) -> Track:
+def _track(table: LogTable, plan: _Plan) -> Track:
     """The table's columns in the system's units, on the table's own clock."""
     table, time, cuts, notes = _usable(table, plan)
     rows = table.rows
     checks.stamps(time, rows)
     known = table.clock is not None or plan.period is not None
     notes += checks.rate(time, cuts, rows.source, in_seconds=known)
-    channels, mask, masked = _channels(table, plan)
-    inputs, clipped = _inputs(table, plan)
+    channels, mask, masked = _measured_channels(table, plan)
+    inputs, clipped = _commanded_inputs(table, plan)
     said = (*table.notes, *notes, *masked, *clipped)
     return Track(table.stream, rows, time, cuts, channels, mask, inputs, said)
 
 
-def _usable(table: Table, plan: _Plan) -> tuple[Table, Values, Mask, list[Note]]:
+def _usable(table: LogTable, plan: _Plan) -> tuple[LogTable, Values, Mask, list[Note]]:
     """The rows outside the excluded times, their times, where to cut, and notes."""
     source = table.rows.source
     notes = []
@@ -213,7 +213,7 @@ def _usable(table: Table, plan: _Plan) -> tuple[Table, Values, Mask, list[Note]]
             notes.append(Note("W101", f"{text}: the log is cut there"))
         out |= ~whole
     else:
-        checks.finite(table.columns, table.rows, out)
+        checks.check_finite_columns(table.columns, table.rows, out)
     keep = np.flatnonzero(~out)
     if plan.keep_first:
         again = np.diff(time[keep], prepend=-np.inf) == 0
@@ -229,7 +229,7 @@ def _usable(table: Table, plan: _Plan) -> tuple[Table, Values, Mask, list[Note]]
     return table.kept(keep), time[keep], cuts, notes
 
 
-def _time(table: Table, plan: _Plan) -> Values:
+def _time(table: LogTable, plan: _Plan) -> Values:
     """Seconds: the format's own stamps, a column, or rows times the stated period."""
     if plan.period is not None:
         return plan.period * np.arange(len(table.rows.numbers))
@@ -265,14 +265,14 @@ def _converted(
     raw: Values, spec: Column, unit: str, source: str, angle: bool = False
 ) -> Values:
     where = f"{source}:column {spec.column}"
-    values = raw * factor(spec.unit, unit, where)
+    values = raw * unit_factor(spec.unit, unit, where)
     if angle:
         values = np.unwrap(values)
     return spec.sign * spec.scale * values + spec.offset
 
 
-def _channels(
-    table: Table, plan: _Plan
+def _measured_channels(
+    table: LogTable, plan: _Plan
 ) -> tuple[dict[str, Values], dict[str, Mask], list[Note]]:
     """Measured channels in the system's units, their masks, and what to say."""
     channels: dict[str, Values] = {}
@@ -321,7 +321,9 @@ def _wraps(
     return [Note("W122", text)]
 
 
-def _inputs(table: Table, plan: _Plan) -> tuple[dict[str, Values], list[Note]]:
+def _commanded_inputs(
+    table: LogTable, plan: _Plan
+) -> tuple[dict[str, Values], list[Note]]:
     """What was commanded; a command beyond its saturation reaches the motor clipped."""
     inputs: dict[str, Values] = {}
     notes: list[Note] = []
@@ -342,7 +344,7 @@ def _inputs(table: Table, plan: _Plan) -> tuple[dict[str, Values], list[Note]]:
     return inputs, notes
 
 
-def _cut(log: Log, cuts: Mask, rows: Rows) -> tuple[Log, ...]:
+def _split_at_gaps(log: Log, cuts: Mask, rows: Rows) -> tuple[Log, ...]:
     """Split at gaps (W111) and at removed rows; pieces of one row are left out."""
     steps = np.diff(log.time)
     gaps = np.concatenate([[False], steps > checks.GAP * np.median(steps)])

@@ -67,7 +67,7 @@ class Track:
         return np.cumsum(self.cuts | gaps)
 
 
-def joined(
+def join_tracks(
     tracks: Sequence[Track], resample: Resample | None, source: str
 ) -> tuple[Track, list[Note]]:
     """One track of all, and what was done to get it (E103, E116)."""
@@ -81,7 +81,7 @@ def joined(
                 got="one stream, and neither period nor stamps",
             )
     rule = resample or Resample()
-    at, cuts, place = _clock(tracks, rule, source)
+    at, cuts, place = _row_times(tracks, rule, source)
     channels: dict[str, Values] = {}
     mask: dict[str, Mask] = {}
     inputs: dict[str, Values] = {}
@@ -106,7 +106,7 @@ def joined(
         if track.inputs:
             valid &= before.held
         for name, values in track.channels.items():
-            channels[name], mask[name] = _state(
+            channels[name], mask[name] = _resampled_state(
                 values, track.mask[name], before, between
             )
             mask[name] &= once
@@ -117,9 +117,9 @@ def joined(
             if skipped > LOST:
                 lost.append(f"{100 * skipped:.0f} % of the samples of {name}")
     if valid.sum() < 2:
-        raise _apart(tracks, source)
+        raise _no_overlap(tracks, source)
     spread = [name for name, once in counted.items() if (~once[valid]).mean() > LOST]
-    notes.append(_said(rule, place, lost, spread, source))
+    notes.append(_resample_note(rule, place, lost, spread, source))
     rows = Rows(source, np.arange(len(at)), "row")
     whole = Track("", rows, at, cuts, channels, mask, inputs, ())
     return _only(whole, valid), notes
@@ -163,7 +163,7 @@ def _once(
     return once
 
 
-def _state(
+def _resampled_state(
     values: Values, mask: Mask, before: _Before, between: bool
 ) -> tuple[Float[np.ndarray, " M"], Bool[np.ndarray, " M"]]:
     """A state at the wanted times, and whether all that it is made of counts."""
@@ -176,7 +176,7 @@ def _state(
     return taken, mask[i] & (mask[j] | ~some)
 
 
-def _clock(
+def _row_times(
     tracks: Sequence[Track], rule: Resample, source: str
 ) -> tuple[Values, Mask, str]:
     """The times of the rows, cuts among them, and what they are called."""
@@ -184,7 +184,7 @@ def _clock(
         start = max(track.time[0] for track in tracks)
         end = min(track.time[-1] for track in tracks)
         if not end > start:
-            raise _apart(tracks, source)
+            raise _no_overlap(tracks, source)
         count = int(np.floor((end - start) / rule.period + 1e-9)) + 1
         at = start + rule.period * np.arange(count)
         return at, np.zeros(count, dtype=bool), f"every {rule.period:g} s"
@@ -222,7 +222,7 @@ def _gaps(track: Track) -> list[Note]:
     return notes
 
 
-def _said(
+def _resample_note(
     rule: Resample,
     place: str,
     lost: Sequence[str],
@@ -256,7 +256,7 @@ def _only(track: Track, valid: Mask) -> Track:
     )
 
 
-def _apart(tracks: Sequence[Track], source: str) -> InputError:
+def _no_overlap(tracks: Sequence[Track], source: str) -> InputError:
     spans = [f"{t.stream or 'rows'} {t.time[0]:.6g} to {t.time[-1]:.6g} s"
              for t in tracks]  # fmt: skip
     return error("streams_do_not_overlap", where=source, got="; ".join(spans))

@@ -12,13 +12,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sim2gp.data.logs.arrays import missing
+from sim2gp.data.logs.arrays import missing_column
 from sim2gp.data.logs.budget import Meter
 from sim2gp.data.logs.chunks import check_bag, check_database, check_mcap
-from sim2gp.data.logs.definitions import full_name, parsed
-from sim2gp.data.logs.file import MAGIC, compressed, library, read_bytes, shown, steady
-from sim2gp.data.logs.messages import Message, clocked, collected
-from sim2gp.data.logs.table import Table
+from sim2gp.data.logs.definitions import full_name, parse_definition
+from sim2gp.data.logs.file import (
+    MAGIC,
+    compression_error,
+    display_path,
+    import_optional,
+    read_bytes,
+    unchanged_size,
+)
+from sim2gp.data.logs.messages import Message, assign_times, collect_streams
+from sim2gp.data.logs.table import LogTable
 from sim2gp.data.logs.unpack import STEP, pieces
 from sim2gp.errors import InputError, error
 
@@ -31,32 +38,32 @@ Decode = Callable[[bytes], Any]
 
 def read_bag(
     path: Path, kind: str, wanted: Sequence[str] | None, clock: str | None, meter: Meter
-) -> list[Table]:
+) -> list[LogTable]:
     """The wanted fields of a recording, one table for each stream.
 
     ``clock`` names the stamps, "header" or "log"; None takes those of the headers where
     they are, and the recorder's otherwise. Raises `InputError` E103, E104, E125, E126,
     E135, E136, E140.
     """
-    where = shown(path)
+    where = display_path(path)
     with ExitStack() as stack:
         start, messages = _opened(path, kind, wanted, meter, stack)
-        streams, seen = collected(messages, wanted, meter)
+        streams, seen = collect_streams(messages, wanted, meter)
     for name in wanted or ():
         if not any(name in stream.names for stream in streams):
-            known = seen if wanted is None else _names(path, kind, meter)
-            raise missing(name, known, where)
+            known = seen if wanted is None else _topic_fields(path, kind, meter)
+            raise missing_column(name, known, where)
     if not streams:
         raise error("no_messages", where=where, got="no numbers")
-    return clocked(streams, start, clock, where, seen)
+    return assign_times(streams, start, clock, where, seen)
 
 
-def _names(path: Path, kind: str, meter: Meter) -> tuple[str, ...]:
+def _topic_fields(path: Path, kind: str, meter: Meter) -> tuple[str, ...]:
     """The fields of every topic, for the message about one that is missing."""
     again = meter.again()
     with ExitStack() as stack:
         _, messages = _opened(path, kind, None, again, stack)
-        return collected(messages, None, again)[1]
+        return collect_streams(messages, None, again)[1]
 
 
 def _opened(
@@ -64,13 +71,13 @@ def _opened(
 ) -> tuple[int, Iterator[Message]]:
     """The first log time, and the messages of the topics that may be wanted."""
     if kind == "mcap":
-        library("mcap.reader", "ros", "an MCAP file")
+        import_optional("mcap.reader", "ros", "an MCAP file")
     module = "rosbags.rosbag1" if kind == "rosbag1" else "rosbags.rosbag2"
-    rosbags = library(module, "ros", "a rosbag") if kind != "mcap" else None
+    rosbags = import_optional(module, "ros", "a rosbag") if kind != "mcap" else None
     files = _files(path, meter) if path.is_dir() else [path]
     readers = []
     for file in files:
-        stack.enter_context(steady(file))
+        stack.enter_context(unchanged_size(file))
         meter.place = file.name if path.is_dir() else ""
         if kind == "rosbag1":
             check_bag(file, meter)
@@ -79,7 +86,7 @@ def _opened(
                 return _mcap(path, wanted, meter, stack)
         else:
             check_database(file, meter)
-    open_bag = (rosbags or library(module, "ros", "a rosbag")).Reader
+    open_bag = (rosbags or import_optional(module, "ros", "a rosbag")).Reader
     decoders = _Decoders(meter, kind == "rosbag1")
     for file in files:
         reader = stack.enter_context(open_bag(file))
@@ -123,7 +130,7 @@ def _files(path: Path, meter: Meter) -> list[Path]:
     for file in files:
         first = read_bytes(file, first=16)
         if first.startswith(_ZSTD):
-            raise compressed(shown(file), first)
+            raise compression_error(display_path(file), first)
         if not first.startswith((MAGIC["mcap"], MAGIC["rosbag2"])):
             meter.place = file.name
             raise ValueError(f"first bytes {first[:8]!r}")
@@ -174,7 +181,7 @@ class _Decoders:
         return connection.msgtype, connection.msgdef.data
 
     def _decoder(self, connection: Any, name: str, text: str) -> tuple[Decode, bool]:
-        types = library("rosbags.typesys", "ros", "a rosbag")
+        types = import_optional("rosbags.typesys", "ros", "a rosbag")
         if connection.msgdef.format.name == "IDL":
             raise self._unknown("a definition in IDL", "one in ROS's own form (msg)")
         full = full_name(name)
@@ -189,7 +196,7 @@ class _Decoders:
                 )
                 raise self._unknown(full, expected)
         else:
-            definition = parsed(text, name, self.meter)
+            definition = parse_definition(text, name, self.meter)
             store = types.get_typestore(types.Stores.EMPTY)
             store.register(types.get_types_from_msg(definition.written(), full))
             nested = definition.nested
@@ -219,7 +226,7 @@ def _mcap(
     path: Path, wanted: Sequence[str] | None, meter: Meter, stack: ExitStack
 ) -> tuple[int, Iterator[Message]]:
     """Messages in JSON of an MCAP file; another encoding that is wanted is E136."""
-    reading = library("mcap.reader", "ros", "an MCAP file")
+    reading = import_optional("mcap.reader", "ros", "an MCAP file")
     file = stack.enter_context(path.open("rb"))
     reader = reading.make_reader(file, validate_crcs=True)
     summary = reader.get_summary()

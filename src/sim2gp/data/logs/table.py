@@ -20,10 +20,10 @@ from sim2gp.data.logs.file import (
     COMPRESSED,
     MAGIC,
     PICKLED,
-    compressed,
-    pickled,
+    compression_error,
+    display_path,
+    pickle_error,
     read_bytes,
-    shown,
 )
 from sim2gp.data.logs.log import Note
 from sim2gp.errors import InputError, error, nearest
@@ -53,7 +53,7 @@ class Rows:
 
 
 @dataclass(frozen=True)
-class Table:
+class LogTable:
     """Columns of one clock: ``columns[name]`` (N,), and what their rows are called.
 
     ``clock`` is in s where the format has stamps of its own, None where a column or the
@@ -67,7 +67,7 @@ class Table:
     stream: str = ""
     notes: tuple[Note, ...] = ()
 
-    def kept(self, which: Int[np.ndarray, " K"] | slice) -> "Table":
+    def kept(self, which: Int[np.ndarray, " K"] | slice) -> "LogTable":
         """Some of the rows, by their positions."""
         columns = {name: values[which] for name, values in self.columns.items()}
         clock = None if self.clock is None else self.clock[which]
@@ -77,9 +77,9 @@ class Table:
 def decode(content: bytes, where: str) -> str:
     """Bytes to text: UTF-8 with or without a byte-order mark, no NUL bytes (E120)."""
     if content.startswith(PICKLED):
-        raise pickled(where, "a pickle")
+        raise pickle_error(where, "a pickle")
     if content.startswith(COMPRESSED):
-        raise compressed(where, content)
+        raise compression_error(where, content)
     nul = content.find(b"\x00")
     faults = [0] if content.startswith(_BINARY) else [nul] if nul >= 0 else []
     try:
@@ -98,19 +98,19 @@ def decode(content: bytes, where: str) -> str:
 
 def read_table(
     path: Path, wanted: Sequence[str] | None, time: str | None, meter: Meter
-) -> Table:
+) -> LogTable:
     """Read the wanted columns of a CSV file as float64; empty cells become NaN.
 
     None wants every named column whose first cell is a number.
     """
-    where = shown(path)
+    where = display_path(path)
     text = decode(read_bytes(path, meter.budget.bytes), where)
     lines = text.splitlines()
     filled = [i for i, line in enumerate(lines) if line and not line.isspace()]
     if not filled:
         raise error("empty_table", where=where, got="no text")
     numbers = np.asarray(filled, dtype=np.int64) + 1
-    header = _header(lines[filled[0]], Rows(where, numbers[:1]))
+    header = _split_header(lines[filled[0]], Rows(where, numbers[:1]))
     if len(filled) == 1:
         raise error("no_rows_below_header", where=where, got="0 rows")
     table = Rows(where, numbers[1:])
@@ -120,7 +120,7 @@ def read_table(
     places = {name: i for i, name in enumerate(header)}
     for name in wanted:
         if name not in places:
-            raise _missing(name, header, where)
+            raise _missing_in_header(name, header, where)
     quoted = '"' in text
     meter.spend(8 * len(rows) * len(wanted))
     values = np.empty((len(rows), len(wanted)))
@@ -132,10 +132,10 @@ def read_table(
         kept = table.kept(part)
         values[part] = _parse(rows[part], columns, header, kept, quoted, time)
     found = {name: values[:, i] for i, name in enumerate(wanted)}
-    return Table(table, header, found)
+    return LogTable(table, header, found)
 
 
-def _fields(lines: Sequence[str], table: Rows) -> Iterator[list[str]]:
+def _split_lines(lines: Sequence[str], table: Rows) -> Iterator[list[str]]:
     """The fields of each line; one that Python's parser does not take is E121."""
     reader = csv.reader(lines, skipinitialspace=True)
     try:
@@ -150,16 +150,16 @@ def _fields(lines: Sequence[str], table: Rows) -> Iterator[list[str]]:
         ) from caught
 
 
-def _header(line: str, table: Rows) -> tuple[str, ...]:
+def _split_header(line: str, table: Rows) -> tuple[str, ...]:
     where = table.at(0)
-    (found,) = _fields([line], table)
+    (found,) = _split_lines([line], table)
     names = [name.strip() for name in found]
     if len(names) == 1:
         for mark, word in ((";", "semicolons"), ("\t", "tabs"), ("|", "bars")):
             if mark in line:
                 raise _delimiter(line, where, word)
     if all(_is_number(name) for name in names if name):
-        raise error("no_header", where=where, got=repr(_cut(line)))
+        raise error("no_header", where=where, got=repr(_shorten(line)))
     first: dict[str, int] = {}
     for i, name in enumerate(names):
         if name and first.setdefault(name, i) != i:
@@ -173,22 +173,22 @@ def _header(line: str, table: Rows) -> tuple[str, ...]:
 
 
 def _numeric(header: tuple[str, ...], row: str, table: Rows) -> list[str]:
-    (found,) = _fields([row], table)
+    (found,) = _split_lines([row], table)
     cells = [cell.strip() for cell in found]
     pairs = zip(header, cells, strict=False)
     return [name for name, cell in pairs if name and (not cell or _is_number(cell))]
 
 
 def _delimiter(line: str, where: str, word: str) -> InputError:
-    return error("wrong_delimiter", where=where, got=f"{word} in {_cut(line)!r}")
+    return error("wrong_delimiter", where=where, got=f"{word} in {_shorten(line)!r}")
 
 
-def _missing(name: str, header: tuple[str, ...], where: str) -> InputError:
+def _missing_in_header(name: str, header: tuple[str, ...], where: str) -> InputError:
     close = nearest(name, header)
     return error(
         "missing_column",
         where=f"{where}:line 1",
-        got=_cut(", ".join(header[:60]), 120),
+        got=_shorten(", ".join(header[:60]), 120),
         name=name,
         fix=f"did you mean {close}" if close else "name a column of the file",
     )
@@ -204,7 +204,7 @@ def _check_widths(
     """Every row has as many fields as the header (E121), and commas between them."""
     if quoted:
         widths = []
-        for fields in _fields(rows, table):
+        for fields in _split_lines(rows, table):
             meter.tick()
             widths.append(len(fields))
         if len(widths) != len(rows):
@@ -256,7 +256,7 @@ def _parse(
         except ValueError:
             pass  # some cell is not a number: the search below says which
     out = np.empty((len(rows), len(columns)))
-    lines = _fields(rows, table)
+    lines = _split_lines(rows, table)
     for r, fields in enumerate(lines):
         for c, column in enumerate(columns):
             cell = fields[column].strip()
@@ -272,7 +272,7 @@ def _parse(
 
 
 def _not_a_number(cell: str, place: str, is_time: bool) -> InputError:
-    got = repr(_cut(cell))
+    got = repr(_shorten(cell))
     if is_time and _DATE.search(cell):
         return error("time_as_date", where=place, got=got)
     if cell.lower() in ("true", "false") or _is_complex(cell):
@@ -298,5 +298,5 @@ def _is_complex(cell: str) -> bool:
     return True
 
 
-def _cut(text: str, width: int = 40) -> str:
+def _shorten(text: str, width: int = 40) -> str:
     return text if len(text) <= width else text[: width - 3] + "..."

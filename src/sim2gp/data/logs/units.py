@@ -37,7 +37,7 @@ UNITS: dict[str, tuple[str, float]] = {
 }
 
 
-def factor(unit: str | None, target: str, where: str) -> float:
+def unit_factor(unit: str | None, target: str, where: str) -> float:
     """What a number in ``unit`` is multiplied by to be in ``target`` (E107, E160)."""
     if unit is None or unit == target:
         return 1.0

@@ -6,7 +6,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from sim2gp.data.logs.file import library
+from sim2gp.data.logs.file import import_optional
 
 STEP = 2**18  # bytes of one piece
 
@@ -20,14 +20,14 @@ def pieces(content: bytes, kind: str, what: str) -> Iterator[bytes]:
     if kind in ("", "none"):
         yield content
     elif kind == "zstd":
-        zstandard = library("zstandard", "ros", what)
+        zstandard = import_optional("zstandard", "ros", what)
         stream = zstandard.ZstdDecompressor().stream_reader(
             io.BytesIO(content), read_across_frames=True
         )
         while part := stream.read(STEP):
             yield part
     elif kind == "lz4":
-        frames = library("lz4.frame", "ros", what)
+        frames = import_optional("lz4.frame", "ros", what)
         yield from _streamed(content, frames.LZ4FrameDecompressor)
     elif kind == "bz2":
         yield from _streamed(content, bz2.BZ2Decompressor)
@@ -49,7 +49,7 @@ def _streamed(content: bytes, make: Callable[[], Any]) -> Iterator[bytes]:
         content = stream.unused_data or b""
 
 
-def inflated(content: bytes) -> Iterator[bytes]:
+def inflate(content: bytes) -> Iterator[bytes]:
     """Unpacked bytes of a zlib stream, as HDF5 compresses with gzip."""
     stream = zlib.decompressobj()
     while not stream.eof:

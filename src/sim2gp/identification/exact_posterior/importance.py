@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from sim2gp.data.windows_likelihood import WindowsLikelihood
-from sim2gp.identification.words import digits, finite_or_none, listed
+from sim2gp.identification.words import digits, finite_or_none, join_names
 from sim2gp.inference.arrowhead import Noise, eliminate
 from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
@@ -43,7 +43,7 @@ ENOUGH = 20.0
 
 
 @dataclass(frozen=True)
-class Checked:
+class ImportanceCheck:
     """``shift`` and ``ratio`` are the exact mean and sd in those of the Gaussian.
 
     ``k`` is the shape of the weights' tail, ``draws`` the effective number of draws.
@@ -68,7 +68,7 @@ class Checked:
 
     def far(self) -> Bool[np.ndarray, " p"]:
         """Constants whose mean or sd is another than the Gaussian's."""
-        return different(self.shift, self.ratio)
+        return differs(self.shift, self.ratio)
 
     def as_dict(self, names: tuple[str, ...]) -> dict[str, Any]:
         """For summary.json; JSON has no infinity."""
@@ -77,7 +77,7 @@ class Checked:
             "k": finite_or_none(self.k),
             "draws": self.draws,
             "text": self.words(names),
-            "constants": moments(names, self.shift, self.ratio),
+            "constants": moment_changes(names, self.shift, self.ratio),
         }
 
     def words(self, names: tuple[str, ...]) -> str:
@@ -89,11 +89,11 @@ class Checked:
         text = f"{head} ({k}, {self.draws:.0f} effective draws of {DRAWS})"
         if self.draws < ENOUGH:
             return f"{text}: too few to say how it differs."
-        told = moved(names, self.shift, self.ratio)
-        return f"{text}; it differs in {listed(told)}." if told else f"{text}."
+        told = describe_shifts(names, self.shift, self.ratio)
+        return f"{text}; it differs in {join_names(told)}." if told else f"{text}."
 
 
-def different(
+def differs(
     shift: Float[np.ndarray, " p"], ratio: Float[np.ndarray, " p"]
 ) -> Bool[np.ndarray, " p"]:
     """Whether a mean or an sd is another than the Gaussian's; a NaN is."""
@@ -101,7 +101,7 @@ def different(
     return ~(same & (np.abs(shift) <= MOVED))
 
 
-def moved(
+def describe_shifts(
     names: tuple[str, ...],
     shift: Float[np.ndarray, " p"],
     ratio: Float[np.ndarray, " p"],
@@ -109,11 +109,11 @@ def moved(
     """The constants that differ, and how."""
     return [
         f"{names[j]} (mean by {shift[j]:.1f} sd, sd times {ratio[j]:.2f})"
-        for j in np.flatnonzero(different(shift, ratio))
+        for j in np.flatnonzero(differs(shift, ratio))
     ]
 
 
-def moments(
+def moment_changes(
     names: tuple[str, ...],
     shift: Float[np.ndarray, " p"],
     ratio: Float[np.ndarray, " p"],
@@ -125,7 +125,7 @@ def moments(
     }
 
 
-def directions(posterior: Gaussian) -> Float[np.ndarray, "p p"]:
+def standardised_directions(posterior: Gaussian) -> Float[np.ndarray, "p p"]:
     """A row for each constant: its direction among the standardised unknowns."""
     scale = np.asarray(posterior.scale)
     found: np.ndarray = scale / np.linalg.norm(scale, axis=1)[:, None]
@@ -135,7 +135,7 @@ def directions(posterior: Gaussian) -> Float[np.ndarray, "p p"]:
 @in_float64
 def check_windows(
     likelihood: WindowsLikelihood, fitted: Estimate, *, key: Key
-) -> Checked:
+) -> ImportanceCheck:
     """Laplace's posterior of a fit against the exact one, given the fit's noise."""
     prior = ParameterPrior(fitted.prior, likelihood.system.parameters)
     z, e = fitted.z(), fitted.nuisances
@@ -144,8 +144,8 @@ def check_windows(
     draws = z[None] + white @ scale.T
     found = _log_posterior(likelihood, prior, draws, e, fitted.noise)
     log_weights = np.asarray(found) + 0.5 * np.sum(np.asarray(white) ** 2, axis=1)
-    unit = directions(fitted.posterior)
-    return checked(log_weights, np.asarray(white) @ unit.T)
+    unit = standardised_directions(fitted.posterior)
+    return check_weights(log_weights, np.asarray(white) @ unit.T)
 
 
 @eqx.filter_jit
@@ -177,9 +177,9 @@ def _log_posterior(
     return found
 
 
-def checked(
+def check_weights(
     log_weights: Float[np.ndarray, " S"], draws: Float[np.ndarray, "S p"]
-) -> Checked:
+) -> ImportanceCheck:
     """Shape and moments; a draw at which nothing is finite has no weight.
 
     ``draws`` are in sd of the Gaussian, about its mean.
@@ -188,20 +188,20 @@ def checked(
     log_weights = np.where(finite, log_weights, -np.inf)
     if not finite.any():
         nowhere = np.full(draws.shape[1], np.nan)
-        return Checked(math.inf, 0.0, nowhere, nowhere)
-    smooth, k = smoothed(log_weights)
+        return ImportanceCheck(math.inf, 0.0, nowhere, nowhere)
+    smooth, k = pareto_smooth(log_weights)
     weight = np.exp(smooth - np.max(smooth))
     weight /= weight.sum()
     mean = weight @ draws
     sd = np.sqrt(weight @ (draws - mean) ** 2)
     own = np.sqrt(np.mean((draws - draws.mean(axis=0)) ** 2, axis=0))
     # Against the draws' own moments: what sampling moved moves both.
-    return Checked(
+    return ImportanceCheck(
         k, float(1.0 / np.sum(weight**2)), mean - draws.mean(axis=0), sd / own
     )
 
 
-def smoothed(log_weights: Float[np.ndarray, " S"]) -> tuple[np.ndarray, float]:
+def pareto_smooth(log_weights: Float[np.ndarray, " S"]) -> tuple[np.ndarray, float]:
     """Log weights with the largest at the quantiles of their Pareto law, and ``k``.
 
     Infinite where there is no tail of different weights to fit.

@@ -32,12 +32,12 @@ from jaxtyping import Array, Bool, Float
 from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.errors import missing_extra
 from sim2gp.identification.exact_posterior.importance import (
-    different,
-    directions,
-    moments,
-    moved,
+    describe_shifts,
+    differs,
+    moment_changes,
+    standardised_directions,
 )
-from sim2gp.identification.words import finite_or_none, listed
+from sim2gp.identification.words import finite_or_none, join_names
 from sim2gp.inference.arrowhead import Noise, eliminate
 from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.least_squares import stack
@@ -52,7 +52,7 @@ MIXED, ENOUGH = 1.01, 400.0  # split R-hat, effective draws
 
 
 @dataclass(frozen=True)
-class Sampled:
+class ChainSummary:
     """``shift`` and ``ratio`` are NUTS' mean and sd in those of the Gaussian.
 
     ``draws`` are effective ones, of the constant that has the fewest; ``divergent``
@@ -72,7 +72,7 @@ class Sampled:
 
     def far(self) -> Bool[np.ndarray, " p"]:
         """Constants whose mean or sd is another than the Gaussian's."""
-        return different(self.shift, self.ratio)
+        return differs(self.shift, self.ratio)
 
     def as_dict(self, names: tuple[str, ...]) -> dict[str, Any]:
         """For summary.json."""
@@ -82,7 +82,7 @@ class Sampled:
             "draws": finite_or_none(self.draws),
             "divergent": self.divergent,
             "text": self.words(names),
-            "constants": moments(names, self.shift, self.ratio),
+            "constants": moment_changes(names, self.shift, self.ratio),
         }
 
     def words(self, names: tuple[str, ...]) -> str:
@@ -93,9 +93,9 @@ class Sampled:
                 f"NUTS did not settle ({about}, {self.divergent} divergent): "
                 "it says nothing of the Gaussian."
             )
-        told = moved(names, self.shift, self.ratio)
+        told = describe_shifts(names, self.shift, self.ratio)
         if told:
-            return f"NUTS ({about}) differs from the Gaussian in {listed(told)}."
+            return f"NUTS ({about}) differs from the Gaussian in {join_names(told)}."
         return f"NUTS ({about}) agrees with the Gaussian in every parameter."
 
 
@@ -112,19 +112,19 @@ def sampler() -> ModuleType:
 @in_float64
 def sample_windows(
     likelihood: WindowsLikelihood, fitted: Estimate, *, key: Key
-) -> Sampled:
+) -> ChainSummary:
     """The posterior of a fit by NUTS against Laplace's, given the fit's noise.
 
     Raises E135 without the extra ``mcmc``.
     """
     prior = ParameterPrior(fitted.prior, likelihood.system.parameters)
     at = fitted.z(), fitted.nuisances, fitted.noise
-    draws, divergent = sampled(likelihood, prior, *at, key)
-    unit = directions(fitted.posterior)
-    return judged(np.asarray(draws), np.asarray(divergent), unit)
+    draws, divergent = sample_posterior(likelihood, prior, *at, key)
+    unit = standardised_directions(fitted.posterior)
+    return summarise_chains(np.asarray(draws), np.asarray(divergent), unit)
 
 
-def sampled(
+def sample_posterior(
     likelihood: AbstractLikelihood,
     prior: AbstractPrior,
     z: Float[Array, " p"],
@@ -149,7 +149,7 @@ def _chains(
     key: Key,
 ) -> tuple[Array, Array]:
     blackjax = sampler()
-    density = _density(likelihood, prior, z, e, noise)
+    density = _log_density(likelihood, prior, z, e, noise)
 
     def chain(key: Key) -> tuple[Array, Array]:
         first, warm, rest = jax.random.split(key, 3)
@@ -173,7 +173,7 @@ def _chains(
     return found
 
 
-def _density(
+def _log_density(
     likelihood: AbstractLikelihood,
     prior: AbstractPrior,
     z0: Float[Array, " p"],
@@ -209,11 +209,11 @@ def _density(
 
 
 @in_float64
-def judged(
+def summarise_chains(
     draws: Float[np.ndarray, "chains S p"],
     divergent: Bool[np.ndarray, "chains S"],
     unit: Float[np.ndarray, "p p"],
-) -> Sampled:
+) -> ChainSummary:
     """Moments per constant, whose direction in ``a`` is its row of ``unit``."""
     from blackjax.diagnostics import effective_sample_size, potential_scale_reduction
 
@@ -221,7 +221,7 @@ def judged(
     S = x.shape[1] // 2
     halves = np.concatenate([x[:, :S], x[:, S : 2 * S]])  # a drift splits a chain
     whole = x.reshape(-1, x.shape[-1])
-    return Sampled(
+    return ChainSummary(
         whole.mean(axis=0),
         whole.std(axis=0),
         float(np.max(potential_scale_reduction(halves))),

@@ -61,7 +61,7 @@ def _features(
     return x, moved, np.all(np.asarray(w.mask)[:, row], axis=1, keepdims=False).ravel()
 
 
-def compared(
+def compare_baselines(
     names: Sequence[str],
     model: Float[np.ndarray, " c"],
     hold: Float[np.ndarray, " c"],
@@ -94,7 +94,7 @@ def forecast_sentence(
     """Errors by channel, next to those of the better predictor without mechanics.
 
     ``about`` begins the sentence ("Open-loop error at 0.5 s"), ``against`` is
-    `compared`'s. Where the model loses, a second sentence says so.
+    `compare_baselines`'s. Where the model loses, a second sentence says so.
     """
     clauses, losses = [], dict[str, list[str]]()
     for name, entry in against.items():
@@ -121,8 +121,8 @@ def loss_sentence(
 ) -> str | None:
     """In which logs alone a model is worse than a predictor without mechanics; or None.
 
-    ``by_log`` holds `compared`'s answer for each log, ``pooled`` that for all of them:
-    of a channel that loses there, nothing more is said.
+    ``by_log`` holds the answer of `compare_baselines` for each log, ``pooled`` that for
+    all of them: of a channel that loses there, nothing more is said.
     """
     lost: dict[str, list[str]] = {}
     for log, against in by_log.items():

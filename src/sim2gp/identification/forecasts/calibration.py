@@ -32,8 +32,11 @@ from jaxtyping import Bool, Float, Int
 from sim2gp.data.grid import steps_of
 from sim2gp.data.logs import Log
 from sim2gp.data.split_log import SPACING
-from sim2gp.identification.forecasts.calibration_words import verdict, words
-from sim2gp.identification.forecasts.prediction import Judged, recordings
+from sim2gp.identification.forecasts.calibration_words import (
+    calibration_verdict,
+    describe_calibration,
+)
+from sim2gp.identification.forecasts.prediction import ScoredForecasts, recording_names
 
 LEVELS = (*(round(0.05 * k, 2) for k in range(1, 20)), 0.99)
 FEWEST = 8  # blocks that a verdict needs
@@ -53,8 +56,8 @@ class Blocks(NamedTuple):
     words: str  # "8 recordings"
 
 
-def calibration(
-    found: Judged, names: Sequence[str], logs: Sequence[Log], horizon: float
+def calibrate_forecasts(
+    found: ScoredForecasts, names: Sequence[str], logs: Sequence[Log], horizon: float
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Summary entry and arrays ``calibration/...`` of forecasts at the horizon.
 
@@ -67,7 +70,7 @@ def calibration(
     measured = np.flatnonzero(valid.any(axis=0)).tolist()
     z = np.abs(found.error[:, at] / found.scale[:, at])
     some = valid.any(axis=1)
-    blocks = blocks_of(found.log[some], recordings(logs), horizon)
+    blocks = blocks_of(found.log[some], recording_names(logs), horizon)
     half = half_widths(z[some], valid[some], blocks.of)
     arrays = {"calibration/level": levels}
     channels: dict[str, dict[str, Any]] = {}
@@ -81,14 +84,16 @@ def calibration(
             arrays[f"calibration/high/{name}"] = high
         seen = np.unique(blocks.of[valid[some, c]])
         factor = np.quantile(inside, levels) / _REACH
-        channels[name] = verdict(levels, share, half[c], factor, len(seen))
+        channels[name] = calibration_verdict(levels, share, half[c], factor, len(seen))
     return {
         "horizon": horizon,
         "windows": int(some.sum()),
         "independent": blocks.number,
         "blocks": blocks.words,
         "channels": channels,
-        "text": words(channels, levels, half[measured], blocks.words, FEWEST),
+        "text": describe_calibration(
+            channels, levels, half[measured], blocks.words, FEWEST
+        ),
     }, arrays
 
 

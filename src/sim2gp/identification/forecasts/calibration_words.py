@@ -4,17 +4,19 @@ Bands fail where the share inside leaves the simultaneous band about its level. 
 the factor is what the half-width would have to be multiplied with to hold its share.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from sim2gp.identification.words import join_names
+
 NARROW, WIDE, BOTH = "too narrow", "too wide", "wrong shape"
 PASSED, UNKNOWN = "not contradicted", "too few to say"
 
 
-def verdict(
+def calibration_verdict(
     levels: Float[np.ndarray, " L"],
     share: Float[np.ndarray, " L"],
     half: Float[np.ndarray, " L"],
@@ -42,19 +44,20 @@ def verdict(
         "shares": share[failed].tolist(),
         "factors": factor[failed].tolist(),
         "ranges": [
-            _range(levels, share, factor, off, part) for part in _runs(failed, off)
+            _failed_range(levels, share, factor, off, part)
+            for part in _failed_runs(failed, off)
         ],
     }
 
 
-def _runs(failed: np.ndarray, off: Float[np.ndarray, " L"]) -> list[np.ndarray]:
+def _failed_runs(failed: np.ndarray, off: Float[np.ndarray, " L"]) -> list[np.ndarray]:
     """Neighbouring levels that fail in one direction."""
     sign = np.where(failed, np.sign(off), 0.0)
     cuts = np.flatnonzero(np.diff(sign)) + 1
     return [p for p in np.split(np.arange(len(sign)), cuts) if sign[p[0]] != 0.0]
 
 
-def _range(
+def _failed_range(
     levels: np.ndarray,
     share: np.ndarray,
     factor: np.ndarray,
@@ -74,14 +77,14 @@ def _range(
     }
 
 
-def words(
+def describe_calibration(
     channels: Mapping[str, Mapping[str, Any]],
     levels: Float[np.ndarray, " L"],
     half: Float[np.ndarray, "c L"],
     blocks: str,
     fewest: int,
 ) -> str:
-    """What is said of all channels of a forecast; ``half`` as in `verdict`, by row."""
+    """All channels in words; ``half`` as in `calibration_verdict`, by row."""
     by: dict[str, list[int]] = {}
     for c, entry in enumerate(channels.values()):
         kind = entry["verdict"]
@@ -96,18 +99,19 @@ def words(
         which, wide = by[PASSED], max(half[c, middle] for c in by[PASSED])
         low, high = max(0.5 - wide, 0.0), min(0.5 + wide, 1.0)
         texts.append(
-            f"{_listed([names[c] for c in which])}: {blocks} contradict no band from "
-            f"{_percent(levels[0])} to {_percent(levels[-1])} %; with so few, a 50 % "
-            f"band that holds {_percent(low)} or {_percent(high)} % would pass, too."
+            f"{join_names([names[c] for c in which])}: {blocks} contradict no band "
+            f"from {_percent(levels[0])} to {_percent(levels[-1])} %; with so "
+            f"few, a 50 % band that holds {_percent(low)} or {_percent(high)} % would "
+            "pass, too."
         )
     elif "failed" in by:
         texts.append(f"Judged by {blocks}.")
     if UNKNOWN in by:
         counts = [channels[names[c]]["blocks"] for c in by[UNKNOWN]]
         texts.append(
-            f"{_listed([names[c] for c in by[UNKNOWN]])}: too few to say whether the "
-            f"bands are right: {min(counts)} independent blocks of windows ({blocks}), "
-            f"{fewest} are needed."
+            f"{join_names([names[c] for c in by[UNKNOWN]])}: too few to say whether "
+            f"the bands are right: {min(counts)} independent blocks of windows "
+            f"({blocks}), {fewest} are needed."
         )
     return " ".join(texts)
 
@@ -133,7 +137,3 @@ def _failing(found: Mapping[str, Any]) -> str:
 
 def _percent(share: float) -> str:
     return f"{100.0 * share:.0f}"
-
-
-def _listed(names: Sequence[str]) -> str:
-    return " and ".join([", ".join(names[:-1]), names[-1]] if names[1:] else names)

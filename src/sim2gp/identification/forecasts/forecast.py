@@ -31,7 +31,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp.compilation import compile_async
 from sim2gp.data.grid import PERIOD, Grid
-from sim2gp.data.window_slopes import Asked, HostRun
+from sim2gp.data.window_slopes import HostRun, SlopeInputs
 from sim2gp.data.windows import Windows
 from sim2gp.inference.gaussian import LOG_2PI, Gaussian
 from sim2gp.inference.linearized import value_and_jacobian
@@ -74,7 +74,7 @@ class Forecast(eqx.Module):
 
 
 @in_float64
-def forecast(
+def forecast_windows(
     system: AbstractSystem,
     posterior: Gaussian,
     grid: Grid,
@@ -95,11 +95,11 @@ def forecast(
     parts = []
     for first in range(0, W, size):
         which = np.minimum(np.arange(first, first + size), W - 1)
-        some = _some(grid, which, passed)
+        some = _window_batch(grid, which, passed)
         if simulator is not None:
             found = _forecast_on_host(simulator, system, posterior, some)
         else:
-            found = _forecast(system, posterior, jax.device_put(some))
+            found = _forecast_batch(system, posterior, jax.device_put(some))
         parts.append([np.asarray(x)[: W - first, places] for x in found])
     mean, by_start, by_input, by_constants = map(
         np.concatenate, zip(*parts, strict=True)
@@ -111,19 +111,19 @@ def forecast(
 
 @in_float64
 def compile_forecast(system: AbstractSystem, grid: Grid) -> None:
-    """Start to compile `forecast` for windows like these and a posterior to come.
+    """Compile `forecast_windows` early, for windows like these and any posterior.
 
     It serves where the samples asked for are such as every simulation passes.
     """
     if simulator_of(system) is not None:
         return  # its programs are small
-    first = _some(grid, np.zeros(_BATCH, int), _passed(grid))
+    first = _window_batch(grid, np.zeros(_BATCH, int), _passed(grid))
     arrays = jax.device_put(first)
-    _forecast.compile_for(system, system.parameters.prior(), arrays)
+    _forecast_batch.compile_for(system, system.parameters.prior(), arrays)
 
 
 @compile_async
-def _forecast(
+def _forecast_batch(
     system: AbstractSystem, posterior: Gaussian, windows: Windows
 ) -> tuple[Array, Array, Array, Array]:
     """Outputs at all rows, their slopes in start and input, variance by constants."""
@@ -136,7 +136,7 @@ def _forecast(
             return simulate(system, params, window, window.start + x[:n], x[n : n + m])
 
         x = jnp.zeros(n + m + posterior.scale.shape[1])
-        return _parts(window, *value_and_jacobian(states, x))
+        return _forecast_parts(window, *value_and_jacobian(states, x))
 
     found: tuple[Array, Array, Array, Array] = windows.each(one)
     return found
@@ -153,12 +153,12 @@ def _forecast_on_host(
     by_start, by_input, by_constants = np.split(
         np.eye(n + m + scale.shape[1]), [n, n + m]
     )
-    asked = Asked(mean, windows.start, scale @ by_constants, by_start, by_input)
+    asked = SlopeInputs(mean, windows.start, scale @ by_constants, by_start, by_input)
     run = HostRun(simulator, system, windows, asked)
-    return _parts(windows, run.states, run.slopes())
+    return _forecast_parts(windows, run.states, run.slopes())
 
 
-def _parts(
+def _forecast_parts(
     window: Windows,
     states: Float[AnyArray, "*W L n"],
     slopes: Float[AnyArray, "*W L n k"],
@@ -176,7 +176,7 @@ def _passed(grid: Grid) -> Int[np.ndarray, " L"]:
     return np.union1d([1], np.arange(0, grid.windows.span.shape[1], grid.every))
 
 
-def _some(grid: Grid, which: np.ndarray, rows: np.ndarray) -> Windows:
+def _window_batch(grid: Grid, which: np.ndarray, rows: np.ndarray) -> Windows:
     """Some of the windows, in steps from one of ``rows`` to the next."""
     chosen = grid.windows.some(which)
     new = np.diff(which, prepend=-1) > 0  # what fills a batch up does not move
@@ -248,10 +248,10 @@ def fit_band(found: Forecast, grid: Grid, recordings: int) -> Band:
     shape = np.where(count > 0, squares / np.maximum(count, 1), 1.0)
     rows = np.asarray((0.0, *found.rows))
     shape = np.concatenate([np.ones_like(shape[:1]), shape])
-    return Band(start_sd, np.exp(best), resolution, rows, shape, inflation_of(m))
+    return Band(start_sd, np.exp(best), resolution, rows, shape, new_log_inflation(m))
 
 
-def inflation_of(recordings: int) -> float:
+def new_log_inflation(recordings: int) -> float:
     """By what a variance seen in ``m`` training logs is raised for another log.
 
     One log says nothing of another: then twice the sd is as good as any.

@@ -15,8 +15,9 @@ from jaxtyping import Bool, Float, Int
 from sim2gp.data.grid import CURVE, PERIOD, Grid, steps_of
 from sim2gp.data.logs import Log
 from sim2gp.data.windows import Windows
-from sim2gp.identification.forecasts.baselines import compared, loss_sentence
-from sim2gp.identification.forecasts.forecast import Band, Forecast, forecast
+from sim2gp.identification.forecasts.baselines import compare_baselines, loss_sentence
+from sim2gp.identification.forecasts.forecast import Band, Forecast, forecast_windows
+from sim2gp.identification.forecasts.scoring import masked_mean
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.systems.base import AbstractSystem
 
@@ -25,7 +26,7 @@ _FINEST = 5  # grid samples from one point of a curve to the next
 Picture = dict[str, tuple[np.ndarray, ...]]
 
 
-def recordings(logs: Sequence[Log]) -> list[str]:
+def recording_names(logs: Sequence[Log]) -> list[str]:
     """The recording of each log; a file cut at its gaps is one recording."""
     return [log.source for log in logs]
 
@@ -35,12 +36,12 @@ def channels(system: AbstractSystem, windows: Windows) -> list[str]:
     return [system.physical_states[i].name for i in windows.outputs]
 
 
-def units(system: AbstractSystem) -> dict[str, str]:
+def channel_units(system: AbstractSystem) -> dict[str, str]:
     """Units of all channels, for the report."""
     return {c.name: c.unit for c in (*system.physical_states, *system.actions)}
 
 
-def rows_for(horizon: float) -> Int[np.ndarray, " R"]:
+def scored_rows(horizon: float) -> Int[np.ndarray, " R"]:
     """Grid samples to be judged: one step, the error curve, the horizon."""
     steps = {1, steps_of(horizon), *(steps_of(h) for h in CURVE)}
     return np.asarray(sorted(steps))
@@ -51,15 +52,15 @@ def _rows_of_traces(grid: Grid) -> Int[np.ndarray, " R"]:
     return np.arange(0, steps_of(TRACE) + 1, int(np.lcm(_FINEST, grid.every)))
 
 
-def predicted(
+def forecast_grid(
     system: AbstractSystem, posterior: Gaussian, grid: Grid, horizon: float
 ) -> Forecast:
     """Forecasts of ``grid``'s windows, at all that is judged or drawn of them."""
-    rows = np.union1d(rows_for(horizon), _rows_of_traces(grid))
-    return forecast(system, posterior, grid, rows)
+    rows = np.union1d(scored_rows(horizon), _rows_of_traces(grid))
+    return forecast_windows(system, posterior, grid, rows)
 
 
-class Judged(eqx.Module):
+class ScoredForecasts(eqx.Module):
     """Held-out forecasts with their bands, and the trivial predictors' errors.
 
     The regression's are NaN where it had too few windows to learn from.
@@ -77,18 +78,18 @@ class Judged(eqx.Module):
     inside95: Bool[np.ndarray, "W R c"]
 
 
-def judged(
+def score_forecasts(
     rows: np.ndarray,
     grid: Grid,
     found: Forecast,
     band: Band,
     regression: Float[np.ndarray, "W R c"],
-) -> Judged:
+) -> ScoredForecasts:
     """Forecasts of ``grid``'s windows held against their band."""
     y, found = np.asarray(grid.windows.y), found.at(rows)
     start = np.asarray(grid.windows.start)[:, list(grid.windows.outputs)]
     scale, error = band.scale(found), np.abs(found.error)
-    return Judged(
+    return ScoredForecasts(
         rows,
         found.valid,
         found.error,
@@ -102,7 +103,7 @@ def judged(
     )
 
 
-def joined(parts: Sequence[Judged]) -> Judged:
+def join_folds(parts: Sequence[ScoredForecasts]) -> ScoredForecasts:
     """The folds of a leave-one-out side by side."""
     first = parts[0]
     fields = {
@@ -110,11 +111,11 @@ def joined(parts: Sequence[Judged]) -> Judged:
         for name in first.__dataclass_fields__
         if name != "rows"
     }
-    return Judged(rows=first.rows, **fields)
+    return ScoredForecasts(rows=first.rows, **fields)
 
 
-def scores(
-    found: Judged, names: Sequence[str], logs: Sequence[Log], horizon: float
+def forecast_scores(
+    found: ScoredForecasts, names: Sequence[str], logs: Sequence[Log], horizon: float
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Summary keys, tables and curves of a held-out evaluation."""
     at = int(np.searchsorted(found.rows, steps_of(horizon)))
@@ -123,7 +124,7 @@ def scores(
     model, hold, regression = (_rms(x, found.valid) for x in each)
     share90 = _share(found.inside90, found.valid)
     share95 = _share(found.inside95, found.valid)
-    nll = _mean(-found.log_prob, found.valid)
+    nll = masked_mean(-found.log_prob, found.valid)
 
     def named(values: np.ndarray) -> dict[str, float]:
         return dict(zip(names, map(float, values), strict=True))
@@ -142,7 +143,7 @@ def scores(
         summary["regression_rmse"] = named(regression[at])
     measured = found.valid[:, at].any(axis=0)
     error = np.where(measured, model[at], np.nan)
-    summary["trivial"] = compared(names, error, hold[at], regression[at])
+    summary["trivial"] = compare_baselines(names, error, hold[at], regression[at])
     by_log = _against_by_log(found, names, logs, at)
     summary["losses"] = loss_sentence(by_log, summary["trivial"])
     some = np.asarray(found.valid.any(axis=(0, 2)))
@@ -150,8 +151,10 @@ def scores(
     seconds = found.rows[curve] * PERIOD
     trivial = hold, regression
     summary["tables"] = [
-        _by_horizon(found, names, curve, seconds, model, trivial, share90, share95),
-        _by_log(found, names, logs, at, horizon),
+        _scores_by_horizon(
+            found, names, curve, seconds, model, trivial, share90, share95
+        ),
+        _scores_by_log(found, names, logs, at, horizon),
     ]
     arrays: dict[str, np.ndarray] = {"curve/horizon": seconds}
     for c, name in enumerate(names):
@@ -165,8 +168,8 @@ def scores(
     }
 
 
-def _by_horizon(
-    found: Judged,
+def _scores_by_horizon(
+    found: ScoredForecasts,
     names: Sequence[str],
     curve: np.ndarray,
     seconds: np.ndarray,
@@ -184,7 +187,11 @@ def _by_horizon(
     for i, s in zip(curve, seconds, strict=True):
         row: list[Any] = [f"{s:.3g}", str(int(found.valid[:, i].any(axis=1).sum()))]
         for c in range(len(names)):
-            row += [f"{model[i, c]:.4f}", f"{hold[i, c]:.4f}", _shown(regression[i, c])]
+            row += [
+                f"{model[i, c]:.4f}",
+                f"{hold[i, c]:.4f}",
+                _regression_text(regression[i, c]),
+            ]
             row += [f"{share90[i, c]:.3f}", f"{share95[i, c]:.3f}"]
         rows.append(row)
     return {
@@ -198,8 +205,12 @@ def _by_horizon(
     }
 
 
-def _by_log(
-    found: Judged, names: Sequence[str], logs: Sequence[Log], at: int, horizon: float
+def _scores_by_log(
+    found: ScoredForecasts,
+    names: Sequence[str],
+    logs: Sequence[Log],
+    at: int,
+    horizon: float,
 ) -> dict[str, Any]:
     columns = ["log", "windows"]
     for name in names:
@@ -213,7 +224,11 @@ def _by_log(
         share = _share(found.inside90[which, at], valid)
         row = ["pooled" if k is None else logs[k].name, str(int(valid.any(1).sum()))]
         for c in range(len(names)):
-            row += [f"{model[c]:.4f}", f"{hold[c]:.4f}", _shown(regression[c])]
+            row += [
+                f"{model[c]:.4f}",
+                f"{hold[c]:.4f}",
+                _regression_text(regression[c]),
+            ]
             row.append(f"{share[c]:.3f}")
         rows.append(row)
     return {
@@ -226,25 +241,25 @@ def _by_log(
 
 
 def _against_by_log(
-    found: Judged, names: Sequence[str], logs: Sequence[Log], at: int
+    found: ScoredForecasts, names: Sequence[str], logs: Sequence[Log], at: int
 ) -> dict[str, dict[str, dict[str, Any]]]:
-    """What `compared` finds in every log that was measured at the horizon."""
+    """What `compare_baselines` finds in every log that was measured at the horizon."""
     out = {}
     for k in np.unique(found.log).tolist():
         valid = found.valid[which := found.log == k, at]
         each = (found.error, found.hold, found.regression)
         model, hold, regression = (_rms(x[which, at], valid) for x in each)
         model = np.where(valid.any(axis=0), model, np.nan)
-        out[logs[k].name] = compared(names, model, hold, regression)
+        out[logs[k].name] = compare_baselines(names, model, hold, regression)
     return out
 
 
-def _shown(regression: float) -> str:
+def _regression_text(regression: float) -> str:
     """An error of the regression, which may have had too few windows to learn from."""
     return f"{regression:.4f}" if np.isfinite(regression) else "not enough windows"
 
 
-def drawn(found: Forecast, band: Band, grid: Grid) -> Picture:
+def forecast_traces(found: Forecast, band: Band, grid: Grid) -> Picture:
     """Forecasts of half a second, for pictures: (which, time, measured, mean, half)."""
     which, rows = _pictured(grid), _rows_of_traces(grid)
     shown = found.of(which).at(rows)
@@ -284,17 +299,17 @@ def trace_arrays(
 
 def _pictured(grid: Grid) -> np.ndarray:
     """Windows that follow each other without overlap and are half a second long."""
-    apart = _apart(grid)
+    apart = _windows_apart(grid)
     whole = np.asarray(grid.windows.mask)[apart, steps_of(TRACE)].any(axis=1)
     return apart[whole]
 
 
-def thinned(grid: Grid) -> Grid:
+def thin_windows(grid: Grid) -> Grid:
     """The windows that start half a second apart."""
-    return subset(grid, _apart(grid))
+    return subset(grid, _windows_apart(grid))
 
 
-def _apart(grid: Grid) -> Int[np.ndarray, " w"]:
+def _windows_apart(grid: Grid) -> Int[np.ndarray, " w"]:
     """Windows of each log that start half a second apart, by number."""
     chosen = []
     for k in np.unique(grid.log):
@@ -321,15 +336,9 @@ def _flat(x: np.ndarray) -> np.ndarray:
     return np.concatenate([x, gap], axis=1).ravel()
 
 
-def _mean(x: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    count = valid.sum(axis=0)
-    total = np.sum(np.where(valid, x, 0.0), axis=0)
-    return np.asarray(total / np.where(count > 0, count, 1))
-
-
 def _rms(x: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    return np.sqrt(_mean(x**2, valid))
+    return np.sqrt(masked_mean(x**2, valid))
 
 
 def _share(inside: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    return _mean(inside.astype(float), valid)
+    return masked_mean(inside.astype(float), valid)

@@ -43,7 +43,7 @@ def nll(error: Values, sd: Values) -> Values:
     return np.asarray(0.5 * (error / sd) ** 2 + np.log(sd) + 0.5 * LOG_2PI)
 
 
-def spread(
+def predicted_spread(
     error: Float[np.ndarray, "W R c"],
     draws: Float[np.ndarray, "D W R c"],
     counts: Bool[np.ndarray, "W R c"],
@@ -62,7 +62,7 @@ def spread(
 
 
 @dataclass(frozen=True)
-class Paired:
+class PairedComparison:
     """One model against another: relative change of CRPS, its interval, and wins."""
 
     change: float
@@ -77,7 +77,7 @@ class Paired:
         return self.change < -MATTERS and self.high < 0.0
 
 
-def by_unit(
+def crps_by_unit(
     score: Float[np.ndarray, "models W R c"],
     valid: Bool[np.ndarray, "W R c"],
     unit: Int[np.ndarray, " W"],
@@ -86,7 +86,7 @@ def by_unit(
 
     A step and channel is measured in the first model's mean CRPS there.
     """
-    reference = _mean(score[0], valid)
+    reference = masked_mean(score[0], valid)
     relative = np.where(valid, score / np.where(reference > 0.0, reference, 1.0), 0.0)
     weight = 1.0 / np.maximum(valid.sum(axis=0), 1)
     per_window = np.sum(relative * weight, axis=(2, 3))
@@ -94,36 +94,38 @@ def by_unit(
     return np.stack([per_window[:, unit == u].sum(axis=1) for u in units], axis=1)
 
 
-def paired(
+def compare_paired(
     new: Float[np.ndarray, " units"],
     old: Float[np.ndarray, " units"],
     rng: np.random.Generator,
-) -> Paired:
+) -> PairedComparison:
     """Two models' sums by unit; the interval resamples units (percentile bootstrap).
 
     A model that is not finite somewhere loses.
     """
     count = len(old)
     if not np.all(np.isfinite(new)):
-        return Paired(math.inf, math.inf, math.inf, 0, count)
+        return PairedComparison(math.inf, math.inf, math.inf, 0, count)
     picked = rng.integers(0, count, (RESAMPLES, count))
     changes = new[picked].sum(axis=1) / old[picked].sum(axis=1) - 1.0
     low, high = np.quantile(changes, [0.5 - LEVEL / 2, 0.5 + LEVEL / 2])
     change = float(new.sum() / old.sum() - 1.0)
     better = int(np.sum(new < old))
-    return Paired(change, float(low), float(high), better, count)
+    return PairedComparison(change, float(low), float(high), better, count)
 
 
-def supported(sums: Float[np.ndarray, "models units"], rng: np.random.Generator) -> int:
+def select_model(
+    sums: Float[np.ndarray, "models units"], rng: np.random.Generator
+) -> int:
     """The model to keep, of models from simple to complex: a tie keeps the simpler."""
     kept = 0
     for k in range(1, len(sums)):
-        if paired(sums[k], sums[kept], rng).wins:
+        if compare_paired(sums[k], sums[kept], rng).wins:
             kept = k
     return kept
 
 
-def percent(found: Paired) -> str:
+def format_change(found: PairedComparison) -> str:
     """``-4.1 % [-7.2, -1.0]``."""
     if not math.isfinite(found.change):
         return "ran away"
@@ -131,8 +133,8 @@ def percent(found: Paired) -> str:
     return f"{100 * found.change:+.1f} % [{low:+.1f}, {high:+.1f}]"
 
 
-def sentence(
-    what: Mapping[str, str], against: Sequence[Paired], kept: int, unit: str
+def selection_sentence(
+    what: Mapping[str, str], against: Sequence[PairedComparison], kept: int, unit: str
 ) -> str:
     """What the logs support, as one would say it to whoever runs the machine.
 
@@ -145,12 +147,12 @@ def sentence(
         return (
             f"The logs support {what[names[kept]]} ({names[kept]}): on data left out "
             f"it is better than the simulator alone in {found.better} of "
-            f"{found.units} {unit}, CRPS {percent(found)}. The simulator's equations "
-            "lack something that these logs show again and again."
+            f"{found.units} {unit}, CRPS {format_change(found)}. The simulator's "
+            "equations lack something that these logs show again and again."
         )
     best = min(range(1, len(names)), key=lambda k: against[k].change)
     found = against[best]
-    said = f"{names[best]}: CRPS {percent(found)}"
+    said = f"{names[best]}: CRPS {format_change(found)}"
     if found.change < math.inf:
         said += f", better in {found.better} of {found.units} {unit}"
     if found.change >= 0.0:
@@ -164,6 +166,7 @@ def sentence(
     )
 
 
-def _mean(x: np.ndarray, valid: np.ndarray) -> np.ndarray:
+def masked_mean(x: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """The mean over windows of the valid entries; 0 where there is none."""
     total = np.sum(np.where(valid, x, 0.0), axis=0)
     return np.asarray(total / np.maximum(valid.sum(axis=0), 1))

@@ -39,8 +39,8 @@ def base_parameters(
     found: list[dict[str, Any]] = []
     for block in blocks(spec, fisher_at):
         kind, exact, local = _combinations(block)
-        found += [_entry(spec, block, kind, row, True) for row in exact]
-        found += [_entry(spec, block, kind, row, False) for row in local]
+        found += [_combination_entry(spec, block, kind, row, True) for row in exact]
+        found += [_combination_entry(spec, block, kind, row, False) for row in local]
     return found
 
 
@@ -86,7 +86,7 @@ def _combinations(
     return kind, exact, local
 
 
-def _entry(
+def _combination_entry(
     spec: Spectrum,
     block: Block,
     kind: Kind,

@@ -37,7 +37,7 @@ def widening_gain(m: float, s: float, t: float = WIDER) -> float:
 def conflict_of(spec: Spectrum, j: int) -> str:
     """How parameter ``j`` conflicts with its prior, in words; empty if it does not."""
     m = float((spec.mean[j] - spec.prior_mean[j]) / spec.prior_sd[j])
-    return _conflict(m, float(spec.sd[j] / spec.prior_sd[j]))
+    return _describe_conflict(m, float(spec.sd[j] / spec.prior_sd[j]))
 
 
 def prior_conflicts(spec: Spectrum) -> list[str]:
@@ -53,7 +53,7 @@ def prior_conflicts(spec: Spectrum) -> list[str]:
     m = spec.directions.T @ z
     s = np.sqrt(np.sum((spec.directions.T @ scale) ** 2, axis=1))
     for k in np.flatnonzero(~spec.flat):
-        text = _conflict(float(m[k]), float(s[k]))
+        text = _describe_conflict(float(m[k]), float(s[k]))
         if text:
             what = weighted_sum(combination(spec, int(k)), spec.names)
             found.append(f"{what} lies {text}, though no parameter alone does.")
@@ -66,7 +66,7 @@ def combination(spec: Spectrum, k: int) -> np.ndarray:
     return covector * spec.prior_sd
 
 
-def _conflict(m: float, s: float) -> str:
+def _describe_conflict(m: float, s: float) -> str:
     gain = widening_gain(m, s)
     if abs(m) <= FAR and gain <= STRONG:
         return ""

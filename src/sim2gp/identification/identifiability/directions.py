@@ -15,14 +15,14 @@ from sim2gp.identification.identifiability.base_parameters import best_reduction
 from sim2gp.identification.identifiability.conflicts import combination
 from sim2gp.identification.identifiability.null_space import blocks
 from sim2gp.identification.identifiability.spectrum import Spectrum
-from sim2gp.identification.words import digits, falling, quantity, weighted_sum
+from sim2gp.identification.words import descending_order, digits, quantity, weighted_sum
 
 _MOSTLY = 0.1  # smaller terms of a flat direction are left out of its words
 _FLAT = math.sqrt(0.5 + 1e-9)  # of the prior's sd: as much as data and prior know
 _FAR = 20.0  # times the first move
 
 
-def directions(spec: Spectrum) -> list[dict[str, Any]]:
+def describe_directions(spec: Spectrum) -> list[dict[str, Any]]:
     """Text, combination, information (nats) and flatness; the least known first."""
     found = [_dead(spec, int(j)) for j in np.flatnonzero(spec.dead)]
     for block in blocks(spec):
@@ -35,11 +35,13 @@ def directions(spec: Spectrum) -> list[dict[str, Any]]:
             pivot = int(block.index[reduced.pivots[column]])
             found.append(_trade_off(spec, move, pivot))
     for k in reversed(range(spec.rank)):
-        found.append(_weakly_seen(spec, k) if spec.flat[k] else _fixed(spec, k))
+        found.append(
+            _weakly_seen(spec, k) if spec.flat[k] else _describe_fixed(spec, k)
+        )
     return found
 
 
-def _direction(text: str, combination: str, l: float) -> dict[str, Any]:
+def _direction_entry(text: str, combination: str, l: float) -> dict[str, Any]:
     return {
         "text": text,
         "combination": combination,
@@ -50,7 +52,7 @@ def _direction(text: str, combination: str, l: float) -> dict[str, Any]:
 
 def _dead(spec: Spectrum, j: int) -> dict[str, Any]:
     name = spec.names[j]
-    return _direction(f"{name} has no effect on these data.", name, 0.0)
+    return _direction_entry(f"{name} has no effect on these data.", name, 0.0)
 
 
 def _trade_off(
@@ -58,29 +60,32 @@ def _trade_off(
 ) -> dict[str, Any]:
     others = [int(j) for j in np.flatnonzero(move) if j != pivot]
     sizes = np.asarray([abs(_in_prior_sd(spec, move, j)) for j in others])
-    order = [pivot, *(others[n] for n in falling(sizes))]
-    text = f"{_told(spec, move, order)}: the data stay the same."
-    return _direction(text, _ratio(spec, move, order), 0.0)
+    order = [pivot, *(others[n] for n in descending_order(sizes))]
+    text = f"{_describe_move(spec, move, order)}: the data stay the same."
+    return _direction_entry(text, _move_ratio(spec, move, order), 0.0)
 
 
 def _weakly_seen(spec: Spectrum, k: int) -> dict[str, Any]:
     u, l = spec.standardised()[:, k], float(spec.eigenvalues[k])
     size = np.abs(u)
-    order = [j for j in falling(size) if size[j] > _MOSTLY * size.max()]
+    order = [j for j in descending_order(size) if size[j] > _MOSTLY * size.max()]
     move = np.sign(u[order[0]]) * u * spec.prior_sd * spec.slope
-    text = f"{_told(spec, move, order)}: the data hardly change; {_left(spec, k)}."
-    return _direction(text, _ratio(spec, move, order), l)
+    text = f"{_describe_move(spec, move, order)}: the data hardly change"
+    text += f"; {_remaining_spread(spec, k)}."
+    return _direction_entry(text, _move_ratio(spec, move, order), l)
 
 
-def _fixed(spec: Spectrum, k: int) -> dict[str, Any]:
+def _describe_fixed(spec: Spectrum, k: int) -> dict[str, Any]:
     l = float(spec.eigenvalues[k])
     what = weighted_sum(combination(spec, k), spec.names)
     # With corrected spreads the data may inform and yet leave it open.
     verb = "determine" if _spread(spec, k) <= _FLAT else "hardly determine"
-    return _direction(f"The data {verb} {what}: {_left(spec, k)}.", what, l)
+    return _direction_entry(
+        f"The data {verb} {what}: {_remaining_spread(spec, k)}.", what, l
+    )
 
 
-def _left(spec: Spectrum, k: int) -> str:
+def _remaining_spread(spec: Spectrum, k: int) -> str:
     """What the posterior keeps of the prior's sd along a direction, in words."""
     return f"{digits(100.0 * _spread(spec, k), 2)} % of the prior's spread is left"
 
@@ -94,7 +99,9 @@ def _in_prior_sd(spec: Spectrum, move: Float[np.ndarray, " p"], j: int) -> float
     return float(move[j] / (spec.slope[j] * spec.prior_sd[j]))
 
 
-def _told(spec: Spectrum, move: Float[np.ndarray, " p"], order: list[int]) -> str:
+def _describe_move(
+    spec: Spectrum, move: Float[np.ndarray, " p"], order: list[int]
+) -> str:
     """Raise a by 1 %, lower b by 0.4 %: relative moves; physical where signed."""
 
     def relative(j: int) -> bool:
@@ -121,7 +128,7 @@ def _told(spec: Spectrum, move: Float[np.ndarray, " p"], order: list[int]) -> st
     return text[0].upper() + text[1:]
 
 
-def _ratio(spec: Spectrum, move: Float[np.ndarray, " p"], order: list[int]) -> str:
+def _move_ratio(spec: Spectrum, move: Float[np.ndarray, " p"], order: list[int]) -> str:
     """``a : b = 1 kg : -0.2 kg m``: the same move in physical units."""
     amounts = [
         quantity(move[j] / move[order[0]], spec.parameters.units[j]) for j in order

@@ -26,7 +26,7 @@ from sim2gp.identification.identifiability.spectrum import (
     FisherAt,
     Spectrum,
     null_space,
-    physical,
+    values_and_slopes,
     zero_columns,
 )
 
@@ -39,7 +39,7 @@ _CANDIDATES = 600  # pivot sets tried
 _DEGENERATE = 1e-4  # volume of orthonormal directions, seen in the pivots alone
 
 
-class Point(eqx.Module):
+class NullSpacePoint(eqx.Module):
     """The null space at one virtual vector, in prior sd of every parameter."""
 
     theta: Float[np.ndarray, " p"]
@@ -51,21 +51,21 @@ class Block(eqx.Module):
     """Parameters tied by null directions, seen at the MAP (first) and elsewhere."""
 
     index: np.ndarray
-    points: tuple[Point, ...]
+    points: tuple[NullSpacePoint, ...]
     scale: Float[np.ndarray, " q"]  # physical prior sd, linearised at the MAP
     share: Float[np.ndarray, " q"]  # of each parameter's prior variance that is null
     positive: bool = eqx.field(static=True)
 
-    def basis(self, kind: Kind, point: Point) -> Float[np.ndarray, "q k"]:
+    def basis(self, kind: Kind, point: NullSpacePoint) -> Float[np.ndarray, "q k"]:
         """Orthonormal null directions in scaled coordinates."""
         size = point.slope / self.points[0].slope
         if kind == "log":
             size = size * self.scale / point.theta
-        return _range(size[:, None] * point.null)
+        return _column_space(size[:, None] * point.null)
 
     def union(self, kind: Kind) -> Float[np.ndarray, "q u"]:
         """All directions that are null at any of the points."""
-        return _range(np.hstack([self.basis(kind, x) for x in self.points]))
+        return _column_space(np.hstack([self.basis(kind, x) for x in self.points]))
 
     @property
     def kinds(self) -> tuple[Kind, ...]:
@@ -94,7 +94,7 @@ class Reduced(eqx.Module):
 
 def blocks(spec: Spectrum, fisher_at: FisherAt | None = None) -> list[Block]:
     """The live parameters that structurally null directions touch, block by block."""
-    points = [_point(spec, spec.at, spec.factor, spec.dead)]
+    points = [_null_space_at(spec, spec.at, spec.factor, spec.dead)]
     k = points[0].null.shape[1]
     if k == 0:
         return []
@@ -151,30 +151,35 @@ def reduce(
     return best[1]
 
 
-def _block(spec: Spectrum, points: Sequence[Point], index: np.ndarray) -> Block:
+def _block(
+    spec: Spectrum, points: Sequence[NullSpacePoint], index: np.ndarray
+) -> Block:
     free = [spec.parameters.free[j] for j in index]
     positive = all(p.low >= 0.0 or p.map == "log" for p in free)
     positive = positive and all(bool(np.all(x.theta[index] > 0.0)) for x in points)
     seen = tuple(
-        Point(x.theta[index], x.slope[index], _range(x.null[index])) for x in points
+        NullSpacePoint(x.theta[index], x.slope[index], _column_space(x.null[index]))
+        for x in points
     )
     scale = (spec.slope * spec.prior_sd)[index]
     return Block(index, seen, scale, np.sum(seen[0].null ** 2, axis=1), positive)
 
 
-def _point(
+def _null_space_at(
     spec: Spectrum,
     tt: Float[np.ndarray, " p"],
     A: Float[np.ndarray, "r p"],
     dead: Bool[np.ndarray, " p"],
-) -> Point:
-    theta, slope = physical(spec.parameters, tt)
+) -> NullSpacePoint:
+    theta, slope = values_and_slopes(spec.parameters, tt)
     null = spec.prior_scale @ null_space(A) / spec.prior_sd[:, None]
     # The unit vectors of dead parameters are null too; what remains is without them.
-    return Point(theta, slope, _range(np.where(dead[:, None], 0.0, null)))
+    return NullSpacePoint(
+        theta, slope, _column_space(np.where(dead[:, None], 0.0, null))
+    )
 
 
-def _elsewhere(spec: Spectrum, fisher_at: FisherAt, k: int) -> list[Point]:
+def _elsewhere(spec: Spectrum, fisher_at: FisherAt, k: int) -> list[NullSpacePoint]:
     """Points around the MAP where the simulation is finite and as blind as there."""
     normal = np.random.default_rng(0).standard_normal((_POINTS, len(spec.mean)))
     points = []
@@ -183,13 +188,15 @@ def _elsewhere(spec: Spectrum, fisher_at: FisherAt, k: int) -> list[Point]:
         A = np.asarray(fisher_at(jnp.asarray(tt, float)))
         if not np.all(np.isfinite(A)):
             continue
-        point = _point(spec, tt, A, spec.dead | zero_columns(A, spec.prior_scale))
+        point = _null_space_at(
+            spec, tt, A, spec.dead | zero_columns(A, spec.prior_scale)
+        )
         if point.null.shape[1] == k:
             points.append(point)
     return points
 
 
-def _range(N: Float[np.ndarray, "q k"]) -> Float[np.ndarray, "q u"]:
+def _column_space(N: Float[np.ndarray, "q k"]) -> Float[np.ndarray, "q u"]:
     """Orthonormal basis of the column space, columns counted at unit length."""
     length = np.linalg.norm(N, axis=0)
     N = N[:, length > _TOUCHED] / length[length > _TOUCHED]

@@ -26,7 +26,10 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Array, Float
 
-from sim2gp.identification.identifiability.spectrum import physical, virtual_columns
+from sim2gp.identification.identifiability.spectrum import (
+    values_and_slopes,
+    virtual_columns,
+)
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.least_squares import over, stack
 from sim2gp.inference.parameters import Parameters
@@ -78,9 +81,9 @@ def select_parameters(
         return Selection({}, {})
     C = scipy.linalg.solve_triangular(R[:open_, :open_], R[:open_, open_:])
     kept, held = rest[order[:open_]], rest[order[open_:]]
-    left = _left(J)
-    after = _left(J[:, np.concatenate([kept, first])])[:open_]
-    _, slope = physical(parameters, np.asarray(prior.mean))
+    left = _posterior_sd(J)
+    after = _posterior_sd(J[:, np.concatenate([kept, first])])[:open_]
+    _, slope = values_and_slopes(parameters, np.asarray(prior.mean))
     size = slope * sd
     stands_for: dict[str, dict[str, float]] = {}
     for i, j in np.argwhere(np.abs(C) > MOVED * after[:, None]):
@@ -91,7 +94,7 @@ def select_parameters(
     return Selection(shares, stands_for)
 
 
-def _left(J: Float[np.ndarray, "r q"]) -> Float[np.ndarray, " q"]:
+def _posterior_sd(J: Float[np.ndarray, "r q"]) -> Float[np.ndarray, " q"]:
     """Posterior sd in prior sd, of independent priors."""
     eye = np.eye(J.shape[1])
     return np.asarray(np.linalg.norm(over(eye, stack(J, eye)), axis=1))

@@ -98,9 +98,9 @@ def spectrum(
     s, V = _right_singular(A)
     # A direction has no sign: let what it measures start with plus.
     weights = np.linalg.solve(L0.T, V) * np.sqrt(np.sum(L0**2, axis=1))[:, None]
-    V = V * np.where(_largest(weights) < 0.0, -1.0, 1.0)
+    V = V * np.where(_largest_entries(weights) < 0.0, -1.0, 1.0)
     tt = np.asarray(posterior.mean if at is None else at)
-    theta, slope = physical(parameters, tt)
+    theta, slope = values_and_slopes(parameters, tt)
     return Spectrum(
         parameters,
         np.asarray(prior.mean),
@@ -120,7 +120,7 @@ def spectrum(
     )
 
 
-def physical(
+def values_and_slopes(
     parameters: Parameters, tt: Float[np.ndarray, " p"]
 ) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
     """Physical values and their slopes ``dtheta/dtt``."""
@@ -164,7 +164,7 @@ def _right_singular(
     return np.concatenate([s, np.zeros(q - len(s))]), Vt.T
 
 
-def _largest(columns: Float[np.ndarray, "p k"]) -> Float[np.ndarray, " k"]:
+def _largest_entries(columns: Float[np.ndarray, "p k"]) -> Float[np.ndarray, " k"]:
     """The largest entry of every column, the first of those equal up to rounding."""
     sizes = np.abs(columns)
     first = np.argmax(sizes > (1.0 - 1e-6) * sizes.max(axis=0, initial=0.0), axis=0)

@@ -26,10 +26,10 @@ from sim2gp.identification.identifiability.spectrum import (
     Spectrum,
 )
 from sim2gp.identification.words import (
+    descending_order,
     digits,
-    falling,
     finite_or_none,
-    listed,
+    join_names,
     quantity,
 )
 from sim2gp.inference.gaussian import Gaussian
@@ -43,7 +43,7 @@ _NODES, _SPAN = 4001, 12.0
 _UPPER = 1.959963984540054  # standard normal quantile of .975
 
 
-def parameter_table(spec: Spectrum) -> dict[str, dict[str, Any]]:
+def parameter_entries(spec: Spectrum) -> dict[str, dict[str, Any]]:
     """One entry per free parameter, as summary.json and the report want it."""
     table = spec.parameters
     prior = physical_moments(table, spec.prior_mean, spec.prior_sd)
@@ -133,7 +133,7 @@ def _partners(spec: Spectrum, P: Float[np.ndarray, "p p"], j: int) -> tuple[str,
     if P[j, j] <= 0.0:
         return ()
     tie = P[:, j] ** 2 / P[j, j]
-    order = [i for i in falling(tie) if i != j and tie[i] > SHARE]
+    order = [i for i in descending_order(tie) if i != j and tie[i] > SHARE]
     return tuple(spec.names[i] for i in order)
 
 
@@ -148,14 +148,14 @@ def _note(spec: Spectrum, j: int, verdict: str, partners: tuple[str, ...]) -> st
         if abs(spec.prior_mean[j]) > BOUND:
             text += ", where its prior already put it"
     elif verdict == "traded_off":
-        text = f"only together with {listed(partners)}: see the combinations"
+        text = f"only together with {join_names(partners)}: see the combinations"
     elif verdict == "prior_dominated":
         text = f"{left} of the prior's spread is left: mostly what was assumed"
     else:
         text = f"{left} of the prior's spread is left"
         behind = _leans_on(spec, j) if verdict == "weak" else ()
         if behind:
-            text += f", and only through the prior of {listed(behind)}"
+            text += f", and only through the prior of {join_names(behind)}"
     conflict = conflict_of(spec, j)
     return f"{text}; against its prior: {conflict}" if conflict else text
 

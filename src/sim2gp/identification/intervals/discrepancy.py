@@ -23,7 +23,10 @@ from sim2gp.identification.intervals.pulls import (
     pulls_of_rows,
     rows_of,
 )
-from sim2gp.identification.intervals.scatter import Corrected, corrected
+from sim2gp.identification.intervals.scatter import (
+    CorrectedFit,
+    correct_posterior,
+)
 from sim2gp.identification.missing_physics.score import sine_to
 from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
@@ -60,7 +63,7 @@ def corrected_windows(
     fitted: Estimate,
     group: Int[np.ndarray, " W"],
     effects: Sequence[AbstractPart] | None = None,
-) -> Corrected:
+) -> CorrectedFit:
     """The corrected posterior of a fit's constants, checked with the simulator itself.
 
     ``effects`` are what it may lack, with their prior sd: None is its library, which a
@@ -69,18 +72,18 @@ def corrected_windows(
     p, cut = fitted.prior.mean.size, likelihood.windows
     system = likelihood.system
     given = smooth_effects(system) if effects is None else tuple(effects)
-    system, whole, own = _with(system, fitted, given)
+    system, whole, own = _with_effects_at_zero(system, fitted, given)
     wider = WindowsLikelihood(system, cut)
     at = np.asarray(whole.posterior.mean)
     rows = rows_of(wider, whole, whole.posterior.mean)
     pulls = pulls_of_rows(rows, cut, group)
-    order = np.concatenate([own, _distinct(pulls, own)])
+    order = np.concatenate([own, _identifiable_effects(pulls, own)])
     lacking = np.arange(len(order)) >= p
     mean, scale = np.asarray(whole.prior.mean), np.asarray(whole.prior.scale)
     prior = Gaussian(*map(jnp.asarray, (mean[order], scale[np.ix_(order, order)])))
     for _ in range(ROUNDS):
         here = Gaussian(jnp.asarray(at[order]), prior.scale)
-        found = corrected(prior, here, pulls.of(order), lacking)
+        found = correct_posterior(prior, here, pulls.of(order), lacking)
         if not found.enough:
             return replace(found, posterior=fitted.posterior)
         to = at.copy()
@@ -104,7 +107,7 @@ def corrected_windows(
     )
 
 
-def _with(
+def _with_effects_at_zero(
     machine: AbstractSystem, fitted: Estimate, effects: Sequence[AbstractPart]
 ) -> tuple[AbstractSystem, Estimate, Int[np.ndarray, " p"]]:
     """The machine with effects, its estimate with all at nothing; its own columns."""
@@ -124,7 +127,9 @@ def _with(
     return system, whole, own
 
 
-def _distinct(pulls: Pulls, own: Int[np.ndarray, " p"]) -> Int[np.ndarray, " k"]:
+def _identifiable_effects(
+    pulls: Pulls, own: Int[np.ndarray, " p"]
+) -> Int[np.ndarray, " k"]:
     """The other columns that show, and that no constants of the machine mimic."""
     A = np.asarray(np.linalg.qr(np.concatenate(list(pulls.factors)), mode="r"))
     others = np.setdiff1d(np.arange(A.shape[1]), own)

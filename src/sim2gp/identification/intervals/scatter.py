@@ -73,7 +73,7 @@ MUCH = 3.0  # times as wide: a summary says why, wherever it names the interval
 
 
 @dataclass(frozen=True)
-class Corrected:
+class CorrectedFit:
     """The corrected posterior, or the plain one where windows are too few to tell.
 
     ``inflation`` is ``kappa^2``, the samples that count as one; ``lag`` the ``b``
@@ -93,12 +93,12 @@ class Corrected:
 
 
 @in_float64
-def corrected(
+def correct_posterior(
     prior: Gaussian,
     plain: Gaussian,
     pulls: Pulls,
     effects: Bool[np.ndarray, " p"] | None = None,
-) -> Corrected:
+) -> CorrectedFit:
     """The posterior as wide as the windows' pulls scatter, about the data's centre.
 
     ``plain`` has the point where the pulls were linearised, and is what is told of too
@@ -124,8 +124,8 @@ def corrected(
     b = _lag(v @ onto.T, W, pulls.group)
     nu = min(W, BARTLETT * W / b)
     if len(s) == 0 or nu < FEWEST:
-        return Corrected(plain, math.nan, b, nu, False)
-    root, kappa2 = _shrunk(_scatter(v, P, pulls.group, b) @ onto.T, nu)
+        return CorrectedFit(plain, math.nan, b, nu, False)
+    root, kappa2 = _shrink_scatter(_scatter(v, P, pulls.group, b) @ onto.T, nu)
     _, size, U = np.linalg.svd(root, full_matrices=False)
     spread = np.maximum(size, 1.0) * math.sqrt(nu / (nu - 2.0))
     # F z_data = (F + I) z at the MAP, where the scores add up to -z.
@@ -134,7 +134,7 @@ def corrected(
     free = np.zeros(p, bool) if effects is None else np.asarray(effects)
     centre, scale, missing = _averaged(weight @ (s[:, None] * Vt), weight @ data, free)
     found = Gaussian(jnp.asarray(mu0 + L0 @ centre), jnp.asarray(L0 @ scale))
-    return Corrected(found, kappa2, b, nu, True, missing)
+    return CorrectedFit(found, kappa2, b, nu, True, missing)
 
 
 def _averaged(
@@ -171,7 +171,9 @@ def _averaged(
     return mean, scale, 1.0 - float(weights[0])
 
 
-def words(found: Corrected, widened: Sequence[float], windows: int) -> str:
+def describe_intervals(
+    found: CorrectedFit, widened: Sequence[float], windows: int
+) -> str:
     """Which intervals these are and why, in some sentences."""
     if not found.enough:
         return (
@@ -185,15 +187,17 @@ def words(found: Corrected, widened: Sequence[float], windows: int) -> str:
             "Intervals were checked for errors that are correlated in time: those of "
             f"{windows} windows pull the parameters {digits(scatter, 2)} times as far "
             f"as white noise would, and intervals are at most {digits(most, 3)} times "
-            f"those of independent samples. {_allowed(found)}"
+            f"those of independent samples. {_missing_physics_remark(found)}"
         )
     text = f"Intervals are {_times(widened)} times as wide as if every sample were new"
     if not lacks or scatter > LIKE_WHITE:
         text += f": {_coloured(found, windows)}"
-    return f"{text}. {_allowed(found)}"
+    return f"{text}. {_missing_physics_remark(found)}"
 
 
-def why(found: Corrected, widened: Sequence[float], windows: int) -> str | None:
+def explain_widening(
+    found: CorrectedFit, widened: Sequence[float], windows: int
+) -> str | None:
     """In one sentence, where corrected and plain sd differ by more than `MUCH`.
 
     The reasons are those that the correction has: samples that repeat each other, and
@@ -206,8 +210,8 @@ def why(found: Corrected, widened: Sequence[float], windows: int) -> str | None:
         reasons.append(_coloured(found, windows))
     if found.missing > NOTHING:
         reasons.append(
-            f"the simulator is missing physics with a probability of {_sure(found)}, "
-            f"which the parameters make up for"
+            "the simulator is missing physics with a probability of "
+            f"{_missing_percent(found)}, which the parameters make up for"
         )
     reason = ", and ".join(reasons) or "windows are few"
     return (
@@ -221,19 +225,19 @@ def _times(widened: Sequence[float]) -> str:
     return ends[0] if ends[0] == ends[1] else " to ".join(ends)
 
 
-def _coloured(found: Corrected, windows: int) -> str:
+def _coloured(found: CorrectedFit, windows: int) -> str:
     return (
         f"the errors of {windows} windows are coloured and pull the parameters "
         f"{digits(math.sqrt(found.inflation), 2)} times as far as white noise would"
     )
 
 
-def _sure(found: Corrected) -> str:
+def _missing_percent(found: CorrectedFit) -> str:
     percent = f"{100.0 * found.missing:.0f} %"
     return "more than 99 %" if found.missing >= 0.995 else percent
 
 
-def _allowed(found: Corrected) -> str:
+def _missing_physics_remark(found: CorrectedFit) -> str:
     """Whether physics that is missing is in the intervals."""
     if not found.effects:
         return (
@@ -242,16 +246,17 @@ def _allowed(found: Corrected) -> str:
         )
     if found.missing > NOTHING:
         return (
-            f"The model lacks physics with a probability of {_sure(found)}: intervals "
-            f"allow for {len(found.effects)} effects of its library (friction, "
-            "springs, drag and the like), and parameters lie where they would with "
-            "them. sim2gp explain tries the effects one by one."
+            f"The model lacks physics with a probability of {_missing_percent(found)}: "
+            f"intervals allow for {len(found.effects)} effects of its library "
+            "(friction, springs, drag and the like), and parameters lie where they "
+            "would with them. sim2gp explain tries the effects one by one."
         )
     count = len(found.effects)
     effects = "an effect" if count == 1 else f"{count} effects"
     return (
         f"Intervals allow for {effects} that the model may be missing, which has a "
-        f"probability of {_sure(found)}; they do not allow for other physics."
+        f"probability of {_missing_percent(found)}; they do not allow for other "
+        "physics."
     )
 
 
@@ -304,7 +309,7 @@ def _running(x: Float[np.ndarray, "W *p"], b: int) -> Float[np.ndarray, "S *p"]:
     return total[b:] - total[:-b]
 
 
-def _shrunk(
+def _shrink_scatter(
     rows: Float[np.ndarray, "S q"], nu: float
 ) -> tuple[Float[np.ndarray, "T q"], float]:
     """A root of G drawn towards one number for all directions, and that number."""

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from sim2gp.identification.intervals import scatter as intervals
-from sim2gp.identification.intervals.scatter import NOTHING, Corrected
+from sim2gp.identification.intervals.scatter import NOTHING, CorrectedFit
 from sim2gp.identification.words import digits
 from sim2gp.systems.assemble import free_parts
 from sim2gp.systems.base import AbstractSystem
@@ -16,9 +16,9 @@ from sim2gp.types import in_float64
 
 
 @in_float64
-def told_intervals(
+def interval_entry(
     system: AbstractSystem,
-    honest: Corrected,
+    honest: CorrectedFit,
     parameters: Mapping[str, Mapping[str, Any]],
     windows: int,
 ) -> dict[str, Any]:
@@ -26,8 +26,8 @@ def told_intervals(
     widened = [entry["widened"] or 1.0 for entry in parameters.values()]
     return {
         "which": "corrected" if honest.enough else "plain",
-        "text": intervals.words(honest, widened, windows),
-        "why": intervals.why(honest, widened, windows),
+        "text": intervals.describe_intervals(honest, widened, windows),
+        "why": intervals.explain_widening(honest, widened, windows),
         "pulls_times_white": math.sqrt(honest.inflation) if honest.enough else None,
         "windows_at_once": honest.lag,
         "freedom": honest.freedom,
@@ -36,7 +36,7 @@ def told_intervals(
     }
 
 
-def _effects(system: AbstractSystem, honest: Corrected) -> dict[str, dict[str, Any]]:
+def _effects(system: AbstractSystem, honest: CorrectedFit) -> dict[str, dict[str, Any]]:
     if honest.lacking is None:
         return {}
     table = free_parts(system, smooth_effects(system)).parameters
@@ -52,7 +52,7 @@ def _effects(system: AbstractSystem, honest: Corrected) -> dict[str, dict[str, A
     }
 
 
-def lacking_table(told: Mapping[str, Any]) -> list[dict[str, Any]]:
+def missing_physics_table(told: Mapping[str, Any]) -> list[dict[str, Any]]:
     """What the simulator may lack, clearest first, where something is probable."""
     if not told["allowed_for"] or told["missing"] <= NOTHING:
         return []

@@ -36,15 +36,15 @@ def misfit_of_transitions(
     """
     system, data = likelihood.system, likelihood.data
     N = data.count
-    found = _rows(likelihood, posterior.mean, prior.scale)
+    found = _residual_rows(likelihood, posterior.mean, prior.scale)
     r, J = (np.asarray(x)[:N] for x in found)
     sd = np.asarray(noise)
     s, a, s2 = (np.asarray(x)[:N] for x in (data.state, data.action, data.next_state))
-    episode = _episodes(s, s2)
+    episode = _episode_numbers(s, s2)
     states = system.physical_states
     return misfit(
         r / sd,
-        np.concatenate([encoded(s[:, : len(states)], states), a], axis=1),
+        np.concatenate([encode_angles(s[:, : len(states)], states), a], axis=1),
         jacobian=J / sd[:, None],
         past=earlier(a, episode),
         group=episode,
@@ -73,7 +73,7 @@ def misfit_of_windows(likelihood: WindowsLikelihood, fitted: Estimate) -> Misfit
     states = system.physical_states
     return misfit(
         (r * scale)[kept],
-        np.concatenate([encoded(s, states), a], axis=1)[kept],
+        np.concatenate([encode_angles(s, states), a], axis=1)[kept],
         jacobian=J[..., :p],
         nuisance=J[..., p:] if free else None,
         group=group,
@@ -83,7 +83,7 @@ def misfit_of_windows(likelihood: WindowsLikelihood, fitted: Estimate) -> Misfit
     )
 
 
-def encoded(
+def encode_angles(
     x: Float[np.ndarray, "N n"], channels: tuple[Channel, ...]
 ) -> Float[np.ndarray, "N k"]:
     """The columns, angles as sine and cosine."""
@@ -109,10 +109,10 @@ def _successive(cut: Windows) -> Int[np.ndarray, " W"]:
     """One number for one-step windows each of which starts where the last one ended."""
     end = np.sum(np.asarray(cut.y), axis=1, where=np.asarray(cut.mask))
     start = np.asarray(cut.start)[:, list(cut.outputs)]
-    return _episodes(start, end)
+    return _episode_numbers(start, end)
 
 
-def _episodes(
+def _episode_numbers(
     start: Float[np.ndarray, "N n"], end: Float[np.ndarray, "N n"]
 ) -> Int[np.ndarray, " N"]:
     breaks = np.any(start[1:] != end[:-1], axis=1)
@@ -120,7 +120,7 @@ def _episodes(
 
 
 @eqx.filter_jit
-def _rows(
+def _residual_rows(
     likelihood: OneStepLikelihood, tt: Array, scale: Array
 ) -> tuple[Array, Array]:
     """Residuals ``f - s'`` and their Jacobian, per prior standard deviation."""

@@ -31,7 +31,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.special import chdtrc, fdtrc, gammaincc
 
 from sim2gp.errors import NotFinite
-from sim2gp.identification.misfit.words import Finding, found, verdict
+from sim2gp.identification.misfit.words import Finding, make_finding, misfit_verdict
 
 LEVEL = 1e-3
 LAGS = 20
@@ -96,7 +96,7 @@ def misfit(
     N, d = residuals.shape
     valid = np.ones((N, d), bool) if mask is None else np.asarray(mask, bool)
     valid = np.broadcast_to(valid[:, None] if valid.ndim == 1 else valid, (N, d))
-    run = np.zeros(N, int) if group is None else _runs(np.asarray(group))
+    run = np.zeros(N, int) if group is None else _run_numbers(np.asarray(group))
     empty = np.zeros((N, d, 0))
     columns = [empty if A is None else np.asarray(A) for A in (nuisance, jacobian)]
     own, J, r = (
@@ -112,19 +112,19 @@ def misfit(
     x, extra = _standardised(x, used), _standardised(extra, used)
     names = list(channels) or [f"channel {c + 1}" for c in range(d)]
 
-    stated = Projected(r, J, own, run, valid)
+    stated = ProjectedResiduals(r, J, own, run, valid)
     scaled = stated.in_units_of(stated.rms())
     tests = {
-        "chi2": found("chi2", *_chi2(stated, noise_known), LEVEL),
-        "ljung_box": found("ljung_box", *_ljung_box(scaled, names), LEVEL),
-        "f_test": found("f_test", *_f_test(scaled, x, extra, names), LEVEL),
-        "split_half": found("split_half", *_split_half(scaled, x), LEVEL),
+        "chi2": make_finding("chi2", *_chi2_test(stated, noise_known), LEVEL),
+        "ljung_box": make_finding("ljung_box", *_ljung_box_test(scaled, names), LEVEL),
+        "f_test": make_finding("f_test", *_f_test(scaled, x, extra, names), LEVEL),
+        "split_half": make_finding("split_half", *_split_half(scaled, x), LEVEL),
     }
     count = int(used.sum())
-    return Misfit(tests, verdict(tests, count, rows), count)
+    return Misfit(tests, misfit_verdict(tests, count, rows), count)
 
 
-class Projected:
+class ProjectedResiduals:
     """Residuals free of all that the fit could move; ``d`` channels in ``N`` rows."""
 
     def __init__(
@@ -139,7 +139,7 @@ class Projected:
         self.own_basis, self.own_rank = _grouped_basis(own, run)
         J = self._without_own(J)
         flat = J.reshape(-1, J.shape[-1])
-        self.basis, self.size = _basis(flat, RANK_TOLERANCE)
+        self.basis, self.size = _orthonormal_basis(flat, RANK_TOLERANCE)
         self.e = self.without(r)[..., 0]
         self.count = int(valid.sum())
         self.freedom = self.count - self.own_rank - self.basis.shape[1]
@@ -173,10 +173,10 @@ class Projected:
         left = self.valid.sum(axis=0) - np.sum(self.hat**2, axis=(0, 2))
         return np.sqrt(np.sum(self.e**2, axis=0) / np.maximum(left, 1.0))
 
-    def in_units_of(self, scale: Float[np.ndarray, " d"]) -> "Projected":
+    def in_units_of(self, scale: Float[np.ndarray, " d"]) -> "ProjectedResiduals":
         """The same with each channel's noise at ``scale``, but never below QUIET."""
         unit = np.maximum(scale, QUIET)[None, :, None]
-        return Projected(
+        return ProjectedResiduals(
             self.r / unit, self.J / unit, self.own / unit, self.run, self.valid
         )
 
@@ -211,7 +211,7 @@ def _likeliest(chances: list[Result]) -> Result:
     return statistic, freedom, min(1.0, len(tested) * p), about
 
 
-def _chi2(data: Projected, known: bool) -> Result:
+def _chi2_test(data: ProjectedResiduals, known: bool) -> Result:
     about: dict[str, object] = {"known": known}
     if not known or data.freedom < 1:
         return *NOTHING, about
@@ -219,7 +219,7 @@ def _chi2(data: Projected, known: bool) -> Result:
     return total / freedom, freedom, float(chdtrc(freedom, total)), about
 
 
-def _ljung_box(data: Projected, names: Sequence[str]) -> Result:
+def _ljung_box_test(data: ProjectedResiduals, names: Sequence[str]) -> Result:
     chances: list[Result] = []
     for c, name in enumerate(names):
         Q, lags, first = ljung_box(
@@ -276,7 +276,7 @@ def ljung_box_tail(Q: float, lags: int, N: int) -> float:
 
 
 def _f_test(
-    data: Projected,
+    data: ProjectedResiduals,
     x: Float[np.ndarray, "N k"],
     past: Float[np.ndarray, "N l"],
     names: Sequence[str],
@@ -306,7 +306,7 @@ def features(x: Float[np.ndarray, "N k"], count: int) -> Float[np.ndarray, "N _"
     return np.concatenate([alone, mixed, np.ones((len(x), 1))], axis=1)
 
 
-def _split_half(data: Projected, x: Float[np.ndarray, "N k"]) -> Result:
+def _split_half(data: ProjectedResiduals, x: Float[np.ndarray, "N k"]) -> Result:
     """Would constants of their own for each half explain the residuals?
 
     The columns are those of the Jacobian with the sign turned in one half. In
@@ -331,7 +331,7 @@ def _split_half(data: Projected, x: Float[np.ndarray, "N k"]) -> Result:
     return _likeliest(chances)
 
 
-def _runs(group: Int[np.ndarray, " N"]) -> Int[np.ndarray, " N"]:
+def _run_numbers(group: Int[np.ndarray, " N"]) -> Int[np.ndarray, " N"]:
     """0, 1, 2, ... for successive stretches of one number."""
     return np.cumsum(np.diff(group, prepend=group[:1]) != 0)
 
@@ -348,7 +348,7 @@ def _standardised(
     return np.where(used[:, None], z, 0.0)
 
 
-def _basis(
+def _orthonormal_basis(
     A: Float[np.ndarray, "M c"], tolerance: float
 ) -> tuple[Float[np.ndarray, "M q"], Float[np.ndarray, " q"]]:
     """Orthonormal columns that span ``A``'s, and their singular values.
@@ -380,7 +380,7 @@ def _grouped_basis(own: Columns, run: Int[np.ndarray, " N"]) -> tuple[Columns, i
         return own[..., :0], 0
     edges = np.flatnonzero(np.diff(run, prepend=-1, append=-1))
     for i, j in pairwise(edges):
-        U, _ = _basis(own[i:j].reshape(-1, own.shape[2]), RANK_TOLERANCE)
+        U, _ = _orthonormal_basis(own[i:j].reshape(-1, own.shape[2]), RANK_TOLERANCE)
         basis[i:j, :, : U.shape[1]] = U.reshape(j - i, own.shape[1], -1)
         rank += U.shape[1]
     return basis, rank

@@ -39,7 +39,7 @@ class Finding:
         return exist | about
 
 
-def found(
+def make_finding(
     test: str,
     statistic: float,
     freedom: int,
@@ -51,14 +51,18 @@ def found(
     alarm = bool(p < level)
     if math.isnan(p):
         return Finding(math.nan, 0, math.nan, False, _not_tested(test, about))
-    words = {"chi2": _chi2, "ljung_box": _ljung_box, "f_test": _f_test}
+    words = {
+        "chi2": _chi2_sentence,
+        "ljung_box": _ljung_box_sentence,
+        "f_test": _f_test_sentence,
+    }
     text = words.get(test, _split)(statistic, alarm, about)
     differenced = test == "ljung_box" and alarm and float(str(about["first"])) < NOISY
     cause = NOISY_STATES if differenced else ""
-    return Finding(statistic, freedom, p, alarm, f"{text} ({said(p)}).", cause)
+    return Finding(statistic, freedom, p, alarm, f"{text} ({p_value_text(p)}).", cause)
 
 
-def said(p: float) -> str:
+def p_value_text(p: float) -> str:
     """``p = 2e-7``."""
     return f"p = {digits(p, 1 if p < 0.01 else 2)}" if p > 1e-99 else "p < 1e-99"
 
@@ -74,7 +78,7 @@ def _not_tested(test: str, about: Mapping[str, object]) -> str:
     return "Not tested: too few rows."
 
 
-def _chi2(ratio: float, alarm: bool, about: Mapping[str, object]) -> str:
+def _chi2_sentence(ratio: float, alarm: bool, about: Mapping[str, object]) -> str:
     del about
     size = f"{digits(math.sqrt(ratio), 3)} times the stated noise"
     if alarm:
@@ -82,7 +86,7 @@ def _chi2(ratio: float, alarm: bool, about: Mapping[str, object]) -> str:
     return f"The residuals are {size}: no larger than it allows"
 
 
-def _ljung_box(Q: float, alarm: bool, about: Mapping[str, object]) -> str:
+def _ljung_box_sentence(Q: float, alarm: bool, about: Mapping[str, object]) -> str:
     del Q
     if alarm:
         alike = float(str(about["first"])) > 0.0
@@ -94,7 +98,7 @@ def _ljung_box(Q: float, alarm: bool, about: Mapping[str, object]) -> str:
     return f"The residuals are not correlated over {about['lags']} rows"
 
 
-def _f_test(ratio: float, alarm: bool, about: Mapping[str, object]) -> str:
+def _f_test_sentence(ratio: float, alarm: bool, about: Mapping[str, object]) -> str:
     del ratio
     if alarm:
         return (
@@ -129,13 +133,13 @@ _SHORT = {
 }
 
 
-def verdict(tests: Mapping[str, Finding], count: int, rows: str) -> str:
+def misfit_verdict(tests: Mapping[str, Finding], count: int, rows: str) -> str:
     """All of it in a sentence or two; of the alarms, the most telling one."""
     if all(math.isnan(finding.p) for finding in tests.values()):
         return f"{count} {rows} are too few to test the model on."
     raised = [name for name in _SHORT if tests[name].alarm]
     if raised:
-        first = _SHORT[raised[0]].format(p=said(tests[raised[0]].p))
+        first = _SHORT[raised[0]].format(p=p_value_text(tests[raised[0]].p))
         split = tests["split_half"]
         if raised == ["ljung_box"] and tests["ljung_box"].cause:
             return f"{first}: {tests['ljung_box'].cause}."

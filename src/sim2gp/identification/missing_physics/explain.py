@@ -1,6 +1,6 @@
 """Three answers told apart: nothing is missing, this effect is, or none of these.
 
-An effect is missing when its evidence makes "nothing" improbable (`missing.search`);
+An effect is missing when its evidence makes "nothing" improbable (`search_candidates`);
 whether the library holds the truth is asked of what the best fit leaves over
 (`misfit`). Evidence alone would always name somebody: the least bad candidate of a
 library that does not hold the truth gains as much as a true one.
@@ -14,9 +14,9 @@ from sim2gp.identification.misfit.tests import Misfit
 from sim2gp.identification.missing_physics.data import AbstractData
 from sim2gp.identification.missing_physics.search import (
     REFITS,
+    CandidateSearch,
     Fits,
-    Search,
-    search,
+    search_candidates,
 )
 from sim2gp.systems.effects.registry import Candidate
 
@@ -31,7 +31,7 @@ class Explanation:
     where no effect gains enough); None where the data have no such test.
     """
 
-    search: Search
+    search: CandidateSearch
     bare: Misfit | None
     best: Misfit | None
 
@@ -50,7 +50,7 @@ class Explanation:
         return best.scored.candidate.name if named and best is not None else None
 
 
-def explain(
+def find_missing_physics(
     data: AbstractData,
     candidates: Sequence[Candidate] | None = None,
     *,
@@ -63,7 +63,9 @@ def explain(
     ``candidates`` take the library's place, ``fits`` that of the loop over fits. Raises
     what the bare machine's fit raises.
     """
-    found = search(data, candidates, refits=refits, fits=fits, on_step=on_step)
+    found = search_candidates(
+        data, candidates, refits=refits, fits=fits, on_step=on_step
+    )
     best = bare = data.misfit(data.system, found.bare)
     if found.best is not None:
         best = data.misfit(found.best.scored.system, found.best.fitted)

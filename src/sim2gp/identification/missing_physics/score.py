@@ -46,7 +46,7 @@ FARTHEST = 3.0  # prior sd, of a refit's start
 
 
 @dataclass(frozen=True)
-class Scored:
+class ScoredCandidate:
     """A candidate beside the bare machine, by one linearisation.
 
     ``gain`` is the evidence that it is worth, nats; ``sine`` the part of its effect
@@ -69,9 +69,9 @@ class Scored:
 
 
 @in_float64
-def score(
+def score_candidates(
     data: AbstractData, bare: Estimate, candidates: Sequence[Candidate]
-) -> list[Scored]:
+) -> list[ScoredCandidate]:
     """Every candidate by its linearisation at the bare machine's MAP."""
     machine, n = data.system, bare.nuisances.shape[1]
     names, likelihood = machine.parameters.names, data.likelihood(machine)
@@ -85,7 +85,7 @@ def score(
     def linear(blocks: np.ndarray, z: np.ndarray) -> _Linear:
         return _linear(data, likelihood, bare, blocks, z)
 
-    plain = _columns(every, whole, [*names, None], n)
+    plain = _select_columns(every, whole, [*names, None], n)
     without = linear(plain, np.asarray([*mode.values(), 0.0]))
     out = []
     for candidate in candidates:
@@ -96,14 +96,15 @@ def score(
             [_extended(mode, system, {candidate.name: x}) for x in candidate.grid]
         )
         if candidate.smooth:
-            found = _columns(every, whole, order, n)[None]
+            found = _select_columns(every, whole, order, n)[None]
         else:
             each = np.asarray(data.blocks(system, z, bare.nuisances))
-            found = np.stack([_columns(b, system, order, n) for b in each])
+            found = np.stack([_select_columns(b, system, order, n) for b in each])
         own = [system.parameters.names.index(name) for name in order]
         fits = [linear(b, x) for b, x in zip(found, z[:, own], strict=True)]
         gains = [
-            tempered(f.evidence - without.evidence, f.inflation, f.sd) for f in fits
+            tempered_gain(f.evidence - without.evidence, f.inflation, f.sd)
+            for f in fits
         ]
         ranked = np.argsort(-np.asarray(gains), kind="stable")
         steps = np.stack([fit.z for fit in fits])[ranked]
@@ -114,7 +115,9 @@ def score(
         best = int(ranked[0])
         sine, shared = _alias(found[best], bare)
         partners = tuple(names[j] for j in shared)
-        out.append(Scored(candidate, system, gains[best], sine, partners, starts))
+        out.append(
+            ScoredCandidate(candidate, system, gains[best], sine, partners, starts)
+        )
     return out
 
 
@@ -153,7 +156,7 @@ def _linear(
     )
     root = np.asarray(found.posterior.scale)
     row = root @ root[-1]
-    inflation = inflation_of(np.asarray(found.scores), data.cluster, row, -1)
+    inflation = sandwich_inflation(np.asarray(found.scores), data.cluster, row, -1)
     z = np.array(found.posterior.mean)
     return _Linear(float(found.log_evidence), z, math.sqrt(row[-1]), inflation)
 
@@ -199,7 +202,7 @@ def sine_to(
     return float(np.linalg.norm(column / length - others / size @ share)), share
 
 
-def inflation_of(
+def sandwich_inflation(
     scores: Float[np.ndarray, "W p"],
     cluster: Int[np.ndarray, " W"],
     row: Float[np.ndarray, " p"],
@@ -220,7 +223,7 @@ def inflation_of(
     return max(1.0, lost * float(np.sum((each @ row) ** 2) / row[j]))
 
 
-def tempered(gain: float, inflation: float, sd: float) -> float:
+def tempered_gain(gain: float, inflation: float, sd: float) -> float:
     """The gain in evidence when the data count for less by ``inflation`` (k).
 
     With the magnitude's ``sd`` in prior sd, the data's information is
@@ -237,7 +240,7 @@ def tempered(gain: float, inflation: float, sd: float) -> float:
     return fit * share - 0.5 * math.log1p(less)
 
 
-def widened(inflation: float, sd: float) -> float:
+def sd_widening(inflation: float, sd: float) -> float:
     """How many times ``sd`` (in prior sd) the magnitude is uncertain by then."""
     information = max(1.0 / sd**2 - 1.0, 0.0)
     return math.sqrt((1.0 + information) / (1.0 + information / inflation))
@@ -253,7 +256,7 @@ def _extended(
     return np.asarray([known[name] for name in table.names])
 
 
-def _columns(
+def _select_columns(
     blocks: np.ndarray, system: AbstractSystem, names: Sequence[str | None], n: int
 ) -> np.ndarray:
     """The factors of some constants' columns, in this order; None is an empty one.

@@ -1,8 +1,8 @@
 """What physics is missing: every effect of a library scored, the best few fitted.
 
-The score tests (`score`) rank by one linearisation; the best are fitted in earnest. An
-effect whose column lies in the span of the machine's own constants can never be told
-from them and is not ranked.
+The score tests (`score_candidates`) rank by one linearisation; then the best are
+fitted. An effect whose column lies in the span of the machine's own constants can never
+be told from them and is not ranked.
 """
 
 import math
@@ -14,11 +14,11 @@ import numpy as np
 from sim2gp.errors import NotConverged, NotFinite
 from sim2gp.identification.missing_physics.data import AbstractData
 from sim2gp.identification.missing_physics.score import (
-    Scored,
-    inflation_of,
-    score,
-    tempered,
-    widened,
+    ScoredCandidate,
+    sandwich_inflation,
+    score_candidates,
+    sd_widening,
+    tempered_gain,
 )
 from sim2gp.inference.estimate import Estimate
 from sim2gp.systems.effects.registry import Candidate
@@ -30,14 +30,14 @@ ODDS = 19.0  # "nothing missing" must be as improbable as 1 in 20
 
 
 @dataclass(frozen=True)
-class Refitted:
+class FittedCandidate:
     """A candidate fitted in earnest; ``gain`` in nats, ``value`` and ``sd`` physical.
 
     ``inflation`` is how much larger the variance of the magnitude is when errors may be
     correlated within clusters of windows; the data's part of the gain is divided by it.
     """
 
-    scored: Scored
+    scored: ScoredCandidate
     fitted: Estimate
     gain: float
     value: float
@@ -51,12 +51,12 @@ class Refitted:
 
 
 @dataclass(frozen=True)
-class Search:
+class CandidateSearch:
     """Everything that was tried; refits by falling gain."""
 
     bare: Estimate
-    scored: tuple[Scored, ...]
-    refitted: tuple[Refitted, ...]
+    scored: tuple[ScoredCandidate, ...]
+    refitted: tuple[FittedCandidate, ...]
     failed: tuple[str, ...] = field(default=())
 
     @property
@@ -66,7 +66,7 @@ class Search:
         return math.log(ODDS * max(ranked, 1))
 
     @property
-    def best(self) -> Refitted | None:
+    def best(self) -> FittedCandidate | None:
         """The best candidate that gains enough and has a possible sign."""
         for refit in self.refitted:
             if refit.gain > self.threshold and refit.physical:
@@ -74,7 +74,7 @@ class Search:
         return None
 
     @property
-    def tied(self) -> tuple[Refitted, ...]:
+    def tied(self) -> tuple[FittedCandidate, ...]:
         """Candidates that the evidence does not put behind the best (20 to 1)."""
         best = self.best
         if best is None:
@@ -87,19 +87,20 @@ class Search:
 
 #: How the best candidates are fitted: the name of each, and its fit or None.
 Fits = Callable[
-    [AbstractData, Estimate, Sequence[Scored]], Iterable[tuple[str, Refitted | None]]
+    [AbstractData, Estimate, Sequence[ScoredCandidate]],
+    Iterable[tuple[str, FittedCandidate | None]],
 ]
 
 
 @in_float64
-def search(
+def search_candidates(
     data: AbstractData,
     candidates: Sequence[Candidate] | None = None,
     *,
     refits: int = REFITS,
     fits: Fits | None = None,
     on_step: Callable[[str], None] = lambda _: None,
-) -> Search:
+) -> CandidateSearch:
     """Fit the bare machine, score every candidate, fit the best few.
 
     ``fits`` replaces the loop over these, as processes do. Raises what the fit of the
@@ -109,7 +110,7 @@ def search(
         candidates = registered(data.system, windows=not data.period)
     bare = data.fit()
     on_step("the machine as it is")
-    scored = score(data, bare, candidates)
+    scored = score_candidates(data, bare, candidates)
     ranked = sorted((s for s in scored if not s.alias), key=lambda s: -s.gain)
     on_step(f"{len(scored)} effects scored")
     found, failed = [], []
@@ -122,17 +123,19 @@ def search(
     rank = {one.candidate.name: k for k, one in enumerate(ranked)}  # not who was first
     failed.sort(key=lambda name: rank[name])
     found.sort(key=lambda fit: (-fit.gain, rank[fit.scored.candidate.name]))
-    return Search(bare, tuple(scored), tuple(found), tuple(failed))
+    return CandidateSearch(bare, tuple(scored), tuple(found), tuple(failed))
 
 
 def _in_turn(
-    data: AbstractData, bare: Estimate, ranked: Sequence[Scored]
-) -> Iterator[tuple[str, "Refitted | None"]]:
+    data: AbstractData, bare: Estimate, ranked: Sequence[ScoredCandidate]
+) -> Iterator[tuple[str, "FittedCandidate | None"]]:
     for one in ranked:
         yield one.candidate.name, refit(data, bare, one)
 
 
-def refit(data: AbstractData, bare: Estimate, scored: Scored) -> Refitted | None:
+def refit(
+    data: AbstractData, bare: Estimate, scored: ScoredCandidate
+) -> FittedCandidate | None:
     """A candidate fitted in earnest; None where that does not converge."""
     try:
         return _refit(data, bare, scored)
@@ -140,7 +143,9 @@ def refit(data: AbstractData, bare: Estimate, scored: Scored) -> Refitted | None
         return None
 
 
-def _refit(data: AbstractData, bare: Estimate, scored: Scored) -> Refitted:
+def _refit(
+    data: AbstractData, bare: Estimate, scored: ScoredCandidate
+) -> FittedCandidate:
     fitted = data.refit(scored.system, scored.starts, bare)
     table, name = scored.system.parameters, scored.candidate.name
     j = table.names.index(name)
@@ -148,11 +153,11 @@ def _refit(data: AbstractData, bare: Estimate, scored: Scored) -> Refitted:
     middle = table[name].constrain(float(mean[j]))
     ends = [table[name].constrain(float(mean[j]) + k * sd) for k in (-1.0, 1.0)]
     white = np.linalg.solve(fitted.prior.scale, fitted.posterior.scale)
-    inflation = inflation_of(
+    inflation = sandwich_inflation(
         np.asarray(fitted.scores), data.cluster, white @ white[j], j
     )
     raw = float(fitted.log_evidence - bare.log_evidence)
     relative = sd / table[name].sd
-    gain = tempered(raw, inflation, relative)
-    half = 0.5 * (ends[1] - ends[0]) * widened(inflation, relative)
-    return Refitted(scored, fitted, gain, middle, half, inflation)
+    gain = tempered_gain(raw, inflation, relative)
+    half = 0.5 * (ends[1] - ends[0]) * sd_widening(inflation, relative)
+    return FittedCandidate(scored, fitted, gain, middle, half, inflation)

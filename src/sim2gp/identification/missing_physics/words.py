@@ -6,8 +6,11 @@ from typing import Any
 
 from sim2gp.identification.misfit.tests import Misfit
 from sim2gp.identification.missing_physics.explain import Explanation
-from sim2gp.identification.missing_physics.search import Refitted, Scored
-from sim2gp.identification.words import digits, listed, quantity
+from sim2gp.identification.missing_physics.search import (
+    FittedCandidate,
+    ScoredCandidate,
+)
+from sim2gp.identification.words import digits, join_names, quantity
 
 
 def candidate_rows(found: Explanation) -> list[dict[str, Any]]:
@@ -17,7 +20,10 @@ def candidate_rows(found: Explanation) -> list[dict[str, Any]]:
     a fit (``fitted``), else of a linearisation, and None without.
     """
     fitted = {r.scored.candidate.name: r for r in found.search.refitted}
-    rows = [_row(s, fitted.get(s.candidate.name), found) for s in found.search.scored]
+    rows = [
+        _candidate_row(s, fitted.get(s.candidate.name), found)
+        for s in found.search.scored
+    ]
 
     def order(row: Mapping[str, Any]) -> tuple[bool, bool, float]:
         gain = row["evidence_gain"]
@@ -26,7 +32,9 @@ def candidate_rows(found: Explanation) -> list[dict[str, Any]]:
     return sorted(rows, key=order)
 
 
-def _row(s: Scored, refit: Refitted | None, found: Explanation) -> dict[str, Any]:
+def _candidate_row(
+    s: ScoredCandidate, refit: FittedCandidate | None, found: Explanation
+) -> dict[str, Any]:
     where, what = s.candidate.name.rsplit(".", 1)
     table, name = s.system.parameters, s.candidate.name
     j = table.names.index(name)
@@ -54,10 +62,12 @@ def _row(s: Scored, refit: Refitted | None, found: Explanation) -> dict[str, Any
     }
 
 
-def _verdict(s: Scored, refit: Refitted | None, found: Explanation) -> str:
+def _verdict(
+    s: ScoredCandidate, refit: FittedCandidate | None, found: Explanation
+) -> str:
     best = found.search.best
     if s.alias:
-        same = listed(s.partners) if s.partners else "no motion in these data"
+        same = join_names(s.partners) if s.partners else "no motion in these data"
         return f"not distinguishable from {same}"
     if s.candidate.name in found.search.failed:
         return "no fit"
@@ -72,7 +82,7 @@ def _verdict(s: Scored, refit: Refitted | None, found: Explanation) -> str:
     return "no evidence"
 
 
-def headline(found: Explanation) -> str:
+def missing_physics_headline(found: Explanation) -> str:
     """The answer in one or two sentences."""
     best, tests = found.search.best, found.best
     reasons = _reasons(tests)
@@ -88,7 +98,7 @@ def headline(found: Explanation) -> str:
             "None of these: no effect of the library is worth its parameter, and yet "
             f"the simulator does not fit. {reasons}"
         )
-    said = _said(best)
+    said = _describe_candidate(best)
     if found.answer == "none of these":
         return (
             f"None of these. The best effect of the library is {said}, but with it "
@@ -96,12 +106,12 @@ def headline(found: Explanation) -> str:
         )
     text = f"Missing: {said}. With it what is left over looks like noise."
     if found.search.tied:
-        names = listed([r.scored.candidate.name for r in found.search.tied])
+        names = join_names([r.scored.candidate.name for r in found.search.tied])
         text += f" These data cannot separate it from {names}."
     return text
 
 
-def _said(best: Refitted) -> str:
+def _describe_candidate(best: FittedCandidate) -> str:
     candidate = best.scored.candidate
     unit = best.scored.system.parameters[candidate.name].unit
     size = f"{quantity(best.value, '')} ± {quantity(_two(best.sd), unit)}"
@@ -123,14 +133,16 @@ def _reasons(tests: Misfit | None) -> str:
     return " ".join(t.text for t in tests.tests.values() if t.alarm)
 
 
-def table(found: Explanation, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def candidate_table(
+    found: Explanation, rows: Sequence[Mapping[str, Any]]
+) -> dict[str, Any]:
     """Candidates by evidence."""
     cells = [
         [
             row["parameter"],
             row["meaning"],
             "-" if row["evidence_gain"] is None else f"{row['evidence_gain']:+.1f}",
-            _value(row),
+            _magnitude_text(row),
             row["verdict"],
         ]
         for row in rows
@@ -146,7 +158,7 @@ def table(found: Explanation, rows: Sequence[Mapping[str, Any]]) -> dict[str, An
     }
 
 
-def _value(row: Mapping[str, Any]) -> str:
+def _magnitude_text(row: Mapping[str, Any]) -> str:
     if row["value"] is None:
         return "-"
     if row["sd"] is None:

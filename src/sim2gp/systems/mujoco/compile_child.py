@@ -20,7 +20,7 @@ from typing import Any
 MEMORY = 8 << 30
 
 
-def given(folder: str, i: int) -> dict[str, Any]:
+def read_model(folder: str, i: int) -> dict[str, Any]:
     """A model's kind (``suffix``), its text, and files by the names it has for them."""
     with open(os.path.join(folder, f"{i}.json"), encoding="utf-8") as file:
         found: dict[str, Any] = json.load(file)
@@ -76,12 +76,12 @@ def limit(name: str, most: int) -> None:
         return
 
 
-def seal() -> None:
+def forbid_files() -> None:
     """Open no further file, where the system has such a limit."""
     limit("RLIMIT_NOFILE", 0)
 
 
-def compiled(model: dict[str, Any], form: str) -> bytes:
+def compile_model(model: dict[str, Any], form: str) -> bytes:
     """The model, as MuJoCo keeps it or as MuJoCo writes it."""
     import mujoco
     import numpy as np
@@ -102,7 +102,7 @@ def say(kind: str, text: object) -> None:
     sys.stderr.flush()
 
 
-def main(seconds: str, folder: str, form: str, count: str) -> int:
+def compile_models(seconds: str, folder: str, form: str, count: str) -> int:
     """Compile every model; returns the exit code."""
     limit("RLIMIT_AS", MEMORY)
     limit("RLIMIT_CPU", int(seconds))
@@ -112,14 +112,14 @@ def main(seconds: str, folder: str, form: str, count: str) -> int:
     mujoco.set_mju_user_warning(lambda text: say("WARNING:", text))
     warnings.simplefilter("always")
     warnings.showwarning = lambda message, *_: say("WARNING:", message)
-    models = [given(folder, i) for i in range(int(count))]
+    models = [read_model(folder, i) for i in range(int(count))]
     outs = [os.path.join(folder, f"{i}.{form}") for i in range(int(count))]
     files = [open(out, "wb") for out in outs]  # noqa: SIM115 (closed at the end)
-    seal()
+    forbid_files()
     for i, (model, file) in enumerate(zip(models, files, strict=True)):
         say("MODEL", i)
         try:
-            file.write(compiled(model, form))
+            file.write(compile_model(model, form))
             file.close()
         except (ValueError, mujoco.FatalError) as error:
             say("REFUSED", error)
@@ -128,4 +128,4 @@ def main(seconds: str, folder: str, form: str, count: str) -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main(*sys.argv[1:]))
+    raise SystemExit(compile_models(*sys.argv[1:]))

@@ -38,7 +38,7 @@ def figure_of(model: Any, qpos: Float[np.ndarray, "T nq"]) -> Figure:
     mujoco.mj_kinematics(model, data)
     moves = [b for b in range(1, model.nbody) if model.body_weldid[b] != 0]
     bases = sorted({a for b in moves for a in _carriers(model, b)})
-    ends = {b: _end(model, data, b) for b in moves if not _children(model, b)}
+    ends = {b: _far_end(model, data, b) for b in moves if not _children(model, b)}
     tips = {b: end for b, end in ends.items() if end is not None}
     place = {b: k for k, b in enumerate(bases)}
     fixed = [data.xpos[b].copy() for b in bases]
@@ -51,7 +51,7 @@ def figure_of(model: Any, qpos: Float[np.ndarray, "T nq"]) -> Figure:
         data.qpos[:] = q
         mujoco.mj_kinematics(model, data)
         far = [_fixed_to(data, b, end) for b, end in tips.items()]
-        moving[row] = [*(_point(model, data, b) for b in moves), *far]
+        moving[row] = [*(_joint_point(model, data, b) for b in moves), *far]
     for k, b in enumerate(moves):
         parent = int(model.body_parentid[b])
         if model.body_weldid[parent] == 0:
@@ -86,13 +86,13 @@ def _carriers(model: Any, b: int) -> list[int]:
     return found
 
 
-def _joints(model: Any, b: int) -> range:
+def _joints_of_body(model: Any, b: int) -> range:
     first = int(model.body_jntadr[b])
     return range(first, first + int(model.body_jntnum[b])) if first >= 0 else range(0)
 
 
-def _point(model: Any, data: Any, b: int) -> Float[np.ndarray, "3"]:
-    hinges = [j for j in _joints(model, b) if model.jnt_type[j] == _HINGE]
+def _joint_point(model: Any, data: Any, b: int) -> Float[np.ndarray, "3"]:
+    hinges = [j for j in _joints_of_body(model, b) if model.jnt_type[j] == _HINGE]
     return np.array(data.xanchor[hinges[-1]] if hinges else data.xpos[b])
 
 
@@ -100,9 +100,9 @@ def _fixed_to(data: Any, b: int, local: np.ndarray) -> Float[np.ndarray, "3"]:
     return np.asarray(data.xpos[b] + data.xmat[b].reshape(3, 3) @ local)
 
 
-def _end(model: Any, data: Any, b: int) -> Float[np.ndarray, "3"] | None:
+def _far_end(model: Any, data: Any, b: int) -> Float[np.ndarray, "3"] | None:
     """The far end of a body's geometry, in its own frame; None where there is none."""
-    point, ends = _point(model, data, b), [data.xipos[b]]
+    point, ends = _joint_point(model, data, b), [data.xipos[b]]
     for g in range(model.ngeom):
         if model.geom_bodyid[g] != b:
             continue
@@ -124,7 +124,7 @@ def _rail(
     model: Any, b: int, points: np.ndarray, qpos: np.ndarray
 ) -> list[Float[np.ndarray, "3"]]:
     """Both ends of the line that a body on a slide moves on; empty without a slide."""
-    joints = _joints(model, b)
+    joints = _joints_of_body(model, b)
     if not len(joints) or model.jnt_type[joints[0]] != _SLIDE:
         return []
     import mujoco

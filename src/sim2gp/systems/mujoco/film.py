@@ -21,7 +21,7 @@ MOST = 125  # frames
 BYTES = 500_000  # of all of them
 SECONDS = 60
 _OFF = ("disable", "disabled", "off", "false", "0")
-_CHILD = os.path.join(os.path.dirname(__file__), "mujoco_render.py")
+_CHILD = os.path.join(os.path.dirname(__file__), "render.py")
 
 
 def backends(environment: Mapping[str, str], platform: str) -> list[str]:
@@ -34,7 +34,7 @@ def backends(environment: Mapping[str, str], platform: str) -> list[str]:
     return ["egl", "osmesa"]
 
 
-def rendered(
+def render_motion(
     model: Any,
     recorded: Float[np.ndarray, "T nq"],
     forecast: Float[np.ndarray, "T nq"],

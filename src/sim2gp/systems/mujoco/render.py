@@ -1,6 +1,6 @@
 """The child process that renders a motion with MuJoCo: run as a script, in isolation.
 
-    python -I mujoco_render.py FOLDER
+    python -I render.py FOLDER
 
 FOLDER holds ``model.mjb`` and ``motion.npz``: joint positions ``recorded`` and
 ``forecast``, ``lookat``, and ``view`` (azimuth and elevation in degrees, distance,
@@ -33,7 +33,7 @@ def camera_of(x: Any) -> Any:
     return camera
 
 
-def prepare(model: Any, view: Any) -> None:
+def prepare_view(model: Any, view: Any) -> None:
     """Field of view, size of the picture, and a clipping plane behind the machine."""
     model.vis.global_.fovy = view[3]
     model.vis.global_.offwidth, model.vis.global_.offheight = int(view[4]), int(view[5])
@@ -44,7 +44,7 @@ def prepare(model: Any, view: Any) -> None:
     light.diffuse[:] = np.maximum(light.diffuse, 0.6)
 
 
-def drawn(renderer: Any, sky: bool) -> Any:
+def render_picture(renderer: Any, sky: bool) -> Any:
     """The picture, transparent where there is nothing (without a sky that is black)."""
     colours = renderer.render()
     if sky:
@@ -56,7 +56,7 @@ def drawn(renderer: Any, sky: bool) -> Any:
     return Image.fromarray(np.concatenate([colours, solid[..., None]], axis=-1))
 
 
-def main(folder: str) -> int:
+def render_frames(folder: str) -> int:
     """Render every frame; returns the exit code."""
     import mujoco
 
@@ -66,7 +66,7 @@ def main(folder: str) -> int:
         x = {name: stored[name] for name in stored.files}
     sky = bool(np.any(model.tex_type == int(mujoco.mjtTexture.mjTEXTURE_SKYBOX)))
     view, options, pert = x["view"], mujoco.MjvOption(), mujoco.MjvPerturb()
-    prepare(model, view)
+    prepare_view(model, view)
     first, second = mujoco.MjData(model), mujoco.MjData(model)
     images, camera = [], camera_of(x)
     with mujoco.Renderer(model, int(view[5]), int(view[4])) as renderer:
@@ -81,7 +81,7 @@ def main(folder: str) -> int:
             for geom in scene.geoms[count : scene.ngeom]:
                 geom.rgba[:], geom.matid = FORECAST, -1
                 geom.size[:] *= LARGER
-            images.append(drawn(renderer, sky))
+            images.append(render_picture(renderer, sky))
     for quality in QUALITIES:
         files = []
         for image in images:
@@ -97,4 +97,4 @@ def main(folder: str) -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main(*sys.argv[1:]))
+    raise SystemExit(render_frames(*sys.argv[1:]))
