@@ -2,9 +2,7 @@
 
 import contextlib
 import json
-import struct
 import time
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -67,46 +65,6 @@ def test_no_bytes_break_a_reader(name: str, rounds: int, tmp_path: Path) -> None
             lines.append(str(error))
     assert len(lines) >= 3
     assert not any("\n" in line for line in lines)
-
-
-def npz_of(header: bytes) -> Callable[[Path], None]:
-    """An archive of one array with a header of these bytes."""
-
-    def write(path: Path) -> None:
-        start = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header
-        with zipfile.ZipFile(path, "w") as file:
-            file.writestr("q.npy", start + bytes(24))
-
-    return write
-
-
-#: What evaluates an array's header, or counts on another form, stumbles here.
-HEADERS = (
-    b"{'descr': '<f8', 'fortran_order': False, 'shape': (3,",
-    b"{'descr': '<f8', 'fortran_order': False, 'shape': (3,)",
-    b"{'descr': '<f8', 'fortran_order': False, 'shape': (3,), }}",
-    b"{'descr': '<f8', 'fortran_order': 0, 'shape': (3,), }",
-    b"{'descr': '<f8', 'fortran_order': False, 'shape': (-3,), }",
-    b"{'descr': '<f8', 'fortran_order': False, 'shape': (3.0,), }",
-    b"{'descr': '<f8', 'fortran_order': False, 'shape': (3 * 1,), }",
-    b"{'descr': '<f8', 'fortran_order': False, 'shape': 3, }",
-    b"{'descr': '<f8', 'shape': (3,), 'shape': (3,), }",
-    b"{'descr': '<z8', 'fortran_order': False, 'shape': (3,), }",
-    b"{'descr': __import__('os'), 'fortran_order': False, 'shape': (3,), }",
-    b"{'descr': '<f8', 'fortran_order': False, 'shape': (" + b"1," * 40 + b"), }",
-    b"\xff\xfe'",
-    b"''" + b"'",
-    b"(" * 900,
-    b"",
-)
-
-
-@pytest.mark.parametrize("header", HEADERS)
-def test_a_malformed_header_of_an_array(header: bytes, tmp_path: Path) -> None:
-    npz_of(header)(tmp_path / "a.npz")
-    with pytest.raises(InputError, match=r"^E12[56] .*a\.npz:array q") as caught:
-        columns_of(tmp_path / "a.npz")
-    assert "\n" not in str(caught.value)
 
 
 def test_a_field_beyond_the_parsers_limit(tmp_path: Path) -> None:

@@ -4,6 +4,8 @@ import contextlib
 import json
 import shutil
 import sqlite3
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -331,3 +333,15 @@ def test_lance_and_partial_downloads_are_told(tmp_path: Path) -> None:
     place.write_text(json.dumps(info | {"storage_format": "lance"}))
     with pytest.raises(InputError, match=r"E136 .*info\.json.*lance.*Fix:"):
         read(tmp_path / "ds", LEROBOT)
+
+
+def test_reading_imports_what_it_needs_alone() -> None:
+    """sim2gp starts without any of the optional libraries."""
+    code = (
+        "import sys, sim2gp.data.logs; names = {n.split('.')[0] for n in sys.modules};"
+        "print(sorted(names & {'h5py', 'pyarrow', 'rosbags', 'mcap', 'minari'}))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "[]"
