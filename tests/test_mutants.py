@@ -9,8 +9,9 @@ import pytest
 import mutants
 from test_all_bad_inputs import CASES
 
-#: Cases of a table, which a mutant may name as well.
-TITLES = {"test_all_bad_inputs.py": [bad.title for bad in CASES]}
+#: Cases of a table, which a mutant may name as well, and keys of errors.
+KEYS = {given.key for bad in CASES for given in bad.inputs}
+TITLES = {"test_all_bad_inputs.py": [*(bad.title for bad in CASES), *KEYS]}
 
 
 def test_each_mutant_applies_to_the_code_as_it_is(tmp_path: Path) -> None:
