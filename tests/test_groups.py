@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bad_project_files import BARE, LOADED, grouped
 from sim2gp.commands.apply import apply
 from sim2gp.commands.design import setting as setting_of
 from sim2gp.commands.evaluate import evaluate
@@ -25,25 +26,10 @@ QUIET = Progress(quiet=True)
 
 # What project files say.
 
-FREE = ("motor_constant", "arm_damping")
-COLUMNS = '{theta = "theta", alpha = "alpha", voltage = "u"}'
-BARE = (
-    '[[logs]]\nname = "bare"\nfiles = ["bare.csv"]\nfixed = {"alpha.payload" = 0.0}\n'
-)
-LOADED = '[[logs]]\nname = "loaded"\nfiles = ["loaded.csv"]\nfree = ["alpha.payload"]\n'
-
-
-def text(*groups: str, more: str = "") -> str:
-    nominal = Furuta().parameters.nominal()
-    fixed = "\n".join(f"{n} = {v}" for n, v in nominal.items() if n not in FREE)
-    parts = [f"{group}columns = {COLUMNS}\n" for group in groups]
-    prior = "[effects.alpha.payload]\nlow = 0.0\nhigh = 0.02\n"
-    return "\n".join(['system = "furuta"\n[parameters]', fixed, prior, *parts, more])
-
 
 def project_in(folder: Path, *groups: str, more: str = "") -> Path:
     path = folder / "machine.toml"
-    path.write_text(text(*groups, more=more))
+    path.write_text(grouped(*groups, more=more))
     return path
 
 
@@ -78,32 +64,6 @@ def test_groups_become_configurations(tmp_path: Path) -> None:
     unnamed = LOADED.replace('name = "loaded"\n', "")
     project = load_project(project_in(tmp_path, BARE, unnamed))
     assert project.system.parameters.names[-1] == "alpha.payload @ 2"
-
-
-@pytest.mark.parametrize(
-    ("groups", "more", "words"),
-    [
-        ((BARE.replace("payload", "paylaod"),), "", "E145 unknown parameter"),
-        ((LOADED.replace("payload", "paylaod"),), "", "did you mean alpha.payload"),
-        ((LOADED + "fixed = {'alpha.payload' = 0.1}\n",), "", "stated twice"),
-        ((LOADED.replace("alpha.payload", "gravity"),), "", "E145"),
-        ((LOADED.replace("alpha.payload", "arm_mass"),), "", "give arm_mass a prior"),
-        ((BARE, LOADED.replace("loaded", "bare")), "", "stated in two ways"),
-        ((LOADED.replace('"loaded"', '"a b"'),), "", "a word without spaces and @"),
-        ((BARE,), '[parameters]\n"alpha.payload @ bare" = 1.0', "E145 duplicate"),
-        ((BARE,), '[parameters."alpha.payload @ bare"]\nvalue = 1.0', "E145 unknown"),
-        ((LOADED,), '[parameters."alpha.payload @ loaded"]\nvalue = 1.0', "fixed = "),
-        ((), '[parameters."arm_damping @ loaded"]\nvalue = 1.0', "E145 unknown"),
-    ],
-)
-def test_what_makes_no_sense_is_one_line(
-    tmp_path: Path, groups: tuple[str, ...], more: str, words: str
-) -> None:
-    with pytest.raises(InputError) as caught:
-        load_project(project_in(tmp_path, *groups, more=more))
-    assert words in str(caught.value)
-    assert "machine.toml:line" in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 def test_a_table_says_what_each_configuration_has(tmp_path: Path) -> None:

@@ -249,20 +249,3 @@ def test_effects_are_constants_of_the_machine(folder: Path) -> None:
     assert system.effects[0].width == 0.02
     assert system.parameters["theta.coulomb"].map == "log"
     assert dict(system.parameters.fixed)["alpha.drag"] == 0.1
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("[effects.theta]\ncoulom = 1.0", "did you mean coulomb"),
-        ("[effects.thetta]\ncoulomb = 1.0", "did you mean theta"),
-        ("[effects.theta]\ndrag = {value = 1.0, width = 0.1}", "unknown option"),
-        ("[effects.theta.coulomb]\nmean = 1.0", "state mean and sd"),
-        ("[effects.theta.coulomb]\nwidth = -1.0\nvalue = 1.0", "width"),
-    ],
-)
-def test_a_wrong_effect_is_one_line(folder: Path, text: str, words: str) -> None:
-    with pytest.raises(InputError) as caught:
-        load_project(project_in(folder, f"\n{text}\n"))
-    assert words in str(caught.value)
-    assert "machine.toml:line" in str(caught.value)

@@ -1,7 +1,6 @@
 """A model's file as the machine of a project: patterns, ties, priors, faults."""
 
 import json
-import sys
 from pathlib import Path
 
 import jax
@@ -100,36 +99,10 @@ def test_an_empty_table_opens_all_of_an_inertia(tmp_path: Path) -> None:
     assert (alpha.map, alpha.mean, alpha.sd) == ("identity", 0.0, 0.2)
 
 
-def test_without_mujoco_the_extra_is_named(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(InputError, match=r"E135.*pip install 'sim2gp\[mujoco\]'"):
-        load_project(project(tmp_path, ""))
-
-
 def test_without_parameters_all_usual_ones_are_open(tmp_path: Path) -> None:
     names = load_project(project(tmp_path, "")).system.parameters.names
     assert {n.split("/")[-1] for n in names} == {"damping", "mass"}
     assert len(names) == 4
-
-
-@pytest.mark.parametrize(
-    ("text", "fault"),
-    [
-        ('[parameters."joint/wrist/damping"]\nmean = 1.0\nsd = 0.1', "E170.*line 3"),
-        ('[parameters."joint/*/frictionloss"]\ntie = true', "E160.*line 3"),
-        ('[parameters."joint/*/stiffness"]\nrelative_sd = 0.1', "E160.*relative_sd"),
-        ("[options]\ngravity = 9.8", "E160 unknown option.*line 4.*root"),
-        (
-            "[effects.shoulder.payload]\nmean = 0.0\nsd = 1.0",
-            "E145 no payload on this machine.*encoder",
-        ),
-        ("[effects.wrist.encoder]\nsd = 0.1", "E103 unknown channel.*line 3"),
-        ("[limits]\nwrist = [0.0, 1.0]", "E160 unknown channel.*line 4"),
-    ],
-)
-def test_faults_name_their_line(tmp_path: Path, text: str, fault: str) -> None:
-    with pytest.raises(InputError, match=fault):
-        load_project(project(tmp_path, "\n" + text))
 
 
 def test_an_encoder_of_a_model_may_be_off(tmp_path: Path) -> None:
@@ -169,20 +142,6 @@ def test_an_sd_alone_is_about_the_machines_own_number(tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError, match="E160 incomplete prior: mean and sd"):
             load_project(project(tmp_path, text))
-
-
-def test_a_tie_is_for_files(tmp_path: Path) -> None:
-    path = tmp_path / "p.toml"
-    path.write_text('system = "furuta"\n[parameters.arm_mass]\ntie = true\n' + LOGS)
-    with pytest.raises(InputError, match=r"E160 unknown option.*line 2.*tie"):
-        load_project(path)
-
-
-def test_a_model_that_is_not_there_is_said_with_its_line(tmp_path: Path) -> None:
-    path = project(tmp_path, "")
-    (tmp_path / "arm.xml").unlink()
-    with pytest.raises(InputError, match=r"E130 cannot read .*arm\.xml"):
-        load_project(path)
 
 
 TRUTH = {

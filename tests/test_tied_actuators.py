@@ -114,30 +114,3 @@ def test_a_table_of_its_own_is_the_exception_to_a_pattern(tmp_path: Path) -> Non
     assert "torque1.delay" in table.names
     fixed = dict(table.fixed)
     assert (fixed["torque2.delay"], fixed["torque2.gain"]) == (0.0, 2.0)
-
-
-@pytest.mark.parametrize(
-    ("text", "fault"),
-    [
-        ('[actuators."motor*"]\ngain = 2.0', r"E160 unknown input.*line 2.*torque1"),
-        (
-            '[actuators."torque*"]\ngain = 2.0\n[actuators."*1"]\ngain = 1.0',
-            r"E145 an input named twice.*line 4.*torque1",
-        ),
-        (
-            '[actuators."*2"]\ngain = 2.0\n[actuators.torque2]\ngain = 1.0',
-            r"E145 pattern without inputs of its own.*line 2",
-        ),
-        (
-            '[actuators."*1"]\ngain = 2.0\ntie = true',
-            r"E160 a tie of one input.*line 4.*torque1",
-        ),
-        (
-            '[actuators."torque*"]\ntie = true\ndelay = -0.1',
-            r"E141 negative delay.*line 4",
-        ),
-    ],
-)
-def test_faults_name_their_line(tmp_path: Path, text: str, fault: str) -> None:
-    with pytest.raises(InputError, match=fault):
-        project(tmp_path, text)

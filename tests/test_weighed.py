@@ -11,7 +11,6 @@ import scipy.optimize
 from descents import minimise
 from linear_system import linear, transitions, windows_of
 from sim2gp.data.one_step import OneStepLikelihood
-from sim2gp.errors import InputError
 from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.missing_physics.score import _LinearPrior
 from sim2gp.inference.arrowhead import Noise
@@ -193,26 +192,3 @@ def test_a_project_file_says_what_was_weighed(tmp_path: Path) -> None:
     path.write_text(ARM.format(value=0.2, sd=0.005) + "weights = [1.0, -0.5]\n")
     (x,) = load_project(path).system.parameters.measurements
     assert x.weights == (1.0, -0.5)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "words"),
-    [
-        ("1.24", "-1.0", "E142 a measured sum that the bounds rule out"),
-        ("0.005", "0.0", "E144"),
-        ('"m2"', '"mm2"', "did you mean m2"),
-        ('"m2"', '"m1"', "E145 a constant twice"),
-        ("sd =", "weights = [1.0]\nsd =", "E160 weights of a sum"),
-        ("sd =", "weight = 1.0\nsd =", "did you mean weights"),
-        ("[[weighed]]", "[parameters]\nm1 = 1.0\nm2 = 0.24\n[[weighed]]", "unknowns"),
-    ],
-)
-def test_a_wrong_sum_is_one_line(
-    tmp_path: Path, old: str, new: str, words: str
-) -> None:
-    path = tmp_path / "arm.toml"
-    path.write_text(ARM.format(value=1.24, sd=0.005).replace(old, new))
-    with pytest.raises(InputError) as caught:
-        load_project(path)
-    assert words in str(caught.value)
-    assert "arm.toml:line" in str(caught.value)
