@@ -1,8 +1,12 @@
-"""Bad inputs 110 to 113: project files that ask for what the machine cannot have."""
+"""Bad inputs 110 to 114: project files that ask for what the machine cannot have."""
 
-from bad_inputs import Case, Input, case
+import sys
+from pathlib import Path
+
+from bad_inputs import Case, Input, Patch, case
 from bad_project_files import file
-from key_changes import GROUP, REFUSED, column_with
+from key_changes import GROUP, REFUSED, column_with, write_files
+from sim2gp.project import load_project
 
 
 def cart(key: str, text: str, *said: str) -> Input:
@@ -29,6 +33,18 @@ def weighed(key: str, old: str, new: str, *said: str) -> Input:
     text = f"{SUM}value = 1.24\nsd = 0.005\n"
     assert old in text
     return file(key, text.replace(old, new), *said)
+
+
+def binary(folder: Path, patch: Patch) -> None:
+    (folder / "project.toml").write_bytes(b"system = \xff")
+    load_project(folder / "project.toml")
+
+
+def without_mujoco(folder: Path, patch: Patch) -> None:
+    patch.setitem(sys.modules, "mujoco", None)
+    write_files(folder)
+    (folder / "project.toml").write_text('system = "arm.xml"\n')
+    load_project(folder / "project.toml")
 
 
 MACHINES: tuple[Case, ...] = (
@@ -193,5 +209,13 @@ MACHINES: tuple[Case, ...] = (
         ),
         cart("unknown_name", "[limits]\ny = [0.0, 1.0]\n", "line 3"),
         cart("unknown_name", "[rates]\nx = 1.0\n", "line 3", "voltage"),
+    ),
+    case(
+        114,
+        "project: files",
+        cart("unknown_name", "[parameters.cart_mass]\ntie = true\n", "line 2", "tie"),
+        file("unreadable_file", 'system = "gone.xml"\n', "gone.xml"),
+        Input("not_utf8_text", ("byte 9",), binary),
+        Input("missing_extra", ("pip install 'sim2gp[mujoco]'",), without_mujoco),
     ),
 )

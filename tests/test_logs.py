@@ -14,7 +14,6 @@ from sim2gp.data.logs import (
     Log,
     Note,
     note_lines,
-    period_matches,
     read_log,
     shared_rows,
 )
@@ -271,13 +270,6 @@ def test_logs_that_begin_at_rest_share_no_rows(tmp_path: Path) -> None:
     assert shared_rows([train], [test]) == []
     (note,) = shared_rows([train], [train])
     assert note.text.startswith("350 rows")
-
-
-def test_period_of_one_step_likelihoods(tmp_path: Path) -> None:
-    (log,) = read(write(tmp_path / "a.csv", swing()))
-    period_matches(log, 0.01)
-    with pytest.raises(InputError, match=r"E113 .*0\.01 s.*0\.02 s"):
-        period_matches(log, 0.02)
 
 
 def test_real_arm(shared_data: Path) -> None:

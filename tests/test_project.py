@@ -138,13 +138,6 @@ def test_every_system_loads_bare(system: str, tmp_path: Path) -> None:
         project.load_logs()
 
 
-def test_binary_project(tmp_path: Path) -> None:
-    path = tmp_path / "a.toml"
-    path.write_bytes(b"system = \xff")
-    with pytest.raises(InputError, match=r"E120 .*byte 9"):
-        load_project(path)
-
-
 TRICKY = '''# [not.a.table]
 title = """
 [also.not]

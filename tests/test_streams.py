@@ -1,7 +1,5 @@
 """Streams with clocks of their own: what may stand between stamps, what may not."""
 
-import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import recordings as rec
-from recordings import Channel
+from recordings import Channel, numbers
+from recordings import write_streams as write
 from sim2gp.data.logs import Column, Log, Resample, read_log
 from sim2gp.data.logs.resample import Track, joined
 from sim2gp.data.logs.table import Rows
@@ -20,28 +19,6 @@ from sim2gp.errors import InputError
 STATES = (Channel("q", "rad", angle=True), Channel("x", "m"))
 ACTIONS = (Channel("u", "V"),)
 COLUMNS = {"q": Column("/arm/q"), "u": Column("/cmd/u")}
-Messages = dict[str, tuple[np.ndarray, Sequence[dict[str, Any]]]]
-
-
-def write(path: Path, streams: Messages, start: int = rec.START) -> Path:
-    """An MCAP file of JSON: topic -> stamps in s, contents."""
-    from mcap.writer import Writer
-
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        schema = writer.register_schema("any", "jsonschema", b"{}")
-        for topic, (times, contents) in streams.items():
-            channel = writer.register_channel(topic, "json", schema)
-            for t, content in zip(times, contents, strict=True):
-                ns = start + round(1e9 * float(t))
-                writer.add_message(channel, ns, json.dumps(content).encode(), ns)
-        writer.finish()
-    return path
-
-
-def numbers(name: str, values: np.ndarray) -> list[dict[str, Any]]:
-    return [{name: float(v)} for v in values]
 
 
 def read(path: Path, columns: Any = None, **options: Any) -> tuple[Log, ...]:
@@ -347,13 +324,3 @@ def test_the_order_of_joints_and_bare_numbers(tmp_path: Path) -> None:
     (log,) = read(path, columns | {"u": Column("/cmd[0]")})
     np.testing.assert_allclose(log.channels["q"], values[0], rtol=1e-15)
     np.testing.assert_allclose(log.channels["x"], values[1], rtol=1e-15)
-
-
-def test_streams_that_never_meet(tmp_path: Path) -> None:
-    q = numbers("q", np.sin(ARM))
-    cmd = (CMD + 100.0, numbers("u", np.cos(CMD)))
-    path = write(tmp_path / "a.mcap", {"/arm": (ARM, q), "/cmd": cmd})
-    with pytest.raises(InputError, match=r"E116 streams that .*/cmd 99\.996 "):
-        read(path)
-    with pytest.raises(InputError, match=r"E116 streams that do not overlap"):
-        read(path, resample=Resample(period=0.01))
