@@ -9,8 +9,10 @@ from bad_project_files import PROJECT_FILES
 from bad_settings import SETTINGS
 from bad_streams import MESSAGES
 from bad_sysid import SYSID
+from bad_systems import SYSTEMS
 
 CALLS: tuple[Case, ...] = (
     *(*SETTINGS, *FUNCTIONS, *MODELS, *SYSID),
     *(*FORMATS, *PROJECT_FILES, *MACHINES, *MESSAGES),
+    *SYSTEMS,
 )

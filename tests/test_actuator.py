@@ -9,7 +9,6 @@ import pytest
 
 import machines
 from sim2gp import systems as sy
-from sim2gp.errors import InputError
 
 DT = 0.02
 
@@ -187,24 +186,3 @@ def test_inputs_with_a_delay_and_with_a_lag():
     means = system.mean_inputs(system.nominal(), held, DT, 2)
     lag = sy.lagged_means(held[:, 1], DT, jnp.asarray(0.004), 2)
     np.testing.assert_allclose(means, jnp.stack([held[[1, 1], 0], lag], 1), rtol=1e-12)
-
-
-def test_mistakes_are_named():
-    bare, delay = sy.Furuta(), sy.Delay("voltage", 0.02)
-    without_history = sy.free_parts(bare, [delay])
-    with pytest.raises(InputError, match=r"E113.*0\.02 s"):
-        without_history.step(without_history.nominal(), START, jnp.ones(1), DT)
-    short = sy.free_parts(bare, [delay], period=DT)
-    with pytest.raises(InputError, match="E113"):
-        short.step(short.nominal(), jnp.append(START, 0.0), jnp.ones(1), 0.01)
-    with pytest.raises(InputError, match=r"E145.*voltage\.delay"):
-        sy.Machine(bare, actuators=[delay], parameters={"voltge.delay": 0.01})
-    table = dataclasses.replace(short.parameters, fixed=(("voltge.gain", 1.0),))
-    with pytest.raises(InputError, match=r"E145.*voltage\.delay"):
-        sy.Machine(bare, actuators=[delay], parameters=table)
-    with pytest.raises(InputError, match="E141"):
-        sy.Machine(bare, actuators=[delay], parameters={"voltage.delay": -0.01})
-    with pytest.raises(InputError, match=r"E145 two parts of one name.*voltage\.delay"):
-        sy.Machine(bare, actuators=[delay, delay])
-    with pytest.raises(InputError, match=r"E103.*did you mean voltage"):
-        sy.Machine(bare, actuators=[sy.Gain("voltge")])

@@ -8,7 +8,6 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from linear_system import linear, transitions
-from sim2gp.errors import InputError
 from sim2gp.models import Auto, Residual, Sim2GP
 from sim2gp.models.auto import choose, log_scores
 
@@ -154,8 +153,3 @@ def test_choice(gaps, expected):
     assert int(index) == expected
     if np.all(np.isfinite(gaps)):
         np.testing.assert_allclose(means, each.mean(axis=1), rtol=1e-12)
-
-
-def test_one_model_is_no_choice():
-    with pytest.raises(InputError, match=r"^E148 models in Auto: got 1"):
-        Auto([Sim2GP(linear(P, D), dt=1.0)])

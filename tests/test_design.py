@@ -24,7 +24,6 @@ from design_cases import (
 from sim2gp.data.logs import Log
 from sim2gp.data.split_log import cut
 from sim2gp.data.windows_likelihood import WindowsLikelihood, information_at
-from sim2gp.errors import InputError
 from sim2gp.experiment_design import by_gradients
 from sim2gp.experiment_design.limits import excess, kept
 from sim2gp.inference.arrowhead import Noise
@@ -199,21 +198,6 @@ def test_rates_are_followed_by_the_nearest_command() -> None:
     box = limits(pendulum(), {}, {"voltage": 100.0})
     U = kept(box, jnp.full((4, 1), 2.5), PERIOD)
     np.testing.assert_allclose(U[:, 0], [1.0, 2.0, 2.5, 2.5])
-
-
-@pytest.mark.parametrize(
-    ("stated", "rates", "start", "words"),
-    [
-        ({"voltage": (1.0, 2.0)}, {}, (0, 0, 0, 0), "E150 limits of voltage"),
-        ({}, {"voltage": 0.0}, (0, 0, 0, 0), "E150 rate of voltage"),
-        ({"alpha": (-1.0, 1.0)}, {}, (0, 2.0, 0, 0), "E150 limits of alpha"),
-        ({"voltag": (-1.0, 1.0)}, {}, (0, 0, 0, 0), "E103 .*did you mean voltage"),
-        ({}, {"theta": 1.0}, (0, 0, 0, 0), "E103 .*expected one of voltage"),
-    ],
-)
-def test_limits_that_admit_no_motion_are_said(stated, rates, start, words) -> None:
-    with pytest.raises(InputError, match=words):
-        limits(pendulum(), stated, rates, np.asarray(start, float))
 
 
 def test_stated_limits_narrow_those_of_the_channels() -> None:

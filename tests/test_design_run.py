@@ -101,38 +101,6 @@ def test_what_is_asked_about(tmp_path: Path) -> None:
     assert isinstance(plain, Everything)
 
 
-BAD = {
-    "--about arm_dampin": ("E145", "did you mean arm_damping"),
-    "--seconds 0.005": ("E151", "at least two periods of 0.01 s"),
-    "--limit voltage=1:2": ("E150", "limits of voltage admit no motion"),
-    "--limit theta=2:1": ("E141", "LOW below HIGH"),
-    "--limit theta": ("E160", "NAME=VALUE"),
-    "--limit theta=1": ("E160", "LOW:HIGH"),
-    "--limit theta=a:b": ("E160", "finite numbers"),
-    "--limit thata=-1:1": ("E103", "did you mean theta"),
-    "--rate theta=1": ("E103", "expected one of voltage"),
-    "--rate voltage=0": ("E150", "rate of voltage"),
-    "--start alpa=1": ("E103", "expected one of theta"),
-    "--start alpha=4 --limit alpha=-1:1": ("E150", "limits of alpha"),
-    "--predict 3": ("E151", "prediction longer than the experiment"),
-    "--period nan": ("E148", "a positive number"),
-    "--kind chirp": ("E160", "one of free, multisine"),
-}
-
-
-@pytest.mark.parametrize("line", BAD)
-def test_bad_input_is_one_line(line: str, tmp_path: Path, capsys) -> None:
-    project, out = project_in(tmp_path), tmp_path / "next"
-    words = ["design", str(project), "--out", str(out), "--seconds", "1"]
-    assert main([*words, *line.split()]) == 2
-    said = capsys.readouterr()
-    code, text = BAD[line]
-    assert said.err.startswith(code + " ")
-    assert text in said.err
-    assert said.err.count("\n") == 1
-    assert not out.exists()
-
-
 def test_a_run_that_is_none(tmp_path: Path, capsys) -> None:
     assert main(["design", str(tmp_path / "gone")]) == 2
     assert capsys.readouterr().err.startswith("E130")

@@ -9,7 +9,6 @@ import lagrangians
 import machines
 from machines import against
 from sim2gp import systems as sy
-from sim2gp.errors import InputError
 from sim2gp.systems import STRENGTHS
 from test_systems import cartpole_forces, furuta_forces
 
@@ -164,16 +163,3 @@ def test_units():
     assert sy.Drag("x", 0.0).unit(cart) == "N s^2/m^2"
     assert sy.Drag("theta", 0.0).unit(furuta) == "N m s^2/rad^2"
     assert sy.DeadZone("voltage", 0.0).unit(furuta) == "V"
-
-
-def test_mistakes_are_named():
-    with pytest.raises(InputError, match=r"E103.*theta"):
-        sy.Machine(sy.Furuta(), [sy.Spring("thta", 1.0)])
-    with pytest.raises(InputError, match="E145"):
-        sy.Machine(sy.Furuta(), [sy.Spring("theta", 1.0), sy.Spring("theta", 2.0)])
-    with pytest.raises(InputError, match=r"E145.*spring"):
-        sy.effect("furuta", "sprng", "mild")
-    with pytest.raises(InputError, match=r"E145.*strong"):
-        sy.effect("furuta", "spring", "stron")
-    with pytest.raises(InputError, match=r"E145.*furuta"):
-        sy.catalogue("furutta")

@@ -113,41 +113,6 @@ def test_no_action_is_made_of_nothing(folder: Path) -> None:
         wide(np.asarray([np.inf]))
 
 
-def test_what_is_no_policy_is_refused(folder: Path, tmp_path: Path) -> None:
-    with new_run(tmp_path / "other", "another") as writer:
-        writer.write_summary({})
-    with pytest.raises(InputError, match=r"E133.*another run"):
-        load_policy(tmp_path / "other")
-    found = load_run(folder)
-    about = found.summary["policy"]
-
-    def written(name: str, about: dict, arrays: dict) -> Path:
-        with new_run(tmp_path / name, "export policy") as writer:
-            writer.write_arrays("arrays.npz", arrays)
-            writer.write_summary({"policy": about})
-        return tmp_path / name
-
-    arrays = found.arrays
-    newer = written("newer", about | {"format": 2}, arrays)
-    with pytest.raises(InputError, match="E185"):
-        load_policy(newer)
-    few = {k: v for k, v in arrays.items() if k != "biases/1"}
-    wide = arrays | {"scale": arrays["scale"].astype(float)}
-    for place, got in (
-        (written("few", about, few), "biases/1"),
-        (written("wide", about, wide), "float64"),
-    ):
-        with pytest.raises(InputError, match=f"E133.*{got}"):
-            load_policy(place)
-    content = (folder / "arrays.npz").read_bytes()
-    try:
-        (folder / "arrays.npz").write_bytes(content[:-9] + b"x" + content[-8:])
-        with pytest.raises(InputError, match="E183"):
-            load_policy(folder)
-    finally:
-        (folder / "arrays.npz").write_bytes(content)
-
-
 @pytest.fixture(scope="module")
 def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A good policy of two layers: four states, of which one turns, one action."""

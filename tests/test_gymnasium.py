@@ -1,6 +1,5 @@
 """Gymnasium environments: the task to the last bit, one program, Gymnasium's checks."""
 
-import sys
 from collections.abc import Iterator
 from typing import Any
 
@@ -13,12 +12,12 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from jaxtyping import Array, Bool
 
-from sim2gp.errors import InputError, NotFinite
+from sim2gp.errors import InputError
 from sim2gp.planning import AbstractPlanner, World
 from sim2gp.planning.episode import Purpose, key_for, oracle_world, run_episode
 from sim2gp.planning.mpc import from_unit
 from sim2gp.planning.tasks import MACHINES, Task, draw_truth, furuta_swingup
-from sim2gp.robot.gymnasium import NAMES, _kind, after, environment, register
+from sim2gp.robot.gymnasium import NAMES, after, register
 from sim2gp.systems import Delay, Furuta
 from sim2gp.types import Key, State
 
@@ -227,22 +226,6 @@ def test_an_episode_ends_where_the_tasks_states_end() -> None:
     assert seen in env.observation_space
 
 
-@pytest.mark.parametrize(
-    ("options", "code", "said"),
-    [
-        ({"truth": "pror"}, "E145", "unknown truth"),
-        ({"params": {"arm_mas": 0.1}}, "E145", "did you mean arm_mass"),
-        ({"params": {"arm_mass": float("nan")}}, "E101", "arm_mass"),
-        ({"effects": ["coulom mild"]}, "E145", "did you mean coulomb"),
-        ({"effects": ["coulomb"]}, "E145", "mild, middle, strong"),
-    ],
-)
-def test_a_mistake_is_one_line(options: Any, code: str, said: str) -> None:
-    with pytest.raises(InputError, match=said) as caught:
-        gymnasium.make("sim2gp/Furuta-v0", **options)
-    assert caught.value.code == code
-
-
 def test_wrong_calls_are_refused() -> None:
     env = gymnasium.make("sim2gp/Furuta-v0").unwrapped
     with pytest.raises(gymnasium.error.ResetNeeded):
@@ -256,17 +239,3 @@ def test_wrong_calls_are_refused() -> None:
         env.step(np.zeros(2, np.float32))
     with pytest.raises(InputError, match="E101"):
         env.step(np.full(1, np.nan, np.float32))
-
-
-def test_a_machine_that_cannot_be_followed_is_an_error() -> None:
-    env = gymnasium.make("sim2gp/Furuta-v0", params={"arm_damping": 1e30})
-    env.reset(seed=0)
-    with pytest.raises(NotFinite, match="E203"):
-        flown(env, np.ones((5, 1), np.float32))
-
-
-def test_without_gymnasium_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    _kind.cache_clear()
-    monkeypatch.setitem(sys.modules, "gymnasium", None)
-    with pytest.raises(InputError, match=r"E135.*sim2gp\[gym\]"):
-        environment("furuta")

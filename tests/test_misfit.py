@@ -223,7 +223,7 @@ def test_an_estimated_noise_says_nothing_by_its_size() -> None:
 def test_what_is_not_a_number_never_passes(name: str, value: float) -> None:
     data = linear(7)
     data[name][5] = value
-    with pytest.raises(NotFinite, match="E203"):
+    with pytest.raises(NotFinite):
         misfit(**data)
 
 

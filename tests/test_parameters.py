@@ -165,31 +165,6 @@ def test_priors_from_physical_moments(p, mean, sd, bounds):
         assert matched.map == "log"
 
 
-@pytest.mark.parametrize(
-    ("code", "make"),
-    [
-        ("E141", lambda: Parameter("k", "", "", "cube")),
-        ("E141", lambda: Parameter("k", "", "", "bounded", 2.0, 1.0)),
-        ("E141", lambda: Parameter("k", "", "", "bounded", 1.0, 1.0)),
-        ("E141", lambda: Parameter("k", "", "", "bounded", math.nan, 1.0)),
-        ("E141", lambda: Parameter("k", "", "", "bounded", 0.0, math.inf)),
-        ("E141", lambda: Parameter("k", "", "", "log_bounded", 0.0, 1.0)),
-        ("E144", lambda: Parameter("k", "", "", "log", 0.0, sd=0.0)),
-        ("E144", lambda: Parameter("k", "", "", "log", 0.0, mean=math.nan)),
-        ("E144", lambda: prior_from_moments(BOX, 1.0, 0.0)),
-        ("E144", lambda: prior_from_moments(BOX, math.inf, 1.0)),
-        ("E142", lambda: prior_from_moments(LOG, -1.0, 0.1)),
-        ("E142", lambda: prior_from_moments(BOX, 3.0, 0.1, 0.5, 2.0)),
-        ("E142", lambda: prior_from_moments(BOX, 1.25, 0.8, 0.5, 2.0)),
-        ("E145", lambda: Parameters((BOX,)).replace(kk=1.0)),
-    ],
-)
-def test_bad_priors(code, make):
-    with pytest.raises(InputError) as caught:
-        make()
-    assert caught.value.code == code
-
-
 class Record(eqx.Module):
     stiffness: jax.Array = bounded(1.0, 3.0, "N/m", "spring", nominal=1.5)
     damping: jax.Array = log_bounded(1e-4, 1e-2, "N s/m", "damper")

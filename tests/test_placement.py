@@ -200,25 +200,6 @@ def test_lagged_machine_carries_what_still_matters():
     assert abs(later[2] - got[2]) > 1e-3
 
 
-def test_mistakes_of_lag_and_payload_are_named():
-    def lagged(*parts):
-        return sy.Machine(sy.Furuta(), actuators=parts, period=0.02)
-
-    with pytest.raises(InputError, match=r"E103.*voltage"):
-        lagged(sy.Lag("volage", 0.01))
-    with pytest.raises(InputError, match="E141"):
-        lagged(sy.Lag("voltage", 0.0))
-    with pytest.raises(InputError, match=r"E145.*delayed"):
-        lagged(sy.Delay("voltage", 0.02), sy.Lag("voltage", 0.01))
-    system = lagged(sy.Lag("voltage", 0.01))
-    with pytest.raises(InputError, match=r"E145.*windows.*use a delay"):
-        system.delays(system.nominal())
-    with pytest.raises(InputError, match=r"E145.*TwoLink"):
-        sy.Machine(sy.TwoLink(), [sy.Payload("q2", 0.1)])
-    with pytest.raises(InputError, match=r"E145.*CartPole"):
-        sy.Machine(sy.CartPole(), [sy.BaseTilt(where="theta")])
-
-
 def test_library_offers_what_the_machine_has_not():
     furuta = sy.Furuta()
     names = [c.name for c in sy.candidates(furuta)]

@@ -320,7 +320,7 @@ def test_no_excitation_is_said(case):
 
 def test_data_that_are_not_finite_are_said(case):
     broken = transitions(case.J, np.where(np.arange(N)[:, None] == 3, np.nan, case.y))
-    with pytest.raises(NotFinite, match="E203"):
+    with pytest.raises(NotFinite):
         case.model.fit(case.model.init(KEY), broken, key=KEY)
 
 

@@ -12,7 +12,6 @@ from sim2gp.data.one_step import OneStepLikelihood
 from sim2gp.data.transitions import Transitions
 from sim2gp.data.windows import Windows
 from sim2gp.data.windows_likelihood import WindowsLikelihood
-from sim2gp.errors import InputError
 from sim2gp.inference.arrowhead import Noise
 from sim2gp.inference.estimate import Estimate, estimate
 from sim2gp.inference.likelihood import AbstractLikelihood
@@ -131,11 +130,6 @@ def test_each_likelihood_has_its_own_noise() -> None:
     floor = np.asarray(windows.floor)
     variance = (2.0 * floor**2 + np.sum(left**2 + spread, axis=0)) / 5.0
     np.testing.assert_allclose(sd**2, variance, rtol=1e-3)
-
-
-def test_nothing_to_stack_is_refused() -> None:
-    with pytest.raises(InputError, match=r"E148.*likelihoods"):
-        Stacked([])
 
 
 def arm_data() -> tuple[AbstractSystem, OneStepLikelihood, WindowsLikelihood]:

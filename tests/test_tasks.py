@@ -199,8 +199,3 @@ def test_truths_outside_lie_beyond_their_bounds(system):
         value = float(getattr(record, p.name))
         beyond = max(value / p.high, p.low / value)
         assert beyond == pytest.approx(1.2, rel=1e-6), p.name
-
-
-def test_an_unknown_truth_is_refused():
-    with pytest.raises(InputError, match=r"^E145 .*got 4sd"):
-        tasks.draw_truth(Furuta(), KEY, "4sd")
