@@ -1,5 +1,6 @@
 """Bad inputs from 77 on: what Python is given, by what takes it."""
 
+from bad_commands import COMMANDS
 from bad_formats import FORMATS
 from bad_functions import FUNCTIONS
 from bad_inputs import Case
@@ -15,4 +16,5 @@ CALLS: tuple[Case, ...] = (
     *(*SETTINGS, *FUNCTIONS, *MODELS, *SYSID),
     *(*FORMATS, *PROJECT_FILES, *MACHINES, *MESSAGES),
     *SYSTEMS,
+    *COMMANDS,
 )

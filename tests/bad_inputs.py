@@ -48,6 +48,7 @@ class Input:
     words: tuple[str, ...]
     make: Make
     summary: dict[str, Any] = field(default_factory=dict)
+    brief: bool = False  # a command's line without what is expected, or the fix
 
 
 @dataclass(frozen=True)
