@@ -11,10 +11,12 @@ from bad_settings import SETTINGS
 from bad_streams import MESSAGES
 from bad_sysid import SYSID
 from bad_systems import SYSTEMS
+from bad_written import WRITTEN
 
 CALLS: tuple[Case, ...] = (
     *(*SETTINGS, *FUNCTIONS, *MODELS, *SYSID),
     *(*FORMATS, *PROJECT_FILES, *MACHINES, *MESSAGES),
     *SYSTEMS,
     *COMMANDS,
+    *WRITTEN,
 )

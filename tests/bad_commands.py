@@ -1,4 +1,4 @@
-"""Bad inputs 128 to 133: command lines, runs, and the files that they write."""
+"""Bad inputs 127 to 132: command lines, runs, and the files that they write."""
 
 import errno
 import os
@@ -233,7 +233,7 @@ def hopeless(folder: Path, patch: Patch) -> None:
 
 COMMANDS: tuple[Case, ...] = (
     case(
-        128,
+        127,
         "words of a command line",
         line("E160", "identfy a.toml", "did you mean identify", brief=True),
         line("E160", "--verison", "did you mean --version", brief=True),
@@ -267,7 +267,7 @@ COMMANDS: tuple[Case, ...] = (
         ],
     ),
     case(
-        129,
+        128,
         "runs and horizons of commands",
         line("not_an_identification", "evaluate other --logs a.csv", "got evaluate"),
         line("nothing_to_explain", "explain other", "got evaluate"),
@@ -288,7 +288,7 @@ COMMANDS: tuple[Case, ...] = (
         fitted("no_model_file", "apply run", "cartpole"),
     ),
     case(
-        130,
+        129,
         "designs from the command line",
         designed("unknown_parameter", "--about arm_dampin", "mean arm_damping"),
         designed("experiment_too_short", "--seconds 0.005", "0.005 s"),
@@ -307,7 +307,7 @@ COMMANDS: tuple[Case, ...] = (
         designed("E160", "--kind chirp", "free, multisine"),
     ),
     case(
-        131,
+        130,
         "folders of runs",
         stored("not_a_run", replaced(os.mkfifo)),
         stored("not_a_run", replaced(Path.mkdir)),
@@ -341,7 +341,7 @@ COMMANDS: tuple[Case, ...] = (
         made("cells_of_others", torn, "1 damaged"),
     ),
     case(
-        132,
+        131,
         "files and packages",
         made("no_folder_for_file", lambda folder: sg.example(folder / "no" / "where")),
         made("file_exists", lambda folder: (sg.example(folder), sg.example(folder))),
@@ -352,7 +352,7 @@ COMMANDS: tuple[Case, ...] = (
         without(sampler, "blackjax", "mcmc"),
     ),
     case(
-        133,
+        132,
         "results of Python",
         made("no_project_to_add_to", lambda folder: project_file(told(folder, False))),
         made("project_changed_since_run", changed_since, "project.toml"),
@@ -364,7 +364,7 @@ COMMANDS: tuple[Case, ...] = (
             "did you mean furuta",
         ),
         refusal(
-            "worker_died", lambda: list(spread(os._exit, [[3], [1]], 2)), "exit code"
+            "worker_died", lambda: list(spread(os._exit, [[3], [3]], 2)), "exit code 3"
         ),
         Input("no_truth_swung_up", ("MPC", "2 draws"), hopeless),
     ),

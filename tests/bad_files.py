@@ -79,14 +79,16 @@ TENSORS = (8).to_bytes(8, "little") + b'{"a":{}}'
 # Runs
 
 
-def policy(changes: Mapping[str, Any], key: str, *said: str) -> Input:
+def policy(
+    changes: Mapping[str, Any], key: str, *said: str, form: int = FORMAT
+) -> Input:
     """What `export_policy` writes, of one layer, with some arrays changed."""
 
     def make(folder: Path, patch: Patch) -> None:
         two, one = np.ones((1, 2), np.float32), np.ones(1, np.float32)
         stored = {"weights/0": two, "biases/0": two[0], "scale": one}
         stored |= {"low": -one, "high": one}
-        about = {"format": FORMAT, "layers": 1, "angle": None}
+        about = {"format": form, "layers": 1, "angle": None}
         about |= {"states": ["x"], "actions": ["u"], "units": {"x": "m", "u": "V"}}
         with new_run(folder / "policy", "export policy") as writer:
             writer.write_arrays("arrays.npz", stored | dict(changes))
@@ -244,6 +246,7 @@ THIRD: tuple[Case, ...] = (
         stored("a.safetensors", raw(TENSORS), "safetensors_refused", "numpy.savez"),
         policy({"weights/0": NAN}, "policy_not_finite", "weights/0", "2 of 2"),
         policy({"weights/0": np.ones((1, 2))}, "not_a_policy", "float64"),
+        policy({}, "newer_policy", "got 99", form=99),
         stored(
             "a.npz",
             archive(("pos.npy", b"\x93NUMPY\x02\x00" + b"\xff" * 3 + b"\x7f")),

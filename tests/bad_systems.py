@@ -1,4 +1,4 @@
-"""Bad inputs 120 to 127: machines and their parts, tasks, models, designs."""
+"""Bad inputs 120 to 126: machines and their parts, tasks, models, designs."""
 
 import dataclasses
 import math

@@ -9,11 +9,26 @@ from pathlib import Path
 import pytest
 
 from sim2gp.errors import CODES, Entry, InputError, NotConverged, catalogue, error
+from test_all_bad_inputs import CASES
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = sorted((ROOT / "src").rglob("*.py"))
 #: What `error` takes itself; all else fills templates.
 OWN = {"where", "got", "expected", "fix"}
+#: Errors that no row of the table of bad inputs provokes, and why.
+NOT_PROVOKED = {
+    "another_machine_than_fitted": "of a fit: test_project_model.py",
+    "constant_not_open": "of a fit whose machine has other constants open",
+    "fault_of_sim2gp": "of an error that is no input's: test_cli.py",
+    "simulator_not_finite_on_box": "of a training by night: test_function_space.py",
+    "episode_not_finite": "of a compiled episode: test_episode.py",
+    "information_not_finite": "of a search that is lost at every start",
+    "no_commands_keep_limits": "of a search by night: test_design_search.py",
+    "options_refused": "of a machine that checks its options by other errors",
+    "did_not_become_free": "always the cause of `cannot_be_added`",
+    "model_leaves_logs": "of a draft whose model diverges at its own numbers",
+    "actuator_with_several_inputs": "of models that no MuJoCo so far compiles",
+}
 
 
 def calls() -> Iterator[tuple[str, str, set[str]]]:
@@ -52,6 +67,12 @@ def test_each_entry_is_used_and_has_a_code() -> None:
     assert {entry.code for entry in catalogue().values()} <= known
 
 
+def test_each_error_is_provoked_or_listed() -> None:
+    """The list is right: what it names has no row yet."""
+    provoked = {given.key for bad in CASES for given in bad.inputs}
+    assert set(catalogue()) - provoked == set(NOT_PROVOKED)
+
+
 def test_no_key_stands_twice() -> None:
     files = [f for f in CODES.parent.glob("*.toml") if f != CODES]
     keys = [k for f in files for k in tomllib.loads(f.read_text(encoding="utf-8"))]
@@ -62,6 +83,7 @@ def test_an_error_has_the_words_of_its_entry(monkeypatch: pytest.MonkeyPatch) ->
     entry = Entry("E116", "no $what", "at least $least", "record ${what}s")
     monkeypatch.setattr("sim2gp.errors.catalogue", lambda: {"few": entry})
     made = error("few", where="a.csv", got=1, what="row", least=2)
+    assert (made.key, made.code) == ("few", "E116")
     assert isinstance(made, InputError)
     assert str(made) == (
         "E116 no row in a.csv: got 1, expected at least 2. Fix: record rows."

@@ -161,55 +161,6 @@ def test_our_warnings_are_one_line_each(
     assert capsys.readouterr().err.startswith("W200 take care\n")
 
 
-ARGUMENTS = {
-    "identfy a.toml": ("E160", "did you mean identify"),
-    "--verison": ("E160", "did you mean --version"),
-    "demo --sed 3": ("E160", "did you mean --seed"),
-    "demo --seed 1.5": ("E149", "got 1.5"),
-    "demo --seed -1": ("E149", "got -1"),
-    "demo --seed=4294967296": ("E149", "from 0 to 4294967295"),
-    "demo --seed": ("E160", "--seed VALUE"),
-    "demo --episodes 0": ("E148", "from 1"),
-    "demo --machine furutta": ("E160", "did you mean furuta"),
-    "demo --log-to tensorbord": ("E160", "did you mean tensorboard"),
-    "demo now": ("E160", "unexpected argument"),
-    "identify": ("E160", "missing PROJECT"),
-    "identify a.toml b.toml": ("E160", "got b.toml"),
-    "identify gone.toml": ("E130", "no such file"),
-    "identify gone.toml --out there": ("E132", "not a run"),
-    "evaluate": ("E160", "missing RUN|PROJECT"),
-    "evaluate gone --logs a.csv": ("E130", "not a run in gone"),
-    "evaluate gone --logs": ("E130", "not a run"),
-    "evaluate there --horizon nan": ("E148", "a positive number"),
-    "evaluate gone.toml": ("E130", "no such file"),
-    "evaluate gone.toml --logs a.csv": ("E160", "leave --logs out"),
-    "report there": ("E130", "not a run"),
-    "reproduce": ("E160", "missing FIGURE"),
-    "reproduce fig11": ("E160", "did you mean fig1"),
-    "reproduce fig1 --workers 2": ("E160", "leave it out"),
-    "reproduce fig1 --keep-old": ("E160", "--keep-old with fig1"),
-    "reproduce fig2 --refresh --keep-old": ("E160", "leave one out"),
-    "demo --json=maybe": ("E160", "got maybe"),
-}
-
-
-@pytest.mark.parametrize("line", ARGUMENTS)
-def test_misspelt_arguments(
-    line: str, here: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    code, words = ARGUMENTS[line]
-    (here / "there").mkdir()
-    (here / "there" / "thesis.tex").write_text("")
-    assert main(line.split()) == 2
-    said = capsys.readouterr()
-    assert said.out == ""
-    assert said.err.startswith(f"{code} ")
-    assert words in said.err
-    assert said.err.count("\n") == 1
-    assert sorted(os.listdir(here)) == ["there"]
-    assert os.listdir(here / "there") == ["thesis.tex"]
-
-
 def test_help_and_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--help"]) == 0
     page = capsys.readouterr().out

@@ -101,11 +101,6 @@ def test_what_is_asked_about(tmp_path: Path) -> None:
     assert isinstance(plain, Everything)
 
 
-def test_a_run_that_is_none(tmp_path: Path, capsys) -> None:
-    assert main(["design", str(tmp_path / "gone")]) == 2
-    assert capsys.readouterr().err.startswith("E130")
-
-
 def entry(mean: float, sd: float, left: float, times: float = 1.0) -> dict[str, float]:
     """Of a constant whose corrected sd is ``times`` the plain one."""
     return {"mean": mean, "sd": sd, "of_before": left, "corrected_sd": times * sd}

@@ -52,11 +52,6 @@ def test_time_by_name_and_step(name: str, scale: float, unit: str | None) -> Non
     assert time_column(columns, "").column == Column(name, unit)
 
 
-def test_no_time_is_an_error() -> None:
-    with pytest.raises(InputError, match="E103 no column of time"):
-        time_column({"u": U[1], "q": Q[1]}, "log.csv")
-
-
 def test_columns_by_names_and_rates() -> None:
     columns = {
         "pos_des1": Q[1] + 0.1,
@@ -118,15 +113,6 @@ def test_a_rate_tells_units_and_signs(
     assert (q.column, v.column) == ("a", "b")
     assert (q.unit, v.unit, v.sign) == units
     assert found["motor"].column == Column("drive")
-
-
-def test_what_finds_no_column_is_named() -> None:
-    motor = [Channel("motor", "1")]
-    with pytest.raises(InputError, match=r"E103 no column for joint hinge .*log\.csv"):
-        match({"foo": 0.0 * T, "u": U[1]}, T, joints("hinge"), motor, "log.csv")
-    left = {"hinge": Q[1], "foo": Q[2], "bar": U[2]}
-    with pytest.raises(InputError, match="E103 no column for input motor"):
-        match(left, T, joints("hinge"), motor, "log.csv")
 
 
 MODEL = """

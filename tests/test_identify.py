@@ -13,7 +13,6 @@ from sim2gp.commands.evaluate import evaluate
 from sim2gp.commands.identification import restored
 from sim2gp.commands.longer import Longer
 from sim2gp.data.logs import Log
-from sim2gp.errors import InputError
 from sim2gp.project import load_project
 from sim2gp.runs import Progress, load_run
 from sim2gp.systems import Furuta, Machine
@@ -231,13 +230,6 @@ def test_leave_one_out_predicts_every_log(folder: Path, tmp_path: Path) -> None:
     kept = load_run(out).arrays
     assert {key.split("/")[1] for key in kept if "/low/" in key} == {"log1", "log2"}
     assert "calibration/share/alpha" in kept
-
-
-def test_no_horizon_longer_than_the_log(run: Path, folder: Path) -> None:
-    for horizon, code in ((5.0, "E116"), (0.0, "E160"), (float("nan"), "E160")):
-        with pytest.raises(InputError) as caught:
-            _evaluated(run, folder, horizon=horizon)
-        assert caught.value.code == code
 
 
 def test_effects_are_constants_of_the_machine(folder: Path) -> None:

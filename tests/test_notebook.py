@@ -3,8 +3,6 @@
 from html.parser import HTMLParser
 from pathlib import Path
 
-import pytest
-
 import sim2gp as sg
 from sim2gp.commands.evaluate import Evaluation
 from sim2gp.runs import new_run
@@ -45,8 +43,3 @@ def test_a_result_shows_its_warnings() -> None:
     page = made._repr_html_()
     assert page.count(said[0]) == 1
     assert "W1 &lt;b&gt;" in page
-
-
-def test_what_is_no_run_is_said(tmp_path: Path) -> None:
-    with pytest.raises(sg.InputError, match="E13"):
-        sg.show(tmp_path / "nothing")

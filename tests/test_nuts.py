@@ -1,6 +1,5 @@
 """NUTS against a posterior that quadrature knows, and its verdicts."""
 
-import sys
 from dataclasses import replace
 
 import jax
@@ -11,8 +10,7 @@ from jaxtyping import Array, Float
 from scipy.stats import norm
 
 from descents import minimise, standard
-from sim2gp.errors import InputError
-from sim2gp.identification.exact_posterior.nuts import Sampled, judged, sampled, sampler
+from sim2gp.identification.exact_posterior.nuts import Sampled, judged, sampled
 from sim2gp.inference.arrowhead import Blocks, Noise
 from sim2gp.inference.least_squares import factor
 from sim2gp.inference.likelihood import AbstractLikelihood
@@ -122,9 +120,3 @@ def test_what_differs_is_named() -> None:
     assert not replace(GOOD, draws=399.0).mixed
     assert not replace(GOOD, r_hat=np.nan).mixed
     assert replace(GOOD, r_hat=np.nan).as_dict(("a", "b"))["r_hat"] is None
-
-
-def test_without_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "blackjax", None)
-    with pytest.raises(InputError, match=r"E135 .*sim2gp\[mcmc\]"):
-        sampler()

@@ -7,7 +7,6 @@ import pytest
 from key_changes import GROUP, loaded, write_files
 from sim2gp.errors import InputError
 from sim2gp.project import load_project
-from sim2gp.project.draft import Request, draft_project
 
 SYSTEM = 'system = "cartpole"\n'
 MASS = "[parameters.cart_mass]\n"
@@ -121,12 +120,6 @@ def test_a_slip_is_answered_with_what_to_write(
     assert fix in error.fix
     assert "\n" not in str(error)
     assert len(str(error)) < 600
-
-
-def test_the_command_line_names_the_file_too(tmp_path: Path) -> None:
-    """`sim2gp init` is given a system as well."""
-    with pytest.raises(InputError, match=r"write the file's name, \"arm\.xml\""):
-        draft_project(Request("mujoco:arm.xml", [], tmp_path / "a.toml"))
 
 
 def test_what_is_meant_is_accepted(tmp_path: Path) -> None:

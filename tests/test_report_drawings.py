@@ -8,7 +8,6 @@ import pytest
 
 from report_example import swing_up, two_data_sets
 from sim2gp import reports as report
-from sim2gp.errors import InputError
 from sim2gp.reports import densities, scenes, svg
 
 
@@ -114,11 +113,6 @@ def test_every_machine_stays_inside_its_picture(system: str) -> None:
         assert (pixels > 0).all()
         assert (pixels < [scene.width, scene.height]).all()
         assert (depth > 0).all()
-
-
-def test_an_unknown_machine_names_the_nearest() -> None:
-    with pytest.raises(InputError, match=r"E195.*did you mean furuta"):
-        scenes.scene_of({"system": "furtua"}, np.zeros((2, 4)))
 
 
 def test_the_film_restarts_where_an_episode_starts() -> None:
