@@ -215,6 +215,8 @@ MACHINES: tuple[Case, ...] = (
         "project: files",
         cart("unknown_name", "[parameters.cart_mass]\ntie = true\n", "line 2", "tie"),
         file("unreadable_file", 'system = "gone.xml"\n', "gone.xml"),
+        cart("E160", GROUP.replace('"t"', "1979-05-27"), "line 4"),
+        cart("E160", "[actuators]\ndelay = 1979-05-27\n", "line 3"),
         Input("not_utf8_text", ("byte 9",), binary),
         Input("missing_extra", ("pip install 'sim2gp[mujoco]'",), without_mujoco),
     ),

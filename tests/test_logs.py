@@ -5,8 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from recordings import Channel
 from sim2gp.data.logs import (
@@ -17,8 +15,6 @@ from sim2gp.data.logs import (
     read_log,
     shared_rows,
 )
-from sim2gp.data.logs.units import UNITS, factor
-from sim2gp.errors import InputError
 
 STATES = (
     Channel("q", "rad", angle=True),
@@ -116,16 +112,6 @@ def test_sign_scale_offset_unit_and_time(tmp_path: Path) -> None:
     np.testing.assert_allclose(log.channels["q"], table[:, 1], atol=1e-13)
     np.testing.assert_allclose(log.channels["q.velocity"], table[:, 2], atol=1e-13)
     np.testing.assert_allclose(log.inputs["u"], table[:, 3], atol=1e-15)
-
-
-@given(st.sampled_from(sorted(UNITS)), st.sampled_from(sorted(UNITS)))
-def test_units_convert_there_and_back_or_refuse(one: str, other: str) -> None:
-    if UNITS[one][0] == UNITS[other][0]:
-        there, back = factor(one, other, "here"), factor(other, one, "here")
-        assert there * back == pytest.approx(1.0, rel=1e-15)
-    else:
-        with pytest.raises(InputError, match="E107"):
-            factor(one, other, "here")
 
 
 def test_wrapped_angles_are_unwrapped_and_it_is_said(tmp_path: Path) -> None:
