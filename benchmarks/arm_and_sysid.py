@@ -25,9 +25,8 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
-from commands import MAIN, timed  # noqa: E402
-
 import servo_arm  # noqa: E402
+from commands import MAIN, timed  # noqa: E402
 from sim2gp.project.draft_text import window_of  # noqa: E402
 
 #: What is open, and how far the truth lies from the file, in log units.

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from arm_and_sysid import OPEN, ROOT, judged, write
+
 from commands import MAIN, timed
 
 DELAY = 0.01  # s

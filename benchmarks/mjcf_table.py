@@ -23,10 +23,10 @@ import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "benchmarks")]
-from commands import MAIN, timed  # noqa: E402
 from mujoco_slopes import OF_OTHERS, fixed  # noqa: E402
 
 import servo_arm  # noqa: E402
+from commands import MAIN, timed  # noqa: E402
 
 ARMS: dict[str, dict[str, Any]] = {
     "2 joints": {"links": servo_arm.LINKS[1:3]},
