@@ -15,15 +15,16 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT / "tests")]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 import pytest  # noqa: E402
 
-from bad_files import THIRD  # noqa: E402
-from bad_inputs import Input  # noqa: E402
-from bad_logs import FIRST  # noqa: E402
-from bad_projects import SECOND  # noqa: E402
 from sim2gp.errors import Sim2GPError  # noqa: E402
+from tests.catalogue.bad_files import THIRD  # noqa: E402
+from tests.catalogue.bad_inputs import Input  # noqa: E402
+from tests.catalogue.bad_logs import FIRST  # noqa: E402
+from tests.catalogue.bad_projects import SECOND  # noqa: E402
+from tests.catalogue.bad_tables import TABLES  # noqa: E402
 
 CALL = "import sys; from sim2gp.cli import main; sys.exit(main(sys.argv[1:]))"
 BAR = 2.0  # s
@@ -55,7 +56,7 @@ def main() -> int:
     """Times every input, or those of some numbers."""
     asked = [int(word) for word in sys.argv[1:]]
     found = []
-    for bad in (*FIRST, *SECOND, *THIRD):
+    for bad in (*FIRST, *TABLES, *SECOND, *THIRD):
         if asked and bad.number not in asked:
             continue
         for i, given in enumerate(bad.inputs):

@@ -12,11 +12,11 @@ import jax
 import numpy as np
 import pytest
 
-from bad_inputs import HEADER, ROWS, table, text
 from sim2gp.commands import design, explain
 from sim2gp.project import load_project
 from sim2gp.project.project import Project
 from sim2gp.runs.progress import Progress
+from tests.catalogue.bad_inputs import HEADER, ROWS, table, text
 
 GROUP = """[[logs]]
 files = ["a.csv"]

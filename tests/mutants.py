@@ -23,6 +23,12 @@ PACKAGE = ROOT / "src" / "sim2gp"
 TABLE = Path(__file__).with_name("mutants.toml")
 
 
+def file_of(tests: str) -> Path:
+    """The one file of tests with that name, in whatever folder it is."""
+    (found,) = (ROOT / "tests").rglob(tests)
+    return found
+
+
 @dataclass(frozen=True)
 class Mutant:
     """``old`` becomes ``new`` in ``file``; ``only`` of the ``tests`` must then fail."""
@@ -47,7 +53,7 @@ class Mutant:
     def fails(self, package: Path) -> tuple[bool, str]:
         """Whether the tests fail on this copy of the package, and which one first."""
         command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider"]
-        command += [f"tests/{self.tests}", "--durations=0", "--durations-min=1000"]
+        command += [str(file_of(self.tests)), "--durations=0", "--durations-min=1000"]
         command += ["--tb=no", *(["-k", self.only] if self.only else [])]
         path = os.pathsep.join([str(package.parent), os.environ.get("PYTHONPATH", "")])
         env = os.environ | {"PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1"}

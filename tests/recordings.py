@@ -3,6 +3,7 @@
 import json
 import math
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -220,3 +221,28 @@ def write_mcap(
                 data = json.dumps(said).encode()
                 writer.add_message(channel, int(ns), data, int(ns))
         writer.finish()
+
+
+#: Topic -> stamps in s, contents.
+Messages = dict[str, tuple[np.ndarray, Sequence[Any]]]
+
+
+def write_streams(path: Path, streams: Messages, start: int = START) -> Path:
+    """An MCAP file of JSON."""
+    from mcap.writer import Writer
+
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("any", "jsonschema", b"{}")
+        for topic, (times, contents) in streams.items():
+            channel = writer.register_channel(topic, "json", schema)
+            for t, content in zip(times, contents, strict=True):
+                ns = start + round(1e9 * float(t))
+                writer.add_message(channel, ns, json.dumps(content).encode(), ns)
+        writer.finish()
+    return path
+
+
+def numbers(name: str, values: np.ndarray) -> list[dict[str, Any]]:
+    return [{name: float(v)} for v in values]

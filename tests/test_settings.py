@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 import sim2gp as sg
-from bad_settings import INF, box, ode, task
 from linear_system import linear
 from mass_task import mass_task, single
 from sim2gp import checks
 from sim2gp import systems as sy
 from sim2gp.errors import InputError
+from tests.catalogue.bad_settings import INF, box, ode, task
 
 
 def test_what_can_be_is_taken() -> None:

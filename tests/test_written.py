@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from bad_functions import Pull, arm, host, inertia_of, ode
 from double_integrator import Linear, Quadratic
 from double_integrator import world as world_of
 from sim2gp import checks
 from sim2gp import systems as sy
 from sim2gp.errors import InputError
+from tests.catalogue.bad_functions import Pull, arm, host, inertia_of, ode
 
 
 def test_what_a_function_raised_is_the_cause() -> None:

@@ -43,8 +43,8 @@ _NUMBER = r"[+-]?\d+(?:\.\d+)?(?:[eE][+-]?\d+)?"
 
 
 def toml(value: Any) -> str:
-    """A short text, number or list as TOML writes it."""
-    return json.dumps(value, ensure_ascii=False)
+    """A short text, number or list as TOML writes it; a date as text."""
+    return json.dumps(value, ensure_ascii=False, default=str)
 
 
 def suggest_table(key: str) -> str:

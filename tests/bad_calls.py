@@ -1,9 +1,0 @@
-"""Bad inputs from 77 on: what Python is given, by what takes it."""
-
-from bad_functions import FUNCTIONS
-from bad_inputs import Case
-from bad_models import MODELS
-from bad_settings import SETTINGS
-from bad_sysid import SYSID
-
-CALLS: tuple[Case, ...] = (*SETTINGS, *FUNCTIONS, *MODELS, *SYSID)

@@ -1,0 +1,298 @@
+"""Intervals that allow for missing physics: Bayes' mixture; an arm with friction."""
+
+import dataclasses
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+
+from descents import estimate_of
+from sim2gp.data.split_log import cut
+from sim2gp.data.windows_likelihood import WindowsLikelihood
+from sim2gp.identification.fit import fit_windows
+from sim2gp.identification.intervals import scatter as intervals
+from sim2gp.identification.intervals.discrepancy import (
+    _with_effects_at_zero,
+    corrected_windows,
+)
+from sim2gp.identification.intervals.pulls import Pulls
+from sim2gp.identification.intervals.scatter import (
+    NOTHING,
+    SHARES,
+    CorrectedFit,
+    correct_posterior,
+)
+from sim2gp.identification.intervals.words import interval_entry, missing_physics_table
+from sim2gp.inference.arrowhead import Noise
+from sim2gp.inference.estimate import Estimate
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.parameters import Parameter
+from sim2gp.systems import Delay, UniformRodArm, with_parts
+from sim2gp.systems.effects.registry import smooth_effects
+from sim2gp.types import in_float64
+from tests.identification.test_intervals import (
+    HIGH,
+    LOW,
+    Linear,
+    Plain,
+    ar1,
+    gaussian,
+    smooth,
+)
+
+ROOT = Path(__file__).resolve().parents[2]
+OWN, ALL = 3, 5
+EFFECTS = np.arange(ALL) >= OWN
+
+
+def sensitivities(rng: np.random.Generator) -> np.ndarray:
+    """Of three constants, and of two effects that they nearly mimic: (W, rows, 5)."""
+    J = smooth(rng, 2.0)
+    like = J @ rng.standard_normal((OWN, ALL - OWN))
+    return np.concatenate([J, like + 0.3 * smooth(rng, 2.0)[..., : ALL - OWN]], axis=-1)
+
+
+def test_the_average_over_shares_is_bayes() -> None:
+    """Beside the marginal of the data under each share, in covariances, by scipy."""
+    rng = np.random.default_rng(0)
+    root = rng.standard_normal((7, ALL)) * [3.0, 1.0, 2.0, 4.0, 0.5]
+    data = root @ [0.5, -1.0, 0.2, 0.15, -0.1] + rng.standard_normal(7)
+    mean, scale, missing = intervals._averaged(root, data, EFFECTS)
+    shares = np.array([0.0, *SHARES])
+    odds = np.array([NOTHING, *[(1.0 - NOTHING) / len(SHARES)] * len(SHARES)])
+    means, covs = [], []
+    for k, share in enumerate(shares):
+        prior = np.diag(np.where(EFFECTS, share, 1.0) ** 2)
+        S = root @ prior @ root.T + np.eye(7)
+        odds[k] *= scipy.stats.multivariate_normal(np.zeros(7), S).pdf(data)
+        gain = prior @ root.T @ np.linalg.inv(S)
+        means.append(gain @ data)
+        covs.append(prior - gain @ root @ prior)
+    odds /= odds.sum()
+    assert 0.05 < odds[0] < 0.95
+    assert missing == pytest.approx(1.0 - odds[0], rel=1e-9)
+    want = odds @ np.array(means)
+    np.testing.assert_allclose(mean, want, rtol=1e-9)
+    away = np.array(means) - want
+    cov = np.einsum(
+        "k,kij->ij", odds, np.array(covs) + away[:, :, None] * away[:, None]
+    )
+    np.testing.assert_allclose(scale @ scale.T, cov, rtol=1e-8, atol=1e-12)
+
+
+def told(model: Linear, y: np.ndarray, allowed: bool) -> CorrectedFit:
+    """The intervals of a fit of the constants alone; effects stand at nothing."""
+    H = model.H[:OWN, :OWN]
+    z = np.zeros(ALL)
+    z[:OWN] = np.linalg.solve(H, np.einsum("wlp,wl->p", model.J[..., :OWN], y))
+    scores = np.einsum("wlp,wl->wp", model.J, model.J @ z - y)
+    pulls = Pulls(model.J, scores, model.group)
+    if allowed:
+        return correct_posterior(model.prior, gaussian(z, np.eye(ALL)), pulls, EFFECTS)
+    first = np.arange(OWN)
+    prior = gaussian(np.zeros(OWN), np.eye(OWN))
+    return correct_posterior(prior, gaussian(z[:OWN], np.eye(OWN)), pulls.of(first))
+
+
+def covered(lacks: float, rho: float, allowed: bool) -> tuple[float, float, float]:
+    """Coverage of 95 % intervals, their median sd, and P(something) on average."""
+    rng, inside, sd, missing = np.random.default_rng(1), [], [], []
+    model = Linear(sensitivities(rng))
+    for _ in range(150):
+        z = rng.standard_normal(ALL) * np.where(EFFECTS, lacks, 1.0)
+        found = told(model, model.J @ z + ar1(rng, rho), allowed)
+        lies = Plain(found.posterior)
+        spread, error = lies.sd[:OWN], lies.mean[:OWN] - z[:OWN]
+        inside.append(np.abs(error) < 1.96 * spread)
+        sd.append(spread)
+        missing.append(found.missing)
+    return float(np.mean(inside)), float(np.median(sd)), float(np.mean(missing))
+
+
+def test_what_all_windows_lack_is_covered() -> None:
+    """A bias that no scatter of windows shows, of a size that is not the library's."""
+    assert covered(0.3, 0.0, allowed=False)[0] < 0.4
+    inside, _, missing = covered(0.3, 0.0, allowed=True)
+    assert LOW < inside < HIGH
+    assert missing > 0.7
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.9])
+def test_where_nothing_is_missing_little_is_paid(rho: float) -> None:
+    _, before, none = covered(0.0, rho, allowed=False)
+    inside, sd, missing = covered(0.0, rho, allowed=True)
+    assert none == 0.0
+    assert missing < NOTHING  # effects too small to show cannot be ruled out
+    assert inside > 0.93
+    assert before < sd < 1.6 * before
+
+
+def test_it_does_not_matter_where_a_linear_machine_is_linearised() -> None:
+    rng = np.random.default_rng(2)
+    model = Linear(sensitivities(rng))
+    y = model.J @ rng.standard_normal(ALL) + ar1(rng, 0.5)
+    found = told(model, y, allowed=True)
+    z = rng.standard_normal(ALL)
+    scores = np.einsum("wlp,wl->wp", model.J, model.J @ z - y)
+    there = gaussian(z, np.eye(ALL))
+    again = correct_posterior(
+        model.prior, there, Pulls(model.J, scores, model.group), EFFECTS
+    )
+    one, other = Plain(again.posterior), Plain(found.posterior)
+    np.testing.assert_allclose(one.mean, other.mean, atol=1e-9)
+    np.testing.assert_allclose(one.C, other.C, atol=1e-9)
+    assert again.missing == pytest.approx(found.missing)
+
+
+# ---- an arm that another hand simulates --------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def arms() -> ModuleType:
+    """The benchmark's recordings: plain numpy, none of the library's simulators."""
+    script = ROOT / "benchmarks" / "interval_arms.py"
+    spec = importlib.util.spec_from_file_location("interval_arms", script)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["interval_arms"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+Fitted = tuple[np.ndarray, Estimate, WindowsLikelihood]
+
+
+def fitted(arms: ModuleType, condition: str, s: int) -> Fitted:
+    """Hidden virtual constants, and the fit of one arm's ten seconds."""
+    data = arms.recordings(arms.CONDITIONS[condition], 20, 0)
+    windows, _ = cut([data.log(s)], UniformRodArm(), window=0.2)
+    belief = fit_windows(UniformRodArm(), windows, key=jax.random.key(0))
+    return data.truth[s], belief, WindowsLikelihood(UniformRodArm(), windows)
+
+
+def away(truth: np.ndarray, found: Gaussian) -> np.ndarray:
+    """Errors in sd."""
+    lies = Plain(found)
+    error: np.ndarray = np.abs(lies.mean - truth) / lies.sd
+    return error
+
+
+@pytest.mark.nightly
+def test_friction_that_the_simulator_lacks_is_in_the_intervals(
+    arms: ModuleType,
+) -> None:
+    """20 mN m in both joints: the damping takes it up, with a narrow interval."""
+    truth, belief, likelihood = fitted(arms, "friction20", 0)
+    one = np.zeros(len(likelihood.windows), int)
+    assert away(truth, belief.posterior).max() > 12.0
+    alone = corrected_windows(likelihood, belief, one, ())
+    assert alone.effects == ()
+    assert away(truth, alone.posterior).max() > 7.0
+    found = corrected_windows(likelihood, belief, one)
+    assert found.missing > 0.99
+    assert {"q1.coulomb", "q2.coulomb"} <= set(found.effects)
+    assert not any("back_emf" in name for name in found.effects)  # a damping, again
+    assert found.posterior.scale.shape == (4, 4)
+    assert away(truth, found.posterior).max() < 2.0
+    about = interval_entry(UniformRodArm(), found, {}, 50)
+    for q in "q1", "q2":
+        friction = about["allowed_for"][f"{q}.coulomb"]
+        assert abs(friction["mean"] - 0.02) < 3.0 * friction["sd"]
+        assert friction["unit"] == "N m"
+    assert about["missing"] == found.missing
+    (table,) = missing_physics_table(about)
+    assert [row[0] for row in table["rows"][:1]] in (["q1.coulomb"], ["q2.coulomb"])
+    assert len(table["rows"]) == len(found.effects)
+    # Where a fit without effects stands is of no account.
+    with jax.enable_x64(True):
+        at = belief.posterior.mean + jnp.asarray([0.2, -0.3, 0.2, 0.5])
+        other = dataclasses.replace(
+            belief, posterior=Gaussian(at, belief.posterior.scale)
+        )
+    again = corrected_windows(likelihood, other, one)
+    assert away(Plain(found.posterior).mean, again.posterior).max() < 0.1
+
+
+@pytest.mark.nightly
+def test_a_sound_simulator_is_believed(arms: ModuleType) -> None:
+    truth, belief, likelihood = fitted(arms, "white", 0)
+    one = np.zeros(len(likelihood.windows), int)
+    found = corrected_windows(likelihood, belief, one)
+    alone = corrected_windows(likelihood, belief, one, ())
+    assert found.missing < 0.3
+    assert missing_physics_table(interval_entry(UniformRodArm(), found, {}, 50)) == []
+    assert interval_entry(UniformRodArm(), alone, {}, 50)["missing"] is None
+    assert interval_entry(UniformRodArm(), alone, {}, 50)["allowed_for"] == {}
+    assert np.max(Plain(found.posterior).sd / Plain(alone.posterior).sd) < 1.3
+    assert away(truth, found.posterior).max() < 3.0
+
+
+@in_float64
+def test_a_belief_keeps_its_constants_among_effects() -> None:
+    """Actuators, whose constants stand elsewhere in the table, and a dense prior."""
+    delay = Parameter("torque1.delay", "s", "delay", "bounded", 0.0, 0.02)
+    parts = {"torque1.delay": delay}
+    system = with_parts(UniformRodArm(), [Delay("torque1")], parts)
+    p = len(system.parameters.names)
+    scale = jnp.asarray(np.tril(1.0 + np.arange(p * p).reshape(p, p)))
+    prior = Gaussian(jnp.linspace(0.5, 1.0, p), scale)
+    posterior = Gaussian(jnp.linspace(-1.0, -2.0, p), scale)
+    none = jnp.zeros(1)
+    belief = estimate_of(prior, posterior, Noise(none, none), none[None])
+    wider, whole, own = _with_effects_at_zero(system, belief, smooth_effects(system))
+    names = wider.parameters.names
+    assert len(names) > p + 6
+    assert tuple(names[k] for k in own) == system.parameters.names
+    np.testing.assert_array_equal(whole.posterior.mean[own], posterior.mean)
+    np.testing.assert_array_equal(whole.prior.mean[own], prior.mean)
+    np.testing.assert_array_equal(whole.prior.scale[np.ix_(own, own)], scale)
+    effects = np.setdiff1d(np.arange(len(names)), own)
+    np.testing.assert_array_equal(whole.posterior.mean[effects], 0.0)
+    assert not np.any(np.asarray(whole.prior.scale)[np.ix_(own, effects)])
+
+
+def test_the_words_say_whether_physics_is_missing() -> None:
+    posterior = gaussian(np.zeros(1), np.eye(1))
+    found = CorrectedFit(posterior, 1.0, 1, 30.0, True, 0.97, ("q1.coulomb", "q1.drag"))
+    text = intervals.describe_intervals(found, [1.0, 4.0], 40)
+    assert text.startswith("Intervals are 1 to 4 times as wide as if every sample were")
+    assert "coloured" not in text
+    assert "lacks physics with a probability of 97 %: intervals allow for 2" in text
+    assert "sim2gp explain" in text
+    sound = CorrectedFit(posterior, 9.0, 1, 30.0, True, 0.04, ("q1.coulomb",))
+    text = intervals.describe_intervals(sound, [3.0], 40)
+    assert "coloured and pull the parameters 3 times" in text
+    assert "missing, which has a probability of 4 %" in text
+    none = CorrectedFit(posterior, 9.0, 1, 30.0, True)
+    assert "not physics that the model lacks" in intervals.describe_intervals(
+        none, [3.0], 40
+    )
+
+
+def test_a_wide_interval_says_why_in_one_sentence() -> None:
+    """Where the two sd differ by more than a factor of 3, and only there."""
+    flat = Gaussian(jnp.zeros(1), jnp.ones((1, 1)))
+    coloured = CorrectedFit(flat, 81.0, 1, 40.0, True)
+    assert intervals.explain_widening(coloured, [0.9, 3.0], 340) is None
+    assert (
+        intervals.explain_widening(CorrectedFit(flat, 81.0, 1, 2.0, False), [9.0], 3)
+        is None
+    )
+    text = intervals.explain_widening(coloured, [12.0, 41.0], 340)
+    assert text is not None
+    assert "12 to 41 times" in text
+    assert "9 times as far" in text
+    assert "physics" not in text
+    missing = CorrectedFit(flat, 1.0, 1, 40.0, True, 0.93, ("spring",), flat)
+    text = intervals.explain_widening(missing, [1.0, 5.0], 340)
+    assert text is not None
+    assert "93 %" in text
+    assert "white noise" not in text
+    assert text.count(". ") == 0
