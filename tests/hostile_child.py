@@ -23,7 +23,7 @@ with open(os.path.join(folder, "inner.stl"), "rb") as file:
     inner = file.read()
 os.chdir(folder)
 if way == "sealed":
-    child.seal()
+    child.forbid_files()
 for each in documents:
     texts = {} if each["part"] is None else {"part.xml": each["part"].encode("latin-1")}
     text = each["text"].encode("latin-1").decode("utf-8", errors="replace")

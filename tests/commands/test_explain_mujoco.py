@@ -64,6 +64,7 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
     )
 
 
+@pytest.mark.nightly
 @pytest.mark.usefixtures("few")
 def test_a_spring_of_mujocos_own_is_found(tmp_path: Path) -> None:
     (tmp_path / "pendulum.xml").write_text(

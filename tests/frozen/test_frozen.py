@@ -10,13 +10,12 @@ pytestmark = pytest.mark.skipif(
 )
 
 CASES = every()
-#: Minutes of compilation: what is left tells any fault of the mathematics by day.
+#: Minutes of compilation: what is left shows any fault of the mathematics by day.
 BY_DAY = (
     "transition/furuta/all",
     "transition/two_link/actuated",
     "transition/zeroed",
     "density/arm",
-    "one_step/arm",
 )
 #: Relative to the largest number of an array: of what is computed in one sweep, of
 #: what a descent finds, of what float32 training finds.

@@ -274,14 +274,17 @@ CONSUMERS = [
 #: Wrapped models share nearly all of their code; these are tried every night alone.
 WRAPPED = ("PointEstimate(", "Auto(")
 LONG = {draws, update, information, world, loop, forecast}
+#: Models that train a network around another model: by day in tests of their own.
+NETWORKS = ("Residual", "Auto")
 
 
 def cases():
     for name, consumer in itertools.product(MODELS, CONSUMERS):
         cheap = name in ("PointEstimate(Sim2GP)", "PointEstimate(NLM)")
         wrapped = name.startswith(WRAPPED) and not cheap
-        rare = consumer in LONG and (wrapped or name.endswith("FunctionSpace"))
+        rare = consumer in LONG and (wrapped or name in NETWORKS)
         rare |= wrapped and name.endswith(("Residual)", "FunctionSpace)"))
+        rare |= name.endswith("FunctionSpace")
         marks = [pytest.mark.nightly] if rare else []
         yield pytest.param(
             name, consumer, marks=marks, id=f"{name}-{consumer.__name__}"

@@ -279,16 +279,22 @@ def defined(file: Path, path: str) -> bool:
     return True
 
 
-def test_the_theory_names_code_and_tests_that_are_there() -> None:
-    text = (DOCS / "theory.md").read_text(encoding="utf-8")
+@pytest.mark.parametrize("page", ["theory.md", "decisions.md"])
+def test_a_page_names_code_tests_and_results_that_are_there(page: str) -> None:
+    text = (DOCS / page).read_text(encoding="utf-8")
     lost = []
-    for file, path in re.findall(r"`([\w/]+\.py):([\w.]+)`", text):
-        home = PACKAGE / file
-        if file.startswith("test_"):
-            home = next((ROOT / "tests").rglob(file), home)
-        if not (home.is_file() and defined(home, path)):
+    for file, path in re.findall(r"`([\w/]+\.py)(?::([\w.]+))?`", text):
+        places = [PACKAGE / file, ROOT / file, *(ROOT / "tests").rglob(file)]
+        home = next((place for place in places if place.is_file()), None)
+        if home is None or (path and not defined(home, path)):
             lost.append(f"{file}:{path}")
+    paths = re.findall(r"(?<![\w/])(?:benchmarks|results)/[\w./]*\w", text)
+    lost += [path for path in paths if not (ROOT / path).exists()]
     assert not lost, "\n".join(lost)
+
+
+def test_the_theory_is_numbered_and_tested() -> None:
+    text = (DOCS / "theory.md").read_text(encoding="utf-8")
     numbered = [row for row in rows(text) if re.fullmatch(r"\(\d+\)", row[0])]
     numbers = list(dict.fromkeys(int(row[0].strip("()")) for row in numbered))
     assert sorted(numbers) == list(range(1, max(numbers) + 1))

@@ -7,13 +7,11 @@ import pytest
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 #: `test_from_python.py` runs the fourth.
-LONG = ("your_robot", "swing_up")
+NOTEBOOKS = ("first_posterior", "your_robot", "swing_up")
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["first_posterior", *(pytest.param(n, marks=pytest.mark.nightly) for n in LONG)],
-)
+@pytest.mark.nightly
+@pytest.mark.parametrize("name", NOTEBOOKS)
 def test_a_notebook_runs(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
