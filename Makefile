@@ -47,13 +47,12 @@ docs: $(VENV)/.docs
 	$(BIN)/python docs/site/stage.py build/docs/pages
 	$(BIN)/zensical build --clean --strict
 
-# Two processes for each core: a program of one operation keeps 1.4 MB until its process
-# ends. Whole files each, and one cache of what they compile, empty at the start.
+# Two processes, whole files each, and one cache of what they compile, empty at the start.
 unit: $(VENV)/.test
 	@cache=$$(mktemp -d) && trap 'rm -rf "$$cache"' EXIT && \
 	  export JAX_COMPILATION_CACHE_DIR="$$cache" && \
 	  export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0 && \
-	  $(BIN)/python -m pytest -m "not nightly" -n 4 --dist loadfile \
+	  $(BIN)/python -m pytest -m "not nightly" -n 2 --dist loadfile \
 	    --no-loadscope-reorder $(ARGS)
 
 nightly: $(VENV)/.test

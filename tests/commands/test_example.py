@@ -23,6 +23,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return sg.example(tmp_path_factory.mktemp("example") / "first").parent
 
 
+@pytest.mark.nightly  # by day a block of the README identifies it
 def test_what_was_hidden_is_found(folder: Path) -> None:
     robot = sg.load_project(folder / "arm.toml")
     found = sg.identify(robot, held_out=False, progress=QUIET)

@@ -85,6 +85,7 @@ def test_processes_find_the_same(run: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert two.winner.scored.candidate.name == "theta.spring"
 
 
+@pytest.mark.nightly
 @pytest.mark.usefixtures("few")
 def test_a_spring_is_found_in_logs_and_added(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
@@ -116,7 +117,7 @@ def test_windows_of_a_second_share_an_error(run: Path) -> None:
 
 
 @pytest.mark.usefixtures("few")
-@pytest.mark.nightly  # the way of `test_a_spring_is_found_in_logs_and_added`
+@pytest.mark.nightly
 def test_a_demo_is_explained_by_its_own_flights(tmp_path: Path) -> None:
     episodes = study.episodes_in("furuta", SPRING, jax.random.key(6))
     with new_run(tmp_path / "demo", "demo") as writer:

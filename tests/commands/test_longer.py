@@ -91,6 +91,7 @@ def test_physics_too_slow_for_short_ones_refuses_long_ones(
     assert "no way to know more" in told["text"]
 
 
+@pytest.mark.nightly
 def test_what_contradicts_the_model_already_is_not_lengthened(tmp_path: Path) -> None:
     assert "already" in asked(tmp_path, recording(), alarm=True).refused
 

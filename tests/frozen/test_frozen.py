@@ -12,7 +12,6 @@ pytestmark = pytest.mark.skipif(
 CASES = every()
 #: Minutes of compilation: what is left shows any fault of the mathematics by day.
 BY_DAY = (
-    "transition/furuta/all",
     "transition/two_link/actuated",
     "transition/zeroed",
     "density/arm",

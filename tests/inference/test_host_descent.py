@@ -117,6 +117,7 @@ def test_starts_are_compared_on_some_windows_and_each_step_is_reported(monkeypat
     assert np.all(np.asarray(first.posterior.sd()) > np.asarray(found.posterior.sd()))
 
 
+@pytest.mark.nightly
 @in_float64
 def test_an_encoders_offset_is_learned_on_the_host_as_by_jax():
     """What a machine adds around its plant is differentiated beside the simulator."""

@@ -124,7 +124,7 @@ def test_draws_of_a_machine_have_the_moments_of_the_belief():
     [
         pytest.param(Furuta(), 6, marks=pytest.mark.nightly),
         pytest.param(CartPole(), 5, marks=pytest.mark.nightly),
-        (machines.bare()["six"], 5),
+        pytest.param(machines.bare()["six"], 5, marks=pytest.mark.nightly),
         (UniformRodArm(), 4),
     ],
     ids=["furuta", "cartpole", "six rods", "four rods"],

@@ -93,7 +93,10 @@ def closed_loop(planner: MPC, w: World, s0: Array, key: Array) -> Array:
     "update",
     [
         ICEM(samples=256, iterations=5),
-        ICEM(samples=256, iterations=5, elites=10, decay=1.25),
+        pytest.param(
+            ICEM(samples=256, iterations=5, elites=10, decay=1.25),
+            marks=pytest.mark.nightly,
+        ),
         MPPI(samples=512, iterations=4, effective=0.05),
     ],
     ids=["icem", "icem with decay", "mppi"],

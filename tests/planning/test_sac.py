@@ -264,6 +264,7 @@ def test_episodes_begin_where_no_machine_has_been() -> None:
     np.testing.assert_array_equal(X[:, 2], np.float32(0.3))
 
 
+@pytest.mark.nightly
 def test_a_new_draw_is_new_data() -> None:
     """One program prepares for every world of a run."""
     count = 0
