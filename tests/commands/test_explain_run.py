@@ -15,7 +15,7 @@ from sim2gp.cli import main
 from sim2gp.commands.explain import explain, load_explainable, project_file, window_data
 from sim2gp.commands.identify import identify
 from sim2gp.errors import InputError
-from sim2gp.project import load_project
+from sim2gp.project import Project, load_project
 from sim2gp.runs import Progress, load_run, new_run
 from sim2gp.runs.workers import spread
 from simulated_logs import simulated
@@ -43,14 +43,20 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An identification of a machine that has a spring and of which none is known."""
+def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
+    """A machine that has a spring, and of which none is known."""
     folder = tmp_path_factory.mktemp("explain")
     for seed in (1, 2):
         log = simulated(seconds=1.3, seed=seed, noise=5e-4, effects=(SPRING,))
         write(log, folder / "logs" / f"log{seed}.csv")
-    project = load_project(project_in(folder))
-    return identify(project, progress=QUIET, held_out=False).save(folder / "run")
+    return load_project(project_in(folder))
+
+
+@pytest.fixture(scope="module")
+def run(project: Project) -> Path:
+    """Its identification."""
+    found = identify(project, progress=QUIET, held_out=False)
+    return found.save(project.path.parent / "run")
 
 
 def explained(run: Path, out: Path, *, add: bool) -> dict[str, Any]:
@@ -108,10 +114,8 @@ def test_a_spring_is_found_in_logs_and_added(run: Path, tmp_path: Path) -> None:
         explained(run, out, add=True)
 
 
-def test_windows_of_a_second_share_an_error(run: Path) -> None:
-    found = load_explainable(run)
-    assert found.project is not None
-    data = window_data(found.project, found.project.load_logs())
+def test_windows_of_a_second_share_an_error(project: Project) -> None:
+    data = window_data(project, project.load_logs())
     assert data.cluster.tolist() == [0] * 5 + [1] + [2] * 5 + [3]
     assert data.period == 0.0
 

@@ -56,6 +56,7 @@ def commands(experiment: d.Experiment, size: float = 0.1) -> Any:
     return signal.commands(C, box_of(experiment))
 
 
+@pytest.mark.nightly
 def test_worth_is_that_of_the_definition() -> None:
     """States, information and predictions as JAX finds them step by step."""
     experiment = experiment_with(Spring("hinge", 2.0))
