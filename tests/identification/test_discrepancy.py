@@ -270,6 +270,9 @@ def test_the_words_say_whether_physics_is_missing() -> None:
     text = intervals.describe_intervals(sound, [3.0], 40)
     assert "coloured and pull the parameters 3 times" in text
     assert "missing, which has a probability of 4 %" in text
+    unlikely = CorrectedFit(posterior, 9.0, 1, 30.0, True, 1e-4, ("q1.coulomb",))
+    text = intervals.describe_intervals(unlikely, [3.0], 40)
+    assert "which has a probability of less than 1 %" in text
     none = CorrectedFit(posterior, 9.0, 1, 30.0, True)
     assert "not physics that the model lacks" in intervals.describe_intervals(
         none, [3.0], 40

@@ -233,8 +233,11 @@ def _coloured(found: CorrectedFit, windows: int) -> str:
 
 
 def _missing_percent(found: CorrectedFit) -> str:
-    percent = f"{100.0 * found.missing:.0f} %"
-    return "more than 99 %" if found.missing >= 0.995 else percent
+    if found.missing >= 0.995:
+        return "more than 99 %"
+    return (
+        f"{100.0 * found.missing:.0f} %" if found.missing >= 0.005 else "less than 1 %"
+    )
 
 
 def _missing_physics_remark(found: CorrectedFit) -> str:
