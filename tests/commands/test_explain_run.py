@@ -156,6 +156,7 @@ def test_a_run_without_data_is_told(tmp_path: Path) -> None:
     assert not out.exists()
 
 
+@pytest.mark.nightly
 def test_the_command_line_hands_on(
     run: Path,
     tmp_path: Path,

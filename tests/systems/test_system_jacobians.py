@@ -69,7 +69,7 @@ def error(got, expected):
 
 def cases() -> list[Any]:
     """One machine by day; by night the others, and those with effects or actuators."""
-    night, day = pytest.mark.nightly, "two_link"
+    night, day = pytest.mark.nightly, "cartpole"
     return [n if n == day else pytest.param(n, marks=night) for n in machines.every()]
 
 
