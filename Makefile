@@ -30,7 +30,7 @@ help:
 demo: $(VENV)/.core
 	$(BIN)/sim2gp demo $(ARGS)
 
-# The three checks take turns on the cores, then the tests have them.
+# The three checks run side by side, the tests alone.
 test: $(VENV)/.test
 	$(MAKE) -j3 lint types docs
 	$(MAKE) unit

@@ -1,7 +1,7 @@
 """Does the search find planted physics? Machines with known missing physics.
 
 For each machine and effect, hidden constants are drawn from the prior and two episodes
-of 5 s are flown on the task, process noise as there: one with pink noise as input, one
+of 5 s are run on the task, process noise as there: one with pink noise as input, one
 that pumps the pole up and over. Neither knows any constant. `find_missing_physics` then
 sees states and inputs alone.
 """
@@ -175,7 +175,7 @@ def episodes_in(
     machine: str, planted: AbstractPart | None, key: Key
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """States (T + 1, n) and inputs (T, m) of two episodes on one hidden machine."""
-    hidden, flown = jax.random.split(key)
+    hidden, run = jax.random.split(key)
     task = planted_task(machine, planted, hidden)
     return [
         jax.tree.map(
@@ -185,7 +185,7 @@ def episodes_in(
                 CENTRE[machine],
                 FASTEST[machine],
                 jnp.asarray(float(e), jnp.float32),
-                jax.random.fold_in(flown, e),
+                jax.random.fold_in(run, e),
             ),
         )
         for e in range(EPISODES)

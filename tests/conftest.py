@@ -68,7 +68,7 @@ PAGES = Path("/proc/self/statm")
 
 
 #: Files of few and long tests: at the end of a run they leave one process alone.
-LONG = ("windows", "compare", "design_run", "system_jacobians", "explain_run")
+LONG = ("windows", "compare", "design_run")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

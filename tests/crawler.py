@@ -41,6 +41,16 @@ USUAL = {
     "kp": 8.0,
     "gain": 0.4,
 }
+#: An arm of one joint, in the other format.
+URDF = """
+<robot name="arm">
+  <link name="base"/>
+  <link name="upper"><inertial><origin xyz="0 0 -.2"/><mass value="1"/>
+    <inertia ixx=".02" iyy=".02" izz=".001" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="shoulder" type="continuous"><parent link="base"/><child link="upper"/>
+    <axis xyz="0 1 0"/><dynamics damping=".1" friction=".05"/></joint>
+</robot>
+"""
 
 
 def written(tmp_path: Path, text: str) -> Path:

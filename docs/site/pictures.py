@@ -1,4 +1,4 @@
-"""Pictures of docs/ that stand for long tables, drawn from results/.
+"""Pictures in docs/ that replace long tables, drawn from results/.
 
     python docs/site/pictures.py
 

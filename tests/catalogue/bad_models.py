@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from crawler import CRAWLER, USUAL, written
+from crawler import CRAWLER, URDF, USUAL, written
 from hostile_models import tetrahedron
 from sim2gp import systems as sy
 from tests.catalogue.bad_inputs import Case, Input, Patch, case
@@ -16,15 +16,6 @@ FLOATING = """
 <mujoco><worldbody>
   <body><freejoint name="base"/><geom size="1"/></body>
 </worldbody></mujoco>
-"""
-URDF = """
-<robot name="arm">
-  <link name="base"/>
-  <link name="upper"><inertial><origin xyz="0 0 -.2"/><mass value="1"/>
-    <inertia ixx=".02" iyy=".02" izz=".001" ixy="0" ixz="0" iyz="0"/></inertial></link>
-  <joint name="shoulder" type="continuous"><parent link="base"/><child link="upper"/>
-    <axis xyz="0 1 0"/><dynamics damping=".1" friction=".05"/></joint>
-</robot>
 """
 Files = Mapping[str, str | bytes]
 

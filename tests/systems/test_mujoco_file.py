@@ -8,24 +8,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from crawler import CRAWLER, USUAL, written
+from crawler import CRAWLER, URDF, USUAL, written
 from sim2gp import systems as sy
 from sim2gp.errors import InputError, Sim2GPWarning
 from sim2gp.systems.mujoco import compile_child as mjcf_child
 from sim2gp.systems.mujoco import load as mjcf_load
 
 mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is not installed")
-
-
-URDF = """
-<robot name="arm">
-  <link name="base"/>
-  <link name="upper"><inertial><origin xyz="0 0 -.2"/><mass value="1"/>
-    <inertia ixx=".02" iyy=".02" izz=".001" ixy="0" ixz="0" iyz="0"/></inertial></link>
-  <joint name="shoulder" type="continuous"><parent link="base"/><child link="upper"/>
-    <axis xyz="0 1 0"/><dynamics damping=".1" friction=".05"/></joint>
-</robot>
-"""
 
 
 def test_a_urdf_has_a_motor_at_every_joint(tmp_path):
