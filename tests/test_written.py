@@ -28,8 +28,11 @@ def test_what_is_right_is_taken() -> None:
     assert arm(inertia_of, jnp.sin).states[0].name == "q1"
 
 
-def test_a_function_is_traced_once_for_its_kind() -> None:
+def test_a_function_is_traced_once_for_its_kind(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Another draw of the same machine is new data, and no new trace."""
+    monkeypatch.setattr(checks, "_KNOWN", {})  # what is known is forgotten when full
     traced = []
 
     class Counted(Linear):
