@@ -1,5 +1,6 @@
 """Where the library's parts stand today: the one file here that follows a rewrite."""
 
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -56,6 +57,11 @@ def one_step() -> dict[str, sg.AbstractSystem]:
     }
 
 
+#: The machines of `windowed`, by name: to make them is to simulate their logs.
+WINDOWED = ("actuated", "robust", "one_step", "groups", "measured_sum")
+
+
+@functools.cache
 def windowed() -> dict[str, tuple[sg.AbstractSystem, list[Any], dict[str, Any]]]:
     """Machines that are fitted to logs, with the logs, and options of the fit."""
     bare = simulated_logs.pendulum()

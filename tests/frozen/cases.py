@@ -194,7 +194,7 @@ def every() -> dict[str, Callable[[], Arrays]]:
         "transition": (transition, adapters.stepped()),
         "density": (density, adapters.one_step()),
         "one_step": (one_step, adapters.one_step()),
-        "logs": (logs, adapters.windowed()),
+        "logs": (logs, adapters.WINDOWED),
         "learner": (learner, adapters.learners(adapters.one_step()["furuta"])),
     }
     for group, (case, names) in groups.items():

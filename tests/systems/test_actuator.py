@@ -78,24 +78,25 @@ def test_mean_input_is_the_integral_of_the_held_input():
     np.testing.assert_allclose(total, held[0], rtol=1e-13)
 
 
-@pytest.mark.parametrize("delay", [0.0037, 0.0123, 0.0311, 0.0472])
-def test_gradient_with_respect_to_the_delay(delay):
-    system, _ = furuta(delay)
+def test_gradient_with_respect_to_the_delay():
+    system, _ = furuta(0.0)
     s = jnp.concatenate([START, jnp.array([2.0, -1.0, 3.0])])
 
+    @jax.jit
     def after(tau):
         values = system.parameters.nominal() | {"voltage.delay": tau}
         record = system.record({k: jnp.asarray(v, float) for k, v in values.items()})
         return system.step(record, s, jnp.ones(1), DT)[:4]
 
+    forward, reverse = jax.jit(jax.jacfwd(after)), jax.jit(jax.jacrev(after))
     h = 1e-5
-    differences = (after(delay + h) - after(delay - h)) / (2 * h)
-    slope = jax.jacfwd(after)(jnp.asarray(delay))
-    scale = float(jnp.max(jnp.abs(differences)))
-    assert scale > 1.0  # a delay of one second changes the speed by many rad/s
-    np.testing.assert_allclose(slope, differences, rtol=0, atol=1e-7 * scale)
-    reverse = jax.jacrev(after)(jnp.asarray(delay))
-    np.testing.assert_allclose(reverse, slope, rtol=0, atol=1e-12 * scale)
+    for delay in (0.0037, 0.0123, 0.0311, 0.0472):
+        differences = (after(delay + h) - after(delay - h)) / (2 * h)
+        scale = float(jnp.max(jnp.abs(differences)))
+        assert scale > 1.0  # a delay of one second changes the speed by many rad/s
+        slope = forward(delay)
+        np.testing.assert_allclose(slope, differences, rtol=0, atol=1e-7 * scale)
+        np.testing.assert_allclose(reverse(delay), slope, rtol=0, atol=1e-12 * scale)
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.01, 0.02, 0.04])
