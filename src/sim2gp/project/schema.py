@@ -53,29 +53,28 @@ class PriorSpec(Section):
     high: FiniteFloat | None = None
     """Upper bound."""
     map: Map | None = None
-    """The scale of the fit: between bounds its place (bounded) or that of its logarithm
-    (log_bounded); without bounds its logarithm or itself. Older files say box and
-    log_box."""
+    """The scale of the fit: `bounded` or `identity` is the value, `log_bounded` or
+    `log` its logarithm. Older files say `box` and `log_box`."""
 
 
 class ParameterSpec(PriorSpec):
     """A prior of a parameter of the machine, or of all that a pattern names."""
 
     tie: bool = False
-    """All parameters of a pattern are one number for each quantity (MuJoCo models)."""
+    """All parameters of a pattern have one value for each quantity (MuJoCo models)."""
 
 
 class EffectSpec(PriorSpec):
-    """Physics that the machine's equations lack: its magnitude, as any parameter's.
+    """Physics that the machine's equations do not have; its magnitude is a parameter.
 
     ``[effects.theta.coulomb]`` adds the parameter ``theta.coulomb``; a bare
     number fixes it. Below are options of the effects that have them.
     """
 
     width: Positive | None = None
-    """Over which dry friction changes its sign (the channel's velocity)."""
+    """Velocity over which dry friction changes its sign."""
     speed: Positive | None = None
-    """Over which Stribeck friction falls (the channel's velocity)."""
+    """Velocity at which Stribeck friction falls."""
     smoothing: Positive | None = None
     """Width of the edge of a dead zone (the input's unit)."""
 
@@ -92,8 +91,7 @@ class ColumnSpec(Section):
     column: str
     """The column's name in the file."""
     unit: str | None = None
-    """What the file holds (`deg`, `mm`, `ms`, `rpm`, ...); by default the channel's
-    own."""
+    """The file's unit (`deg`, `mm`, `ms`, `rpm`, ...); by default the channel's."""
     sign: Literal[1, -1] = 1
     """The sensor's or motor's sign."""
     scale: FiniteFloat = 1.0
@@ -105,17 +103,18 @@ class ColumnSpec(Section):
 
 
 class ResampleSpec(Section):
-    """How streams with clocks of their own become one: every period, or as one has it.
+    """How streams with different clocks become one table of rows.
 
-    With neither, at the stamps of the slowest stream that measures.
+    Without `period` and `stamps`, the rows are the stamps of the slowest stream that
+    measures.
     """
 
     method: Literal["linear", "hold"] = "linear"
-    """How states between two samples are read."""
+    """How states between two samples are interpolated."""
     period: Positive | None = None
-    """Seconds between the rows that come out."""
+    """Seconds between the rows."""
     stamps: str | None = None
-    """A stream whose stamps are the rows, instead."""
+    """The stream whose stamps are the rows, instead of `period`."""
 
 
 class LogSpec(Section):
@@ -124,28 +123,28 @@ class LogSpec(Section):
     files: Annotated[list[str], Field(min_length=1)]
     """Paths or patterns (`*`, `**`); folders too."""
     name: Annotated[str, Field(pattern=r"^[^\s@]+$")] | None = None
-    """The machine's configuration in this group; its number if it has `fixed` or `free`
-    alone."""
+    """Name of the machine's configuration; without it, the number of the group if it
+    has `fixed` or `free`."""
     time: str | ColumnSpec | None = None
-    """The column of time, s, or in full as a column; "header" or "log" in a bag; the
-    column `time` if neither it nor `period` is given."""
+    """The column of time in s, or a column with its unit; "header" or "log" in a bag.
+    By default the column `time`, unless `period` is given."""
     period: Positive | None = None
-    """Seconds between rows, where no column says the time."""
+    """Seconds between rows, if no column has the time."""
     episode: str | None = None
     """A column of episode numbers."""
     resample: ResampleSpec | None = None
-    """How streams with clocks of their own become one."""
+    """How streams with different clocks become one."""
     keep_first: bool = False
     """Keep the first row of each stamp instead of `E108`."""
     exclude: list[Pair] = []
     """Seconds of each log to leave out."""
     columns: dict[str, str | FiniteFloat | ColumnSpec]
-    """By channel: its column; of an input also a constant number, `0.0` where it was
-    not driven."""
+    """The column of each channel. An input may be a number: `0.0` if it was not
+    driven."""
     fixed: dict[str, FiniteFloat] = {}
-    """Parameters known in this configuration alone, such as a payload's mass."""
+    """Parameters known in this configuration only, such as a payload's mass."""
     free: list[str] = []
-    """Parameters of this configuration alone, `x @ name` in the tables; all others are
+    """Parameters of this configuration only, `x @ name` in the tables; all others are
     shared."""
     drop_nonfinite: bool = False
     """Mask measurements and cut at inputs that are not finite instead of `E101`."""
@@ -178,23 +177,23 @@ class ActuatorSpec(Section):
 
 
 class LikelihoodSpec(Section):
-    """The fit's windows: their length, their starts, and the noise."""
+    """The windows of the fit: their length, their starts, and the noise."""
 
     window: Annotated[FiniteFloat, Field(ge=0)] = 0.2
-    """Seconds that the simulator runs before it starts again; 0 predicts one row from
-    the last, and needs every state measured."""
+    """Length in s: the simulator starts again after it. 0 predicts each row from the
+    one before, and needs every state measured."""
     start: Literal["smoothed", "causal"] = "smoothed"
-    """Where a window's start is guessed from: the samples around it, or the past alone,
-    as in a forecast."""
+    """Which samples give the first guess of a window's start: those around it, or only
+    past ones, as in a forecast."""
     robust: bool = False
     """Windows that do not fit count less (Student-t, 4 degrees of freedom): for pushes
     and collisions."""
     start_sd: Positive | dict[str, Positive] | None = None
-    """Sd of the start about that guess, by channel or for all; by default 100 sensor
-    steps of a measured state, and the size of an unmeasured one."""
+    """Sd of the start about that guess, by channel or for all. By default 100 sensor
+    steps if the state is measured, else its size."""
     noise_floor: Positive | dict[str, Positive] | None = None
-    """The least noise, by channel or for all; by default the sensor's step, as the log
-    shows it."""
+    """The smallest noise sd, by channel or for all; by default the sensor's step, which
+    is read from the log."""
 
 
 class ProjectSpec(Section):
@@ -203,12 +202,12 @@ class ProjectSpec(Section):
     system: str
     """A bundled [machine](#machines), or the path of an MJCF or URDF file."""
     options: dict[str, Any] = {}
-    """Settings of the [machine](#machines); of a model's file `root`, the folder its
-    parts must lie in."""
+    """Settings of the [machine](#machines). For an MJCF or URDF file: `root`, the
+    folder that has all its parts."""
     parameters: dict[str, FiniteFloat | ParameterSpec] = {}
-    """What is known of its parameters before the logs."""
+    """What is known about its parameters before the logs."""
     effects: dict[str, dict[str, FiniteFloat | EffectSpec]] = {}
-    """[physics](#effectschannelname) that its equations lack."""
+    """[physics](#effectschannelname) that its equations do not have."""
     weighed: list[WeighedSpec] = []
     """[sums of parameters](#weighed) that were measured, for example on a scale."""
     logs: list[LogSpec] = []
