@@ -1,7 +1,8 @@
 """What a model is: a recipe that turns data into a belief, and a belief gives draws.
 
-``init -> fit -> sample`` is all that a loop needs. Beside posterior sampling always
-stand the point estimate (certainty equivalence) and the unlearned prior mean.
+``init -> fit -> sample`` is all that a loop needs. Two alternatives to posterior
+sampling are always there: the point estimate (certainty equivalence) and the prior
+mean, which never learns.
 """
 
 from abc import abstractmethod
@@ -59,7 +60,7 @@ class AbstractBelief(eqx.Module):
 
     @in_float64
     def parameters(self) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
-        """Virtual mean and sd of a simulator's constants; empty where there are none.
+        """Virtual mean and sd of a simulator's parameters; empty where there are none.
 
         As many at every call: a run keeps them side by side.
         """

@@ -62,11 +62,11 @@ class Sim2GPError(Exception):
 
 
 class InputError(Sim2GPError):
-    """The user's input is at fault; the command line ends with exit code 2."""
+    """The user's input is wrong; the command line ends with exit code 2."""
 
 
 class NotConverged(Sim2GPError):
-    """E201: the MAP was not reached; ``known`` is the posterior where a fit stood."""
+    """E201: the MAP was not reached; ``known`` is the posterior where the fit ended."""
 
     known: object = None
 
@@ -89,7 +89,7 @@ class Sim2GPWarning(UserWarning):
 
 @dataclass(frozen=True)
 class Entry:
-    """The words of one error; ``$name`` stands for a field that is given with it."""
+    """The words of one error; a field that is given with it replaces ``$name``."""
 
     code: str
     title: str
@@ -156,7 +156,7 @@ def missing_extra(what: str, caught: ImportError, extra: str) -> InputError:
 
 @contextmanager
 def of_callbacks() -> Iterator[None]:
-    """Raise anew an `InputError` that compiled code met when it called back.
+    """Raise again an `InputError` that compiled code met when it called back.
 
     JAX passes on the text of what a callback raises, and nothing else.
     """

@@ -2,7 +2,7 @@
 
 Exit codes: 0 done, 1 a bug of ours (or a fit that failed), 2 the user's input, 74 the
 disk, 75 the run is another process's, 130 and 143 interrupted. Results go to stdout,
-everything else to stderr; a fault is one line, its traceback stands behind ``--debug``.
+everything else to stderr; an error is one line, and ``--debug`` shows its traceback.
 """
 
 import contextlib
@@ -48,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     with interruptible(entry=argv is None) as signals:
         try:
             code = _run_command(args)
-            sys.stdout.flush()  # here a reader that has gone is no fault, at exit it is
+            sys.stdout.flush()  # a closed pipe is no error here; at exit it is one
             return code
         except BaseException as error:
             # What a signal raises may arrive as an error of a library on its way.
@@ -61,7 +61,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _failed(caught: BaseException, debug: bool) -> int:
     """Say in one line what went wrong; returns the exit code."""
     if isinstance(caught, BrokenPipeError):
-        # Whoever read our output has gone; the interpreter must not flush into it.
+        # The reader of our output has gone: the interpreter must not flush into it.
         with open(os.devnull, "w") as nowhere:
             os.dup2(nowhere.fileno(), sys.stdout.fileno())
         return OK
@@ -89,7 +89,7 @@ def _run_command(args: list[str]) -> int:
     with warnings.catch_warnings():
         warnings.simplefilter("always", Sim2GPWarning)
         warnings.showwarning = _warner(progress, warnings.showwarning)
-        # Whatever a library prints must not mix with the summary.
+        # What a library prints must not mix with the summary.
         with contextlib.redirect_stdout(sys.stderr):
             call = Call(progress, shlex.join(["sim2gp", *args]))
             summary = command.run(call)  # type: ignore[attr-defined]

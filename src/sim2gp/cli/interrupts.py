@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM end a command within seconds, whatever it does at that moment.
+"""SIGINT and SIGTERM end a command within seconds, in compiled code as well.
 
 Python runs signal handlers in the main thread and between two instructions: while that
 thread is in compiled code, or XLA compiles for it, they wait for minutes or for ever.
@@ -148,7 +148,7 @@ def leave(code: int) -> NoReturn:
 
 
 def _end_process(code: int) -> NoReturn:
-    """End the process here and now, from whichever thread.
+    """End the process at once; any thread may call this.
 
     Nothing milder does: `sys.exit` ends the thread alone, and the interpreter joins
     threads and frees XLA's before it ends, which takes as long as they run.

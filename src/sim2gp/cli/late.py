@@ -42,7 +42,7 @@ class Call:
 
 
 class FirstFolder:
-    """The first answer of a long fit, as the run ``NAME-first`` until the whole stands.
+    """The first answer of a long fit, as the run ``NAME-first`` until all is written.
 
     Where the fit fails it stays.
     """
@@ -57,7 +57,7 @@ class FirstFolder:
         return str(self.folder)
 
     def replaced(self) -> None:
-        """The whole run stands: the first answer goes."""
+        """The whole run is written: remove the first answer."""
         if self.written:
             shutil.rmtree(self.folder, ignore_errors=True)
 

@@ -66,7 +66,7 @@ class Init(Common):
     budget: Seconds = 60.0
     """What it may take; readings that were not tried by then are named in the file."""
     no_readings: Flag = False
-    """Take signs, zeros and units as they stand."""
+    """Use signs, zeros and units as they are in the logs."""
     seed: Seed = 0
     """Draws the phases of the first experiment."""
 

@@ -75,7 +75,7 @@ class Writes(Common):
 
 @dataclass(kw_only=True)
 class Chosen(Common):
-    """The option of a command that needs the machine as it stands."""
+    """The option of a command that needs one configuration of the machine."""
 
     configuration: Name = None
     """Which one, where groups of logs are of several."""

@@ -38,7 +38,7 @@ Written = list[tuple[str, bytes]]
 
 @dataclass(frozen=True, repr=False)
 class AppliedModel(AbstractResult):
-    """A model's file with identified constants, which is written on request."""
+    """A model's file with identified parameters, which is written on request."""
 
     file: ModelFile | None = field(default=None)
     edited: Edited | None = field(default=None)
@@ -50,7 +50,7 @@ class AppliedModel(AbstractResult):
 
     @property
     def constants(self) -> dict[str, dict[str, Any]]:
-        """What each changed constant was and is, in its unit."""
+        """The old and new value of each changed parameter, in its unit."""
         return dict(self.summary["constants"])
 
     def save_model(self, out: Path | str) -> "AppliedModel":
@@ -80,11 +80,11 @@ def apply(
     posterior: Width = "corrected",
     progress: Progress | None = None,
 ) -> AppliedModel:
-    """The constants of an identification in its MuJoCo model's own file.
+    """Write the parameters of an identification into its MuJoCo model's own file.
 
     The machine is that of one ``configuration``, where it has several (E152);
     ``posterior`` says whose modes are written. Raises `InputError` E130 for a run
-    without a model's constants, E170 where the file cannot say them.
+    without a model's parameters, E170 where the file cannot express them.
     """
     project = _with_model(found)
     system = plant_of(project.system)
@@ -133,7 +133,7 @@ def _model_values(
     configuration: str | None,
     posterior: Width,
 ) -> tuple[dict[str, float], dict[str, str]]:
-    """The model's constants by name, and why the run's other ones are none."""
+    """The model's parameters by name, and why the run's other ones are none of them."""
     joint = project.system.parameters
     table, places = own_table(joint, project.system.variants, configuration)
     own = modes(found.arrays, joint, posterior)[list(places)]
@@ -173,7 +173,7 @@ def _write_models(file: ModelFile, edited: Edited, out: Path) -> list[Path]:
 
 
 def _changes_by_path(file: ModelFile, edited: Edited) -> dict[str, dict[str, Any]]:
-    """What each changed constant was and is."""
+    """The old and new value of each changed parameter."""
     table = {}
     for path, constant in file.constants.items():
         was, now = (constant.get(m) for m in (file.model, edited.wanted))

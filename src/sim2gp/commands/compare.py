@@ -1,10 +1,10 @@
 """Compare: which model do the logs support, the simulator, a residual, a black box?
 
 Recordings are left out in turn. A fit of the others' windows gives the simulator's
-constants, as `identify` does; smoothed one-step data of the same logs
-(`sim2gp.data.one_step_log`) then train what is learned beside it, with those constants
-given. All models forecast the recording left out, open loop, from the same causal
-starts: the best single prediction, and draws for the spread.
+parameters, as `identify` does. Smoothed one-step data of the same logs
+(`sim2gp.data.one_step_log`) then train the networks, with those parameters given. All
+models forecast the recording left out, open loop, from the same causal starts: the best
+single prediction, and draws for the spread.
 """
 
 import math
@@ -58,7 +58,7 @@ class ModelFactory(NamedTuple):
 
 Learners = Mapping[str, ModelFactory]
 WITH_RESIDUAL = "the simulator plus a learned residual"
-#: From simple to complex; each from the simulator with its constants given.
+#: From simple to complex; each from the simulator with its parameters given.
 MODELS: Learners = {
     "SIM2GP": ModelFactory(lambda sim, reach: sim, "the simulator alone"),
     "RES": ModelFactory(lambda sim, reach: Residual(sim, reach=reach), WITH_RESIDUAL),
@@ -257,7 +257,7 @@ def _trivial(setup: Setup, test: np.ndarray) -> np.ndarray:
 
 
 def _fit_without(setup: Setup, left: Sequence[int], key: jax.Array) -> Estimate:
-    """The simulator's constants from the windows of all logs but ``left``."""
+    """The simulator's parameters from the windows of all logs but ``left``."""
     mask = np.asarray(setup.windows.mask) & ~np.isin(setup.of, left)[:, None, None]
     kept = eqx.tree_at(lambda w: w.mask, setup.windows, mask)
     robust = setup.project.spec.likelihood.robust

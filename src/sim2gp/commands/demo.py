@@ -1,4 +1,4 @@
-"""The demo: swing up a pendulum whose constants are unknown, in a few trials.
+"""The demo: swing up a pendulum whose parameters are unknown, in a few trials.
 
 For each seed a machine is drawn from the prior, and three learners meet it under the
 same noise: posterior sampling, its point estimate, and the prior mean that never
@@ -54,7 +54,7 @@ class SeedRun:
 
 @dataclass(frozen=True, repr=False)
 class Demonstration(AbstractResult):
-    """What learners made of machines whose constants they did not know."""
+    """What learners achieved on machines whose parameters they did not know."""
 
     @property
     def returns(self) -> dict[str, np.ndarray]:
@@ -81,8 +81,9 @@ def demo(
 ) -> Demonstration:
     """Swing up ``seeds`` pendulums, each in so many ``episodes`` of 5 s.
 
-    ``truth`` are the hidden constants: as believed, so far off, or beyond their bounds.
-    ``sink`` (`sim2gp.sinks`) gets every episode's numbers at once.
+    ``truth`` says how the hidden parameters are drawn: from the prior, 2 or 3 sd from
+    its mean, or beyond their bounds. ``sink`` (`sim2gp.sinks`) gets every episode's
+    numbers at once.
     """
     started = time.perf_counter()
     make, preset = MACHINES[machine]

@@ -1,4 +1,4 @@
-"""Design: the next experiment on a machine, and what it should tell.
+"""Design: the next experiment on a machine, and what it should teach.
 
 From a finished identification, or from a project file alone, before any log exists. The
 commands keep their limits exactly; the states keep theirs for nearly all machines that
@@ -62,7 +62,7 @@ LOOSE = 1.0  # rad, m, rad/s or m/s: the sd of a window's start where none is st
 
 @dataclass(frozen=True, repr=False)
 class NextExperiment(AbstractResult):
-    """Commands for the machine, what it should do, and what that should tell.
+    """Commands for the machine, the motion to expect, and what it should teach.
 
     ``save("next.csv")`` writes the commands alone.
     """
@@ -80,7 +80,7 @@ class NextExperiment(AbstractResult):
 
     @property
     def expected_sd(self) -> dict[str, float]:
-        """Of each constant after the experiment, in its unit (plain)."""
+        """Expected sd of each parameter after the experiment, in its unit (plain)."""
         table = self.summary["expected_sd"]
         return {name: float(entry["expected_sd"]) for name, entry in table.items()}
 
@@ -106,18 +106,18 @@ def design(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> NextExperiment:
-    """The next experiment on a machine: its commands, and what it should tell.
+    """The next experiment on a machine: its commands, and what it should teach.
 
     source: what is known, or a project file's priors, where there is no log yet.
     limits: of inputs, states and rates, in addition to the project's.
     seconds: the duration; kind: the family of the commands.
-    about: constants to learn, all if none; predict: learn what predictions so many s
+    about: parameters to learn, all if none; predict: learn what predictions so many s
         ahead depend on; within: percent that is known well enough.
     start: where the machine rests before (0); period: of commands, s (the logs').
     starts: random motions that are improved; seed: draws machines and motions.
 
-    Raises `InputError`: E145 for an unknown constant, E103 for an unknown channel, E150
-    where the limits admit no motion, E151 for a duration shorter than a step.
+    Raises `InputError`: E145 for an unknown parameter, E103 for an unknown channel,
+    E150 where the limits admit no motion, E151 for a duration shorter than a step.
     """
     began = time.perf_counter()
     asked = DesignOptions(
@@ -231,7 +231,7 @@ def signal_of(kind: str, experiment: Experiment) -> AbstractCommandSignal:
 def goal_of(
     asked: DesignOptions, experiment: Experiment, limits: LimitBox, key: jax.Array
 ) -> AbstractGoal:
-    """What is asked about: all constants, some, or a prediction."""
+    """What the experiment is for: all parameters, some, or a prediction."""
     names = experiment.system.parameters.names
     for name in asked.about:
         if name not in names:
@@ -272,7 +272,7 @@ def _start_state(given: Mapping[str, float], system: AbstractSystem) -> Any:
 def expectation(
     experiment: Experiment, found: DesignResult
 ) -> dict[str, dict[str, Any]]:
-    """Of each constant: unit, mean and sd now, sd expected after, and their ratio.
+    """Of each parameter: unit, mean and sd now, sd expected after, and their ratio.
 
     All plain but ``corrected_sd``, today's with the model's errors allowed for.
     """

@@ -249,7 +249,7 @@ def _constants_table(
     logs: Sequence[Log],
     values: list[np.ndarray],
 ) -> dict[str, Any]:
-    """The constants of every fold: what does not stay put was not determined."""
+    """The parameters of every fold: one that moves between folds is not determined."""
     names = {log.source: log.name for log in logs}
     return {
         "title": "Parameters of each fit (most probable values)",
@@ -285,7 +285,7 @@ def _repeated(logs: Sequence[Log], files: Sequence[str]) -> list[Note]:
 
 
 def _training(fit: Identification) -> tuple[Log, ...] | None:
-    """The logs that a run was fitted to, where they still stand."""
+    """The logs that a run was fitted to, if they are still in their places."""
     try:
         return fit.training_logs()
     except InputError:

@@ -128,7 +128,7 @@ def example(folder: Path | str, *, progress: Progress | None = None) -> Path:
     for number, name in enumerate(("first.csv", "second.csv")):
         texts[name] = _csv_text(_recorded(number))
     try:
-        folder.mkdir()  # ours alone from here on: whatever fails, nothing of it is left
+        folder.mkdir()  # ours alone from here on: if anything fails, nothing is left
         with cleanup.registered(lambda: shutil.rmtree(folder, ignore_errors=True)):
             _write_texts(folder, texts)
     except OSError as caught:

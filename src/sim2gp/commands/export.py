@@ -1,4 +1,4 @@
-"""Export: draws of an identified machine, for whatever trains on many machines.
+"""Export: draws of an identified machine, for a trainer that uses many machines.
 
 Row ``i`` of all ``draws/NAME`` is one machine, in physical units; of a MuJoCo model it
 is also the file ``variant_00i.xml``. Draws are as wide as the report's intervals.

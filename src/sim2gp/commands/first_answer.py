@@ -23,7 +23,7 @@ SOON = 1.0  # posterior sd that a first answer may be from its MAP
 
 
 class FirstAnswer:
-    """Told of each step of a fit; ``keep`` gets the answer and says where it is."""
+    """Called at each step of a fit; ``keep`` gets the answer and returns its place."""
 
     def __init__(
         self,
@@ -60,7 +60,7 @@ class FirstAnswer:
     def _answer(
         self, known: Estimate, failure: NotConverged | None = None
     ) -> Identification:
-        """The posterior as it stands, marked as no final one."""
+        """The posterior so far, marked as not final."""
         return Identification(_summary(self.project, self.logs, known, failure))
 
 

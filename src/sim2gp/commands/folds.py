@@ -1,7 +1,7 @@
 """A fit of some of the windows, held against data that it has not seen.
 
 `evaluate` leaves one recording out after the other; `identify` leaves out one, so that
-its report can show forecasts of data that no constant was fitted to. Windows are
+its report can show forecasts of data that no parameter was fitted to. Windows are
 masked, not removed: fits of all and of some share one compilation.
 """
 

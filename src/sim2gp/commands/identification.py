@@ -1,4 +1,4 @@
-"""The result of `identify`: a posterior over the constants of a machine.
+"""The result of `identify`: a posterior over the parameters of a machine.
 
 It is the same object where it was just made and where `load_run` reads it back.
 """
@@ -34,7 +34,7 @@ _PREFIX = {"corrected": "intervals", "plain": "belief"}
 
 @dataclass(frozen=True)
 class IdentifiedConstant:
-    """What is known of one constant, in its physical unit.
+    """What is known of one parameter, in its physical unit.
 
     ``interval`` holds it with 95 % probability, allowing for errors of the model.
     """
@@ -52,7 +52,7 @@ class IdentifiedConstant:
 
 @dataclass(frozen=True, repr=False)
 class Identification(AbstractResult):
-    """The posterior of a machine's constants, what it was fitted to, and the summary.
+    """The posterior of a machine's parameters, what it was fitted to, and the summary.
 
     A ``first_answer`` has a summary alone: no posterior to go on with.
     """
@@ -61,12 +61,12 @@ class Identification(AbstractResult):
 
     @property
     def machine(self) -> AbstractSystem:
-        """The machine whose constants these are."""
+        """The machine whose parameters these are."""
         return self._project.system
 
     @property
     def parameters(self) -> dict[str, IdentifiedConstant]:
-        """Each constant by name, in physical units."""
+        """Each parameter by name, in physical units."""
         fields = ("unit", "mean", "sd", "prior_mean", "prior_sd", "verdict")
         return {
             name: IdentifiedConstant(
@@ -140,7 +140,7 @@ class Identification(AbstractResult):
     def training_logs(
         self, *, strict: bool = False, alike: bool = False
     ) -> tuple[Log, ...]:
-        """What it was fitted to: as given, or read from where the files stood."""
+        """The logs of the fit: as given, or read from the files' recorded places."""
         if self.logs is not None:
             if alike:
                 self._project.check_alike()
@@ -156,7 +156,7 @@ class Identification(AbstractResult):
 
 @in_float64
 def physical_mode(table: Parameters, tt: AnyArray) -> np.ndarray:
-    """The constants at the posterior's mode, in physical units."""
+    """The parameters at the posterior's mode, in physical units."""
     return np.asarray(table.constrain(np.asarray(tt, float)))
 
 
@@ -169,7 +169,7 @@ def _stored_posterior(x: Mapping[str, np.ndarray], which: Width) -> Gaussian:
 
 
 def modes(x: Mapping[str, np.ndarray], table: Parameters, which: Width) -> np.ndarray:
-    """The constants at a posterior's mode, in physical units, as they were fitted.
+    """The parameters at a posterior's mode, in physical units, as they were fitted.
 
     ``x`` are the run's arrays. E170 where a run of an older version does not say them,
     and the model's file has changed since.
@@ -198,7 +198,7 @@ def posterior_entries(summary: Mapping[str, Any], which: Width) -> dict[str, Any
 
 
 def recorded_project_path(run: Path, summary: dict[str, Any]) -> Path:
-    """Where the project file of an identification stood."""
+    """Where the project file of an identification was."""
     about = summary.get("project", {})
     place = run / about.get("folder", "") / about.get("file", PROJECT)
     return Path(os.path.normpath(place))
@@ -211,7 +211,7 @@ def project_of(
     model: Path | None = None,
     machine: AbstractSystem | None = None,
 ) -> Project:
-    """The run's own copy of its project; its logs and model's file where they stood.
+    """The run's own copy of its project; its logs and model's file in their old places.
 
     ``model`` is another file of the model, ``machine`` one of the user's own.
     """
@@ -225,7 +225,7 @@ def project_of(
 def restore_identification(
     run: Path, machine: AbstractSystem | None = None
 ) -> Identification:
-    """What `identify` saved (E130 for another folder, E184 for other constants)."""
+    """What `identify` saved (E130 for another folder, E184 for other parameters)."""
     stored = load_run(run)
     check_identified(run, stored)
     project = project_of(run, stored, machine=machine)
@@ -244,7 +244,7 @@ def check_identified(run: Path, stored: Run) -> None:
 
 
 def _check_constants(run: Path, project: Project, summary: dict[str, Any]) -> None:
-    """The run's copy of its project still opens the constants that it holds (E184)."""
+    """The run's copy of its project still opens the run's parameters (E184)."""
     now, fitted = project.system.parameters.names, tuple(summary["parameters"])
     if now == fitted:
         return

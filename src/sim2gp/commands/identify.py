@@ -1,4 +1,4 @@
-"""Identify: the posterior of a machine's constants from its logs.
+"""Identify: the posterior of a machine's parameters from its logs.
 
 The result keeps what a later command needs to predict with it: the project file, the
 posterior over virtual values, and what the band of its forecasts is made of.
@@ -38,13 +38,13 @@ def identify(
     first: Callable[[Identification], str] | None = None,
     progress: Progress | None = None,
 ) -> Identification:
-    """Fit the constants of a machine to logs: a project's own, if None are given.
+    """Fit the parameters of a machine to logs: a project's own, if None are given.
 
     ``seed`` draws the starts of the fit. ``check`` holds Laplace's posterior against
     the exact one by importance sampling, ``nuts`` against draws of it (E135 without the
-    extra ``mcmc``); ``longer`` asks what longer windows would tell; ``held_out`` fits
-    once more without some of the data, and forecasts those. Where a fit takes its time,
-    ``first`` gets a first answer, and what a failed one knows; it returns what to say.
+    extra ``mcmc``); ``longer`` also fits longer windows; ``held_out`` fits once more
+    without some of the data, and forecasts those. Where a fit takes its time, ``first``
+    gets a first answer, and what a failed one knows; it returns what to say.
     Raises `InputError` for logs that do not fit the machine, `NotConverged` E201,
     `DeadParameters` E146.
     """

@@ -176,7 +176,7 @@ def _identification_summary(
 
 
 def identified_headline(parameters: dict[str, dict[str, Any]]) -> str:
-    """How many constants the logs determine, and which they do not."""
+    """How many parameters the logs determine, and which they do not."""
     sure = [n for n, entry in parameters.items() if entry["verdict"] == "identified"]
     rest = [n for n in parameters if n not in sure]
     text = f"{len(sure)} of {len(parameters)} parameters are identified"
@@ -198,7 +198,7 @@ def _noise_words(
     windows: Windows,
     unit: dict[str, str],
 ) -> list[str]:
-    """What the window noise holds beside the sensor's own."""
+    """What the window noise contains in addition to the sensor's own."""
     out = []
     for name, floor in zip(names, np.asarray(windows.floor), strict=True):
         times = noise[name] / float(floor)

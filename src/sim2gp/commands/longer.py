@@ -1,9 +1,9 @@
-"""Would longer windows tell more? A second fit; and does the simulator hold so long?
+"""A second fit: would longer windows teach more, and is the simulator right so long?
 
-Each window begins at an unknown start, which takes up much of what a short one tells.
-Of a longer one more is left for the constants, and the simulator must be right for
-longer: the misfit tests of such a fit find physics that is too slow to show in a short
-window (`benchmarks/intervals.py`, docs/intervals.md).
+Each window begins at an unknown start, which uses up much of the information of a short
+window. A longer window leaves more for the parameters, but the simulator must be right
+for longer: the misfit tests of such a fit find physics that is too slow to show in a
+short window (`benchmarks/intervals.py`, docs/intervals.md).
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,7 +27,7 @@ TIMES = 5.0  # as long as the project's
 _UNASKED = (
     "The misfit tests find nothing: longer windows may narrow the intervals (--longer)."
 )
-WORTH = 0.8  # of the present sd: what some constant's must fall to
+WORTH = 0.8  # of the present sd: some parameter's sd must fall to this
 
 
 class Longer(NamedTuple):
@@ -110,7 +110,7 @@ def fit_longer_windows(
         return no("one row is predicted from the last")
     if alarm:
         return no("the misfit tests find something in these windows already")
-    try:  # the run is done, whatever becomes of this
+    try:  # the run is done, even if this fails
         windows, of = cut_logs(project, logs, TIMES)
         system = project.system
         fitted = fit_windows(system, windows, key=key, robust=stated.robust)

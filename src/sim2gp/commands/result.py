@@ -70,7 +70,7 @@ class AbstractResult:
         return folder
 
     def at(self: R, folder: Path) -> R:
-        """The same, its summary as it will stand in ``folder``."""
+        """The same, with the summary that ``folder`` will have."""
         if self.project is None:
             return self
         return self.with_entries(project=_project_place(self.project, folder))
@@ -103,7 +103,7 @@ def numeric_entries(table: Mapping[str, Any] | None) -> dict[str, float]:
 
 
 def _project_place(project: Project, run: Path) -> dict[str, str]:
-    """Where the project file stands, seen from the run."""
+    """Where the project file is, seen from the run."""
     folder = Path(os.path.abspath(project.path)).parent
     place = os.path.relpath(folder, os.path.abspath(run))
     return {"file": project.path.name, "folder": place}

@@ -126,7 +126,7 @@ def measure(check: Check, rng: np.random.Generator) -> dict[str, Any]:
     started = time.perf_counter()
     try:
         figure, error = float(check.measure(rng)), ""
-    except Exception as fault:  # whatever breaks here is what we want to be told
+    except Exception as fault:  # any error here is a result of the test
         figure, error = np.nan, f"{type(fault).__name__}: {fault}".split("\n")[0]
     row = {
         "result": "PASS" if figure <= check.limit else "FAIL",

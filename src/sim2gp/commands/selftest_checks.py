@@ -142,15 +142,15 @@ def unit_invariance(rng: Rng) -> float:
 
 @in_float64
 def degenerate(rng: Rng) -> float:
-    """Departure from the prior in whatever the data do not determine; no NaN."""
+    """Departure from the prior in all that the data do not determine; no NaN."""
     J = rng.standard_normal((8, 12, 2, 4))
     J[0] = 0.0  # zero sensitivity
     J[1, 1:] = 0.0  # one row
     J[2] = 1e3 * J[2, :1]  # equal rows
     J[7] = 1e3 * J[7, 0, 0]  # all of them equal
     J[3] = J[3, :, :, :1] * J[3, 0, 0]  # rank one
-    J[4, :, :, 2] = 0.0  # one dead constant
-    J[5, :, :, 3] = J[5, :, :, 2]  # two constants that act alike
+    J[4, :, :, 2] = 0.0  # one parameter without effect
+    J[5, :, :, 3] = J[5, :, :, 2]  # two parameters that act alike
     U, V = (np.linalg.qr(rng.standard_normal((n, 4)))[0] for n in (24, 4))
     J[6] = ((U * np.logspace(0.0, -16.0, 4)) @ V.T).reshape(12, 2, 4)
     y, mean = rng.standard_normal((8, 12, 2)), rng.standard_normal((8, 4))

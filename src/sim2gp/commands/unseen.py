@@ -1,7 +1,7 @@
 """Forecasts of data that a fit has not seen, for the report of `identify`.
 
-The constants of a run rest on all of its logs. Here they are fitted once more without
-the last recording (or the end of the only one), which is then forecast.
+The parameters of a run are fitted to all of its logs. Here they are fitted once more
+without the last recording (or the end of the only one), which is then forecast.
 """
 
 from collections.abc import Sequence
@@ -51,7 +51,7 @@ def forecast_unseen(
 ) -> Unseen:
     """A second fit, of a part of the windows, and its forecasts of the rest.
 
-    It begins where the ``whole`` logs put constants, starts and noise, and has as many
+    It begins at the parameters, starts and noise of the ``whole`` logs, and has as many
     starts to choose from as that fit: the two share their compilation.
     """
     part = split_held_out(logs, windows, places, grid)

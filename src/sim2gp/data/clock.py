@@ -1,7 +1,7 @@
 """The clock of a log and the steps of a simulator that has its own.
 
 Between two rows a simulator takes a whole number of equal steps, none longer than its
-own. Its constants are those of that step: semi-implicit Euler with ``h`` makes a servo
+own. Its parameters are those of that step: semi-implicit Euler with ``h`` makes a servo
 of gain ``kp`` act as if its damping were ``kp h / 2`` smaller. So jitter of the stamps
 must not become jitter of the steps: stamps of an even clock are taken as even.
 """

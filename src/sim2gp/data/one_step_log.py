@@ -136,7 +136,7 @@ def smoothed_states(
 ) -> Float[np.ndarray, "N n"]:
     """The states in the middle of their samples, by simulation and parabola.
 
-    ``system`` and its virtual constants ``tt`` are those of the windows' fit.
+    ``system`` and its virtual parameters ``tt`` are those of the windows' fit.
     """
     names = [channel.name for channel in system.physical_states]
     w = samples.windows

@@ -25,7 +25,8 @@ SPACING = 0.1  # s, between the starts of forecasts
 #: A start's unmeasured rate may lie so many times its rms away, or what slopes over
 #: different times differ by. A servo forgets its start's rate at once: only this prior
 #: keeps it from where forces saturate, where a simulation jumps (with 10 in place of 3
-#: one of the thirty windows of an arm's log began there, and its constants followed).
+#: one of the thirty windows of an arm's log began there, and the parameters followed
+#: it).
 FAR = 3.0
 Start = Literal["smoothed", "causal"]
 
@@ -42,9 +43,9 @@ def cut(
     """Windows of ``window`` seconds that use every row once, and (log, row) of each.
 
     ``window = 0`` gives the one-step likelihood, which needs every state measured.
-    A ``causal`` start knows the past alone and stands where forecasts start, 0.1 s
-    into the log first: an excitation that switches on that grid makes the error of a
-    filtered start depend on its phase (measured: twice the error between).
+    A ``causal`` start knows the past alone. It is where forecasts start, first 0.1 s
+    into the log: an excitation that switches on that grid makes the error of a filtered
+    start depend on its phase (measured: twice the error between).
     Raises `InputError` E116 where nothing can be cut, E103 where a state is missing or
     unknown, E144 for a sd or a floor that is not positive, E145 for another ``start``,
     E148 for a length that is negative.
@@ -113,7 +114,7 @@ def assemble(
 
     The start's prior is a local parabola's value and slope, with a spread far wider
     than its error, so that the same rows are not believed twice, and no slope that a
-    coarse clock blurs pulls at the constants. A causal start is the recorded value and
+    coarse clock blurs pulls at the parameters. A causal start is the recorded value and
     the slope of the parabola through the past alone.
     """
     actions = [channel.name for channel in system.actions]

@@ -1,6 +1,6 @@
 """Windows that a simulator on the host moves, and their derivatives.
 
-What is asked of each window is affine in a vector ``x`` about zero: its constants, its
+What is asked of each window is affine in a vector ``x`` about zero: its parameters, its
 start, and what is added to its inputs. All is NumPy: to trace and compile these few
 derivatives would take longer than a fit asks for them.
 """
@@ -26,7 +26,7 @@ from sim2gp.types import AnyArray
 class SlopeInputs(NamedTuple):
     """Windows at ``x = 0``, and how they move with it.
 
-    Virtual constants ``tt`` (of all windows, or of each) and start states, with their
+    Virtual parameters ``tt`` (of all windows, or of each) and start states, with their
     slopes, and the slopes of what every input has added.
     """
 
@@ -103,7 +103,7 @@ class HostRun:
 def _given_by(
     names: OnHost, system: AbstractSystem, windows: Pieces, asked: SlopeInputs
 ) -> tuple[OnHost, OnHost]:
-    """The constants of each window that have these names, and their slopes."""
+    """The parameters of each window that have these names, and their slopes."""
     which = np.zeros(len(asked.start), int)
     if isinstance(windows, Windows):
         which = np.asarray(windows.configuration)
@@ -141,7 +141,7 @@ def _altered(
     constants: Float[AnyArray, "W r"],
     inputs: Float[AnyArray, "W L m"],
 ) -> tuple[Array, Array, Array]:
-    """What becomes of the inputs, and its slopes in each of them and the constants."""
+    """The inputs that arrive, and their slopes in each input and in the parameters."""
 
     def one(c: Array, a: Array) -> tuple[Array, Array, Array]:
         value, by_c = value_and_jacobian(lambda c: machine.altered(c, a), c)

@@ -128,7 +128,7 @@ class WindowsLikelihood(AbstractLikelihood):
         e: Float[np.ndarray, "W n"],
         scale: Float[np.ndarray, "p p"],
     ) -> HostRun:
-        """All windows on the host, with slopes in starts and constants, whitened."""
+        """All windows on the host, with slopes in starts and parameters, whitened."""
         simulator, windows = simulator_of(self.system), self.windows
         assert simulator is not None
         start = windows.start + windows.start_sd * e
@@ -160,10 +160,10 @@ def start_states(windows: Windows, fitted: Estimate) -> Float[np.ndarray, "W n"]
 
 
 class Linearised(NamedTuple):
-    """Every row of every window at one vector of constants, windows from their starts.
+    """Every row of every window at one vector of parameters, windows from their starts.
 
-    ``jacobian`` is that of the residuals in the constants and in the window's own start
-    state, per prior sd of each. Masked entries of both are zero.
+    ``jacobian`` is that of the residuals in the parameters and in the window's own
+    start state, per prior sd of each. Masked entries of both are zero.
     """
 
     residual: Float[Array, "W L c"]

@@ -1,4 +1,4 @@
-"""The next experiment: commands within limits, chosen by what they should tell."""
+"""The next experiment: commands within limits, chosen by what they should teach."""
 
 from sim2gp.experiment_design.experiment import (
     Experiment,

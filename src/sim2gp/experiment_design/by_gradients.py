@@ -69,7 +69,7 @@ def compiled_programs(
 def _coarser(
     experiment: Experiment, signal: AbstractCommandSignal
 ) -> tuple[Experiment, AbstractCommandSignal]:
-    """As long and as telling, with periods of `GRID`: for a search, long enough."""
+    """As long and as informative, with periods of `GRID`: enough for a search."""
     k = math.floor(GRID / experiment.period + 1e-9)
     k = max(1, min(k, experiment.steps // 2))
     period, steps = k * experiment.period, experiment.steps // k

@@ -1,6 +1,6 @@
 """The search for a machine that a simulator on the host moves, without gradients.
 
-Its simulator tells slopes of states, but not how information moves with the commands.
+Its simulator gives slopes of states, but not how information changes with the commands.
 So an evolution strategy draws commands: the next ones lie between two of the best, with
 something new. Every motion is simulated with its slopes, as a fit simulates logs.
 """

@@ -1,4 +1,4 @@
-"""What an experiment that was not made yet would tell: the likelihood of logs, ahead.
+"""The expected information of an experiment: the likelihood of logs not yet recorded.
 
 The commands are held over each period, the outputs are sampled at its ends, and what is
 learned is exactly what `data.windows` would learn from that log: windows that do not
@@ -82,7 +82,7 @@ class Experiment(eqx.Module):
         return self.belief if self.corrected is None else self.corrected
 
     def record(self, tt: Float[Array, " p"]) -> Any:
-        """Constants, at virtual values."""
+        """The parameters at virtual values."""
         return self.system.record(self.system.parameters.values(tt))
 
 
@@ -130,7 +130,7 @@ def information(
 
 
 def about_constants(J: Float[Array, "N q"], n: int) -> Float[Array, "rows p"]:
-    """Rows in all of a window's unknowns as rows in its constants alone.
+    """Rows in all of a window's unknowns as rows in its parameters alone.
 
     What an unknown start, of unit prior, explains as well is projected out: twice, as
     the second time takes what rounding left. Every factor here has full rank, so that

@@ -1,8 +1,8 @@
-"""What an experiment is for: all constants, some of them, or a prediction.
+"""What an experiment is for: all parameters, some of them, or a prediction.
 
 Each goal counts nats: half the log of how much a variance (a volume, a mean square)
-shrinks. Goals can therefore be compared, and an experiment that tells nothing of what
-is asked is worth 0.
+shrinks. So goals can be compared, and an experiment without information about the goal
+is worth 0.
 """
 
 from abc import abstractmethod
@@ -36,7 +36,7 @@ class AbstractGoal(eqx.Module):
 
 
 class DOptimal(AbstractGoal):
-    """All constants alike: the volume of the whole belief (D-optimality)."""
+    """All parameters alike: the volume of the whole belief (D-optimality)."""
 
     def uncertainty(self, scale: Scale) -> Scalar:
         return log_det_factor(triangular(scale.T))
@@ -46,7 +46,7 @@ class DOptimal(AbstractGoal):
 
 
 class SubsetDOptimal(AbstractGoal):
-    """Some constants, whatever becomes of the others: their marginal's volume."""
+    """Some parameters, without regard to the others: their marginal's volume."""
 
     index: tuple[int, ...] = eqx.field(static=True)
 

@@ -1,7 +1,7 @@
 """What a machine may be asked to do: limits of inputs, their rates, and its states.
 
 Commands keep their limits exactly, by construction; states keep them as far as the
-belief can tell.
+belief can predict.
 """
 
 import math

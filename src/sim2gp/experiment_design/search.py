@@ -1,6 +1,6 @@
 """The search: the commands whose worth, over draws of the belief, is largest.
 
-Worth is averaged over draws of the constants, because information depends on them. A
+Worth is averaged over draws of the parameters, because information depends on them. A
 random motion is improved along gradients (`by_gradients`), or where a simulator on the
 host moves the machine, by samples (`by_samples`). What is returned has passed on draws
 that had no part in the search, made smaller where it did not.
@@ -27,14 +27,14 @@ from sim2gp.systems.host import simulator_of
 from sim2gp.types import AnyArray, Key, in_float64
 
 STARTS = 1  # random motions
-DRAWS = 4  # of the constants, that information is averaged over, its mean first
+DRAWS = 4  # of the parameters, to average information over; the mean is first
 ALLOWED = 0.01  # the share of draws that may leave the limits
 SMALLER = 0.97  # times the commands, where too many still do
 MILD = 0.03  # of an input's range, the sd of each tone of a random motion
 
 
 class DesignResult(eqx.Module):
-    """Commands, and what they are expected to do and to tell.
+    """Commands, and their expected motion and information.
 
     nats: of the goal, on average over draws.
     scale: square root of the expected covariance at the belief's mean.
@@ -69,8 +69,8 @@ def optimise_commands(
     Raises `InputError` E150 where none of them keeps the limits, E148 for no draws or
     starts.
 
-    Their worth is averaged over ``draws`` of the constants, the mean being the first.
-    The best of what is found from so many random motions.
+    Their worth is averaged over ``draws`` of the parameters; the mean is the first. The
+    best of what is found from so many random motions.
     """
     checks.count("design", draws=draws, starts=starts)
     experiment, goal, limits = jax.tree.map(jnp.asarray, (experiment, goal, limits))

@@ -1,4 +1,4 @@
-"""What a search over commands is made of, whatever moves the machine."""
+"""What a search over commands is made of, for a simulator in JAX or on the host."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -9,7 +9,7 @@ from sim2gp.types import AnyArray, Key
 
 
 class SearchPrograms(NamedTuple):
-    """Better coefficients, draws' states and excess over limits, and what is told.
+    """Better coefficients, draws' states and excess over limits, and the information.
 
     The last of commands: nats, the belief's scale after them, and the mean's states.
     """

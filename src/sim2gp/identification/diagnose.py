@@ -1,4 +1,4 @@
-"""Which constants do the data determine, how well, and which combinations they leave.
+"""Which parameters the data determine, how well, and which combinations stay open.
 
 Everything follows from four things that every belief about parameters has: the table,
 the prior ``N(mu0, L0 L0^T)``, the posterior, and a factor ``A`` of the data's Fisher
@@ -56,11 +56,11 @@ def summary(
     """What summary.json says about the parameters, in physical units and in words.
 
     ``information`` is the factor ``A`` at the MAP; ``fisher_at(tt)`` the same factor at
-    another virtual vector, which tells combinations that hold everywhere from those
+    another virtual vector. It separates combinations that hold everywhere from those
     that hold at the MAP only ("locally"). With a ``corrected`` posterior
-    (`identification.intervals.scatter`) all sd and intervals are its own, each constant
-    has those of the plain ``posterior`` under ``plain`` and is ``widened`` so many
-    times; what is flat or traded off follows from the Fisher information as ever.
+    (`identification.intervals.scatter`) all sd and intervals are its own, each
+    parameter has those of the plain ``posterior`` under ``plain``, and ``widened`` is
+    the ratio; what is flat or traded off follows from the Fisher information as ever.
     """
     known = posterior if corrected is None else corrected
     spec = spectrum(parameters, prior, known, information, at=posterior.mean)
@@ -103,7 +103,7 @@ def arrays(
 def _physical(
     parameters: Parameters, gaussian: Gaussian, rng: np.random.Generator, count: int
 ) -> Float[np.ndarray, "draws p"]:
-    """Draws of the constants in their units."""
+    """Draws of the parameters in their units."""
     mean, scale = np.asarray(gaussian.mean), np.asarray(gaussian.scale)
     return parameters.constrain(
         mean + rng.normal(size=(count, scale.shape[1])) @ scale.T

@@ -46,10 +46,10 @@ def fit_windows(
     is believed but for measured sums. The descent begins at the prior's mean and
     elsewhere, or at the ``warm_start``, another fit of windows like these: that is
     quick, and with as many ``starts`` compiles nothing. Where a simulator on the host
-    moves the machine, ``report`` is told of each step, and starts are compared on some
-    of the windows. Raises `NotConverged`,
-    `NotFinite` or `DeadParameters`, and `InputError` E148 for no starts, E140 for a
-    prior of another number of parameters.
+    moves the machine, ``report`` is called after each step, and starts are compared on
+    some of the windows.
+    Raises `NotConverged`, `NotFinite` or `DeadParameters`, and `InputError` E148 for no
+    starts, E140 for a prior of another number of parameters.
     """
     checks.count("fit_windows", starts=starts)
     prior = system.parameters.prior() if prior is None else prior

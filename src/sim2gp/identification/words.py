@@ -41,7 +41,7 @@ def descending_order(sizes: np.ndarray) -> list[int]:
 def weighted_sum(weights: np.ndarray, names: Sequence[str]) -> str:
     """``0.9 a + 0.2 b``, largest terms first, those below a fifth of it left out.
 
-    A term that stands alone stands for itself, whatever its weight.
+    A single term is its name alone, without its weight.
     """
     size = np.abs(weights)
     order = [j for j in descending_order(size) if size[j] > 0.2 * size.max()]

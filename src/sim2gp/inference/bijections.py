@@ -1,4 +1,4 @@
-"""The maps between virtual values ``tt`` on the whole line and physical constants.
+"""The maps between virtual values ``tt`` on the whole line and physical parameters.
 
     bounded      theta = low + (high - low) sigmoid(tt)
     log_bounded  log theta = log low + (log high - log low) sigmoid(tt)

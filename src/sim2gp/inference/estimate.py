@@ -36,7 +36,7 @@ from sim2gp.types import AnyArray, AnyScalar, Key, Scalar, in_float64
 SPREAD = 0.7  # prior sd, of starts that are drawn
 
 
-#: Told of each step that a fit on the host keeps, and how to have its posterior.
+#: Called with each step that a fit on the host keeps, and a function for its posterior.
 Report = Callable[[Progress, Callable[[], "Estimate"]], None]
 
 
@@ -110,9 +110,9 @@ def estimate(
     ``nuisances`` and ``noise`` are those of another fit to begin with; zeros and the
     likelihood's own first noise without. Rounds beyond those ``needed``, and starts
     that are no number, are compiled and not taken. A simulator on the host learns the
-    noise in turns with its steps until both rest, the step at ``until`` posterior sd,
-    and says to ``report`` after each of them where it stands. What did not converge is
-    reported by `Convergence.check`.
+    noise in turns with its steps until both rest, the step at ``until`` posterior sd.
+    After each of them it calls ``report``. What did not converge is reported by
+    `Convergence.check`.
     """
     if nuisances is None:
         shape = len(likelihood.counts), likelihood.n_nuisances

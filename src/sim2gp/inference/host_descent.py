@@ -47,7 +47,7 @@ Update = Callable[[Laplace, Noise], Noise]
 
 
 class Progress(NamedTuple):
-    """Where a descent stands after a step that was kept.
+    """The state of a descent after a step that was kept.
 
     ``away`` is the largest entry of Newton's step, or of the shortest step that is
     known to gain nothing, in posterior sd: so far the MAP may be.

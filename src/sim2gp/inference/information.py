@@ -1,11 +1,11 @@
-"""What transitions are expected to tell, in nats, before anyone has made them.
+"""The information that transitions are expected to give, in nats, before they are made.
 
 A belief sees the next state through standard normal coordinates ``e``: those that all
-outputs share, ``e_0`` (the constants), and each output's own ``e_k`` (its last layer),
+outputs share, ``e_0`` (the parameters), and each output's own ``e_k`` (its last layer),
 
     s'_k / sig_k = mean + shared_k(x)^T e_0 + own_k(x)^T e_k + noise of sd 1
 
-(`AbstractBelief.sensitivity`). Whatever comes out, a linear-Gaussian belief learns
+(`AbstractBelief.sensitivity`). For any outcome a linear-Gaussian belief learns
 
     IG(X) = 1/2 logdet(I + A A^T),       A = all rows [shared | 0 .. own_k .. 0] of X.
 

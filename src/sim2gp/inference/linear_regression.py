@@ -163,7 +163,7 @@ def condition(
     """One observation ``residual_k = J_k (z - E z) + phi_k^T (W_k - E W_k) + eps_k``.
 
     A square-root Kalman update (Potter 1963), output after output, ``O(d m^2)``. It is
-    exact for the joint Gaussian, whatever the layer and the parameters have in common.
+    exact for the joint Gaussian, for any correlation of the layer and the parameters.
     ``phi`` may differ between outputs by their scale.
     """
     d = noise.size

@@ -1,7 +1,7 @@
-"""Physical constants as random variables: prior, bounds, unit and meaning on one line.
+"""Physical parameters as random variables: prior, bounds, unit and meaning on one line.
 
 Every Gaussian lives on an unconstrained *virtual* value ``tt`` (the paper's theta
-tilde), mapped one by one onto the physical constant ``theta``
+tilde), mapped one by one onto the physical parameter ``theta``
 (`sim2gp.inference.bijections`).
 """
 
@@ -33,7 +33,7 @@ BOX_SD = 1.5
 
 @dataclass(frozen=True)
 class Parameter:
-    """One constant: its name, unit, meaning, map, bounds, and virtual prior.
+    """One parameter: its name, unit, meaning, map, bounds, and virtual prior.
 
     ``mean`` and ``sd`` describe the virtual value; ``nominal`` is the published
     physical value, where there is one.
@@ -85,14 +85,14 @@ class Parameter:
 def bounded(
     low: float, high: float, unit: str, meaning: str, *, nominal: float | None = None
 ) -> Any:
-    """Field of a record: a constant in the box ``[low, high]``, nearly uniform."""
+    """Field of a record: a parameter in the box ``[low, high]``, nearly uniform."""
     return _field(Parameter("", unit, meaning, "bounded", low, high, nominal=nominal))
 
 
 def log_bounded(
     low: float, high: float, unit: str, meaning: str, *, nominal: float | None = None
 ) -> Any:
-    """Field of a record: a constant whose logarithm is nearly uniform in a box."""
+    """Field of a record: a parameter whose logarithm is nearly uniform in a box."""
     return _field(
         Parameter("", unit, meaning, "log_bounded", low, high, nominal=nominal)
     )
@@ -101,7 +101,7 @@ def log_bounded(
 def positive(
     mean: float, sd: float, unit: str, meaning: str, *, nominal: float | None = None
 ) -> Any:
-    """Field of a record: a log-normal constant of the given physical mean and sd."""
+    """Field of a record: a log-normal parameter of the given physical mean and sd."""
     blank = Parameter("", unit, meaning, "log", 0.0, nominal=nominal)
     return _field(prior_from_moments(blank, mean, sd))
 
@@ -109,7 +109,7 @@ def positive(
 def signed(
     mean: float, sd: float, unit: str, meaning: str, *, nominal: float | None = None
 ) -> Any:
-    """Field of a record: a Gaussian constant of any sign."""
+    """Field of a record: a Gaussian parameter of any sign."""
     return _field(
         Parameter("", unit, meaning, "identity", mean=mean, sd=sd, nominal=nominal)
     )
@@ -129,7 +129,7 @@ def prior_from_moments(
     """The parameter with a prior of the given *physical* mean and sd.
 
     With bounds, the virtual prior is matched in that box's map by quadrature; without,
-    it is log-normal where the constant is positive and Gaussian where it has a sign.
+    it is log-normal where the parameter is positive and Gaussian where it has a sign.
     Raises `InputError` E142 where no such prior exists, E144 for a sd that is not
     positive.
     """
@@ -203,9 +203,9 @@ def _impossible(p: Parameter, mean: float, sd: float, expected: str) -> InputErr
 
 
 class Parameters(eqx.Module):
-    """The table of a system's constants: those to be learned, and those held fixed.
+    """The table of a system's parameters: those to be learned, and those held fixed.
 
-    Measured sums of constants, ``measurements``, are part of every fit. Raises
+    Measured sums of parameters, ``measurements``, are part of every fit. Raises
     `InputError` E148 for a value held fixed that is not finite.
     """
 
@@ -221,12 +221,12 @@ class Parameters(eqx.Module):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the free constants, in the order of the virtual vector."""
+        """Names of the free parameters, in the order of the virtual vector."""
         return tuple(p.name for p in self.free)
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Units of the free constants."""
+        """Units of the free parameters."""
         return tuple(p.unit for p in self.free)
 
     def __getitem__(self, name: str) -> Parameter:
@@ -266,7 +266,7 @@ class Parameters(eqx.Module):
 
         At ``tt = mu0 + L0 z``, with the function's ``gradient`` in ``z``. Each map
         contributes ``dF/dtt map''/map'``: at a bound, as much as it takes to push the
-        constant there.
+        parameter there.
         """
         xp = library(z)
         mean, scale = xp.asarray(prior.mean), xp.asarray(prior.scale)
@@ -276,7 +276,7 @@ class Parameters(eqx.Module):
         return scale.T @ ((by_tt * bend)[:, None] * scale)
 
     def values(self, tt: Float[AnyArray, " p"]) -> dict[str, AnyScalar]:
-        """Every constant by name, in physical units: the free ones and the fixed."""
+        """Every parameter by name, in physical units: the free ones and the fixed."""
         theta = self.constrain(tt)
         values = {name: library(tt).asarray(v, tt.dtype) for name, v in self.fixed}
         return values | {p.name: theta[i] for i, p in enumerate(self.free)}
@@ -310,7 +310,7 @@ class Parameters(eqx.Module):
         return dict(self.fixed) | nominal  # type: ignore[return-value]
 
     def replace(self, **changes: "Parameter | float") -> "Parameters":
-        """Give some constants another prior, or fix them at a number.
+        """Give some parameters another prior, or fix them at a number.
 
         Raises `InputError` E145 for a name that the system does not have.
         """
@@ -332,12 +332,12 @@ class Parameters(eqx.Module):
         return dataclasses.replace(self, free=tuple(free), fixed=tuple(fixed))
 
     def merge(self, other: "Parameters") -> "Parameters":
-        """Both tables as one, this one's constants first."""
+        """Both tables as one, this one's parameters first."""
         mine, more = ((x.free, x.fixed, x.measurements) for x in (self, other))
         return Parameters(*(a + b for a, b in zip(mine, more, strict=True)))  # type: ignore[arg-type]
 
     def _groups(self, dtype: Any) -> list[tuple[str, np.ndarray, Any, Any]]:
-        """Free constants grouped by map, so that each map is one vector operation."""
+        """Free parameters grouped by map, so that each map is one vector operation."""
         groups = []
         for kind in bijections.MAPS:
             index = [i for i, p in enumerate(self.free) if p.map == kind]

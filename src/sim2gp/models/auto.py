@@ -1,11 +1,11 @@
-"""Auto: let the data choose the model, by how well each foretold the newest episode.
+"""Auto: let the data choose the model, by how well each predicted the newest episode.
 
     index = argmax_k  mean_n log p_k(s'_n | s_n, a_n),   n in the newest episode
 
-with every ``p_k`` as it stood *before* it saw that episode (the prequential score;
-Dawid 1984). It needs no evidence, so that a network's model stands beside physics.
-Models are given from simple to complex, and the simplest one is kept unless another is
-better by more than one standard error of the paired difference.
+with every ``p_k`` as it was *before* that episode (the prequential score; Dawid 1984).
+It needs no evidence, so a network can be compared with physics. Models are given from
+simple to complex, and the simplest one is kept unless another is better by more than
+one standard error of the paired difference.
 """
 
 from collections.abc import Sequence
@@ -37,8 +37,8 @@ class AutoDraw(eqx.Module):
 class AutoBelief(AbstractBelief):
     """All beliefs, and which one speaks.
 
-    Its constants are the chosen one's, and none where some have other constants than
-    others, or have none: what a run keeps side by side has one size.
+    Its parameters are the chosen model's. It has none where the models' parameters
+    differ, or some model has none: all rows that a run keeps have one size.
 
     scores: mean log score of each model on the episode of the last choice, nats per
         transition; zeros before any.

@@ -129,7 +129,7 @@ def stepped(s: State, a: Action, delta: Float[Array, " d"]) -> State:
 def held_out_rows(mask: Bool[Array, " N"]) -> Bool[Array, " N"]:
     """One chunk of `CHUNK` successive rows in every `HELD_OUT`, at random places.
 
-    A row stays where it is when data grow, whatever the capacity: a warm start has
+    A row stays in its set when data grow, for any capacity: a warm start has
     seen the training rows, so a new split would leak them. Of fewer rows than a chunk
     one is held out, of one none.
     """

@@ -135,6 +135,6 @@ def _fit(
 
 
 def at_map(sim: Sim2GPBelief) -> Gaussian:
-    """The constants' MAP without spread: the layer's variance speaks for it."""
+    """The parameters' MAP without spread: the layer's variance represents it."""
     nothing = jnp.zeros_like(sim.posterior.scale)
     return eqx.tree_at(lambda g: g.scale, sim.posterior, nothing)

@@ -3,9 +3,9 @@
     s' = s + g [f(s, a, tt*) + J (tt - tt*)] + c (.) W^T phi(s, a) + eps
 
 ``g`` is 1 where the physics is part of the function and 0 where a network has replaced
-it; ``c`` is 0 where the network adds nothing. How ``W`` and ``tt`` are learned is what
-tells the recipes apart (`AbstractHybrid.learn`); prediction, draws, updates and
-information gain are the same.
+it; ``c`` is 0 where the network adds nothing. The recipes differ in how ``W`` and
+``tt`` are learned (`AbstractHybrid.learn`); prediction, draws, updates and information
+gain are the same.
 """
 
 from abc import abstractmethod
@@ -104,7 +104,7 @@ class HybridBelief(AbstractBelief):
 
     @in_float64
     def untempered(self) -> "HybridBelief":
-        """Where tempered, the constants' spread is that of independent rows again."""
+        """Where tempered, the parameters' spread is that of independent rows again."""
         plain = jnp.where(
             self.kappa > 1.0, self.sim.posterior.scale, self.physics.scale
         )
@@ -121,7 +121,7 @@ class HybridBelief(AbstractBelief):
 
     @in_float64
     def parameters(self) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
-        """Virtual mean and sd of the simulator's constants."""
+        """Virtual mean and sd of the simulator's parameters."""
         return self.sim.parameters()
 
     def parts(
@@ -147,7 +147,7 @@ class AbstractHybrid(AbstractModel):
     Options as in `NLM`.
     """
 
-    #: Whether an update after the first fit leaves the constants as they are.
+    #: Whether an update after the first fit leaves the parameters as they are.
     layer_alone: AbstractClassVar[bool]
 
     sim: Sim2GP
@@ -185,7 +185,7 @@ class AbstractHybrid(AbstractModel):
         steps: int,
         key: Key,
     ) -> HybridBelief:
-        """Constants and layer given all data, in so many steps; ``sim`` has seen them.
+        """Parameters and layer given all data, in so many steps; ``sim`` has seen them.
 
         Called in float64.
         """
@@ -235,7 +235,7 @@ class AbstractHybrid(AbstractModel):
         mean, _, _ = head.moments(s, a)
         residual = (s2 - s)[: belief.noise.size] - belief.keep * value - mean
         phi = head.output_scale[:, None] * head.phi(s, a)[None]
-        # Before the first fit there is no residual: the constants learn.
+        # Before the first fit there is no residual: the parameters learn.
         fixed = self.layer_alone & jnp.any(head.output_scale > 0.0)
         scale = jnp.where(fixed, 0.0, before.scale)
         physics, layer = last_layer.condition(

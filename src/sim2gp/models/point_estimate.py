@@ -17,7 +17,7 @@ from sim2gp.types import Action, Dynamics, Key, State, in_float64
 class DeterministicBelief(AbstractBelief):
     """A belief whose draws all are one function.
 
-    Its noise and constants are those of ``belief``, whose best function that is.
+    Its noise and parameters are those of ``belief``; the function is its best one.
     """
 
     belief: AbstractBelief

@@ -2,11 +2,11 @@
 
     f(x) = f(x, tt) + c (.) W^T phi(x),        c = 3 sig_sim
 
-Two stages, because a network fitted together with the constants absorbs physics: first
+Two stages, because a network fitted together with the parameters absorbs physics: first
 SIM2GP with its own noise; then features and layer on the residuals, by `nlm.type_two`
 with all its safeguards. An output where the network does not predict held-out rows
 better than the simulator alone keeps the simulator's answer, to the last digit (under
-``joint``, which learns the constants once more, only where no output has a residual).
+``joint``, which learns the parameters once more, only where no output has a residual).
 """
 
 from collections.abc import Mapping
@@ -35,9 +35,9 @@ MODES = ("seq_sum", "joint")
 class Residual(AbstractHybrid):
     """Simulator plus learned residual.
 
-    mode: ``"seq_sum"`` adds two independent posteriors (slightly conservative: both
-        may claim the same residual), ``"joint"`` is the exact posterior of constants
-        and layer together, linearised at the simulator's MAP.
+    mode: ``"seq_sum"`` adds two independent posteriors (slightly conservative: both may
+        claim the same residual), ``"joint"`` is the exact posterior of parameters and
+        layer together, linearised at the simulator's MAP.
     Other options as in `NLM`. Raises `InputError` E145 for another mode.
     """
 
@@ -121,7 +121,7 @@ def _posterior(
     c: Float[Array, " d"],
     mode: str,
 ) -> tuple:
-    """Constants and layer given all rows; ``c`` is 0 where there is no residual."""
+    """Parameters and layer given all rows; ``c`` is 0 where there is no residual."""
     Phi, alpha = best.trained.features(X), best.trained.alpha
     d, p = noise.size, sim.prior.mean.size
     prior = LastLayer.prior(d, Phi.shape[1], p, alpha)

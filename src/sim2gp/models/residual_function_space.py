@@ -4,7 +4,7 @@
 
 The residual is trained by `function_space_loss`, with mean zero and covariance
 ``Se_sim`` as its target: far from the data it returns to the simulator, with the
-simulator's fitted discrepancy as *epistemic* variance. The constants keep their own
+simulator's fitted discrepancy as *epistemic* variance. The parameters keep their own
 spread, as wide as the data's parts disagree about them (`tempering`): beyond the box
 of the comparison physics says how uncertainty grows, which saturated features cannot.
 """
@@ -40,8 +40,8 @@ class ResidualFunctionSpace(AbstractHybrid):
     Other options as in `NLM`.
     """
 
-    #: The constants' spread is how far whole parts of the data disagree, of which one
-    #: row knows nothing.
+    #: The parameters' spread is how far whole parts of the data disagree. One row
+    #: cannot show that.
     layer_alone: ClassVar[bool] = True
 
     objective: Objective
@@ -68,7 +68,7 @@ class ResidualFunctionSpace(AbstractHybrid):
         steps: int,
         key: Key,
     ) -> HybridBelief:
-        """The residual, and the constants as wide as the data's parts disagree."""
+        """The residual, and the parameters as wide as the data's parts disagree."""
         schedule = Schedule.of(0, steps, RATE, INITIAL_SCALE)
         return _fit(belief, sim, data, key, schedule, self.objective)
 
@@ -92,7 +92,7 @@ def _fit(
     target = loss.targets(
         jax.vmap(head.encoding)(S, A),
         jnp.zeros((len(S), c.size)),
-        jnp.zeros((len(S), c.size, 0)),  # the constants' spread is not the layer's
+        jnp.zeros((len(S), c.size, 0)),  # the parameters' spread is not the layer's
         sim.noise / c,
         objective.sets,
     )

@@ -89,10 +89,10 @@ class Sim2GP(AbstractModel):
 
     ``dt`` is the control period (s). ``prior`` replaces the table's own, in virtual
     space: with a posterior here, data sets are learned one after another. A ``frozen``
-    simulator takes ``prior`` as the last word on its constants, because other data or
-    the same ones in another form have made it: a fit then learns the noise alone.
+    simulator keeps ``prior`` as the posterior of its parameters, because it comes from
+    other data or from the same data in another form: a fit then learns the noise alone.
     Raises `InputError` E148 for a period that is not positive, E140 for a prior of
-    another number of constants.
+    another number of parameters.
     """
 
     system: AbstractSystem
@@ -122,7 +122,7 @@ class Sim2GP(AbstractModel):
         return self.system.history
 
     def with_prior(self, prior: Gaussian) -> "Sim2GP":
-        """The same recipe, starting from another belief about the constants."""
+        """The same recipe, starting from another belief about the parameters."""
         return eqx.tree_at(lambda m: m.prior, self, prior)
 
     @in_float64

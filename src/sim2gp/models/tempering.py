@@ -1,7 +1,7 @@
 """How far a posterior is to be trusted elsewhere: parts of the data give evidence.
 
 A wrong simulator leaves residuals that are no independent noise: one part of the data
-pulls the constants one way, another part the other way. With ``g_n`` the score of row
+pulls the parameters one way, another part the other way. With ``g_n`` the score of row
 ``n`` in whitened coordinates and ``R^T R`` the posterior's precision, the pull of part
 ``b`` in posterior standard deviations is ``u_b = R^-T sum_{n in b} g_n``. At the MAP of
 the right model, parts of equal information have ``E sum_b u_b u_b^T = (1 - 1/B) I``,
@@ -14,16 +14,16 @@ data in which all rows count that much less,
 
     Sigma_z = (R_d^T R_d / kappa^2 + I)^-1,
 
-about the MAP, where residuals are learned. One constant's interval is then as wide as
+about the MAP, where residuals are learned. One parameter's interval is then as wide as
 the parts scatter. For several it is on the safe side, because the largest of several
 directions is more than one by chance: with six the right model has a ``kappa`` of 2.6.
 Inflating each direction by its own eigenvalue (a floored sandwich) was measured to
 cover too little where the simulator is wrong: four pulls do not span six directions.
 
-Parts are a fixed share of the information: where parts keep contradicting each other
-more rows do not make the constants certain, and a pole that stands still is not counted
-as evidence. (A power posterior: Gruenwald and van Ommen 2017, arXiv 1412.3730; its rate
-by batch means of the scores, as in the magnitude adjustment of composite likelihoods,
+Parts are a fixed share of the information: where parts keep contradicting each other,
+more rows do not make the parameters certain, and a pole at rest is not counted as
+evidence. (A power posterior: Gruenwald and van Ommen 2017, arXiv 1412.3730; its rate by
+batch means of the scores, as in the magnitude adjustment of composite likelihoods,
 Ribatet, Cooley and Davison 2012, arXiv 0911.5357; t of the number of clusters less one,
 Cameron and Miller 2015, J. Human Resources 50.)
 """
@@ -48,10 +48,10 @@ FEW = ((PARTS - 1) / (PARTS - 3)) ** 0.5
 def tempered(
     belief: Sim2GPBelief, r: Float[Array, "N d"], J: Float[Array, "N d p"]
 ) -> tuple[Gaussian, Scalar]:
-    """The constants' posterior as wide as the data's parts disagree, and ``kappa``.
+    """The parameters' posterior as wide as the data's parts disagree, and ``kappa``.
 
     ``r`` are the residuals of the steps at the MAP and ``J`` their Jacobian in the
-    virtual constants, state units; masked rows are zero. A ``frozen`` simulator's
+    virtual parameters, state units; masked rows are zero. A ``frozen`` simulator's
     posterior, which holds no data of its own, comes back as it is.
     """
     prior = belief.prior.scale

@@ -1,8 +1,8 @@
-"""Domain randomisation: a world whose constants are drawn anew in every episode.
+"""Domain randomisation: a world whose parameters are drawn again in every episode.
 
-The state of such a world ends in the virtual constants, which nothing changes and which
-a policy does not see. Drawn from the prior they are what robust policies are trained
-with elsewhere; drawn from a posterior, what data have left of that.
+The state of such a world ends in the virtual parameters. They do not change within an
+episode, and a policy does not see them. Other tools train robust policies with draws
+from the prior; a posterior is what the data leave of it.
 """
 
 import equinox as eqx
@@ -29,7 +29,7 @@ class Carried(eqx.Module):
 
 
 def randomised_world(task: Task, system: AbstractSystem, constants: Gaussian) -> World:
-    """``task`` on a simulator whose virtual constants every reset draws anew.
+    """``task`` on a simulator whose virtual parameters are drawn again at every reset.
 
     It is for policies that are trained, and look at the machine's own state alone.
     """

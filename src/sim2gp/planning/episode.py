@@ -88,7 +88,7 @@ class Reset(eqx.Module):
 
 
 class DrawnReset(eqx.Module):
-    """A start, and constants drawn for it."""
+    """A start, and parameters drawn for it."""
 
     start: Callable[[Key], State]
     constants: Gaussian
@@ -225,7 +225,7 @@ def episode(
     """One checked episode, compiled once for all draws, truths and keys.
 
     With ``part`` and ``world_at`` the world may change: after every ``part`` steps
-    ``world_at`` is given what was flown so far and says what to plan in from there. The
+    ``world_at`` gets the steps so far and returns the world to plan in from there. The
     plan itself is kept, and a world that stays the same changes nothing.
 
     Raises `NotFinite` E203 at the first state, action or reward that is not finite;
@@ -237,7 +237,7 @@ def episode(
     for first in range(0, task.horizon, part):
         if flown is not None and world_at is not None:
             world = world_at(flown)
-            # What was flown is in the new world's belief.
+            # The steps so far are in the new world's belief.
             memory = world.objective.init()
             moment = eqx.tree_at(lambda m: m.memory, moment, memory)
         steps = jnp.arange(first, min(first + part, task.horizon))

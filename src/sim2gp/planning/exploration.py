@@ -18,7 +18,7 @@ from sim2gp.types import Action, Reward, Scalar, State
 
 
 class InformationGain(AbstractObjective):
-    """Nats that a trajectory is expected to tell a belief.
+    """Nats that a trajectory is expected to give a belief.
 
     With ``together``, what a step repeats of those before it, planned or made, counts
     nothing; without, every step is judged as if it were the first one: Markov, as

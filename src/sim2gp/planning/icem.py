@@ -113,7 +113,7 @@ class ICEM(AbstractUpdate):
         good = valid[best]
         count = jnp.sum(good)
         # An invalid sequence may rank among the elites, but it neither moves the
-        # distribution nor is ever reused: the mean stands in for it.
+        # distribution nor is ever reused: the mean replaces it.
         weight = good.astype(mean.dtype)
         weight = weight / jnp.maximum(jnp.sum(weight), 1.0)
         centre = jnp.einsum("k,ktm->tm", weight, U[best])

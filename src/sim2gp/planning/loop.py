@@ -102,12 +102,12 @@ def posterior_sampling(
     """``episodes`` rounds of: draw a world, act in it on ``task``, fit all data.
 
     ``objective`` makes what is maximised out of the belief at the episode's start,
-    ``world`` what it is planned in. The first episode is flown on the prior.
-    ``history`` is the number of past actions that the model's state carries.
-    ``update_every`` is None or a number of steps after which the belief learns within
-    the episode (`within`). Without a ``final_fit`` the last episode is flown and not
-    learned from: where returns are all that is asked. ``on_episode`` is called after
-    each fit. Raises what the fit raises, `NotFinite`, and E148 for an impossible count.
+    ``world`` what it is planned in. The first episode uses the prior. ``history`` is
+    the number of past actions that the model's state carries. ``update_every`` is None
+    or a number of steps after which the belief learns within the episode (`within`).
+    Without a ``final_fit`` the last episode is run and not fitted, for users who need
+    its return alone. ``on_episode`` is called after each fit. Raises what the fit
+    raises, `NotFinite`, and E148 for an impossible count.
     """
     _check_counts(episodes, history, update_every)
     m = task.actions.low.size
@@ -156,9 +156,9 @@ def within(
     *,
     key: Key,
 ) -> Callable[[Trajectory], World]:
-    """The world to plan in amid an episode, given what was flown in it so far.
+    """The world to plan in within an episode, given its steps so far.
 
-    Constants and last layer are conditioned on each new transition in turn
+    Parameters and last layer are conditioned on each new transition in turn
     (`AbstractModel.update`), features and noise are kept. Before any fit there is no
     noise level to condition with: in a first episode the model is fitted instead. What
     is learned here lasts for this episode; the fit after it starts from ``belief``.
@@ -204,7 +204,7 @@ def _condition(
 
 
 class Options(TypedDict, total=False):
-    """Of `posterior_sampling`, whatever it is for."""
+    """Options of `posterior_sampling`, for any objective."""
 
     history: int
     update_every: int | None
@@ -301,7 +301,7 @@ def optimism(
 
 
 def _parameters(belief: AbstractBelief) -> tuple[np.ndarray, np.ndarray]:
-    """Virtual mean and sd of the constants, as they are now."""
+    """Virtual mean and sd of the parameters, as they are now."""
     mean, sd = belief.parameters()
     return np.asarray(mean), np.asarray(sd)
 

@@ -75,7 +75,8 @@ def softmax_of_size(
 ) -> Float[Array, " N"]:
     """Softmax weights whose effective size is ``effective`` times the valid count.
 
-    Invalid entries weigh exactly 0; with none valid all weights are finite, and 0.
+    Invalid entries have weight 0 exactly; with none valid all weights are finite, and
+    0.
     """
     worst = jnp.min(jnp.where(valid, returns, jnp.finfo(returns.dtype).max))
     gap = jnp.max(masked(returns, valid)) - returns  # >= 0 where valid
@@ -85,7 +86,7 @@ def softmax_of_size(
 
     def weights(log_temperature: Scalar) -> Float[Array, " N"]:
         w = jnp.where(valid, jnp.exp(-scaled * jnp.exp(-log_temperature)), 0.0)
-        return w / jnp.maximum(jnp.sum(w), 1.0)  # the best one alone weighs 1
+        return w / jnp.maximum(jnp.sum(w), 1.0)  # the best one alone has 1
 
     def bisect(_: Array, ends: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
         low, high = ends

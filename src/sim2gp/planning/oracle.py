@@ -87,7 +87,7 @@ def accept_truth(
 ) -> AcceptedTruth:
     """Draw truths (`tasks.draw_truth`) until the oracle swings one up.
 
-    ``preset`` makes a task of a record of constants (`tasks.furuta_swingup`). A truth
+    ``preset`` makes a task of a record of parameters (`tasks.furuta_swingup`). A truth
     that the oracle drives to where its integration diverges is one not swung up (far
     beyond its bounds a machine spins faster than the substeps can follow). Raises
     `Sim2GPError` E204 when ``attempts`` draws all fail.

@@ -265,7 +265,7 @@ def elsewhere(world: World, start: State, key: Key) -> State:
 def _stepped(
     sac: SAC, learner: Learner, world: World, rollouts: Rollouts, fresh: Any, key: Key
 ) -> tuple[Rollouts, Any]:
-    """One step of every world, and its rows; an episode that is over begins anew."""
+    """One step of every world, and its rows; an episode that is over starts again."""
 
     def one(s: State, t: Array, key: Key) -> Any:
         acting, beginning = jax.random.split(key)

@@ -1,6 +1,6 @@
-"""Open-loop excitation, played from an episode's start to its end, whatever happens.
+"""Open-loop excitation, played from an episode's start to its end without feedback.
 
-What identification has always used, beside which an explorer stands: coloured noise, a
+The usual signals of identification, to compare an explorer with: coloured noise, a
 chirp, and a multisine whose amplitudes and phases are optimised for the objective. All
 signals live in the unit box ``[-1, 1]^m``; frequencies are in cycles per step.
 """

@@ -1,8 +1,8 @@
-"""Tasks: a machine with hidden constants, process noise, a reward and a clock.
+"""Tasks: a machine with hidden parameters, process noise, a reward and a clock.
 
     s' = f(s, a) + sd * eps,    eps ~ N(0, I) on the physical states,  observed exactly
 
-The task knows the truth and never tells it to a model. Both presets are swing-ups of
+The task knows the truth and never gives it to a model. Both presets are swing-ups of
 250 steps of 20 ms with ``hanging = 0``; rewards, noise and limits follow the published
 descriptions of the two rigs (`sim2gp.systems`). Scores are defined here once.
 """
@@ -47,7 +47,7 @@ TRUSTED = 3.0
 UPRIGHT_COSINE = -0.9
 #: The solved band of the score.
 SOLVED = 0.95
-#: How hidden constants are drawn: as believed, further away, or beyond the bounds.
+#: How hidden parameters are drawn: from the prior, further away, or beyond the bounds.
 TRUTHS = ("prior", "2sd", "3sd", "outside")
 BEYOND = 1.2
 
@@ -62,7 +62,7 @@ class Task(eqx.Module):
     angle: the state whose turns do not count: a policy sees its sine and cosine.
     goal: whether one state is where the task is to end, or None where nobody asks.
     planning_horizon, planning_iterations, noise_colour: what suits this machine.
-    truth: the hidden constants by name, for reports and tests only.
+    truth: the hidden parameters by name, for reports and tests only.
 
     Raises `InputError` E144 for a sd that is negative or not finite, E148 for another
     number that cannot be, E140 for arrays or functions of another shape; E123 and E173
@@ -154,7 +154,7 @@ class Task(eqx.Module):
 
 
 class PoleUpright(eqx.Module):
-    """The goal of a swing-up: the pole, one of the states, stands (hanging = 0)."""
+    """The goal of a swing-up: the pole, one of the states, is upright (hanging = 0)."""
 
     pole: int = eqx.field(static=True)
 
@@ -169,7 +169,7 @@ class FurutaReward(eqx.Module):
     """
 
     def terms(self, s: State, a: Action, s2: State) -> dict[str, Scalar]:
-        """What stands in the exponent, each at most zero; their sum is the log."""
+        """The terms of the exponent, each at most zero; their sum is the log."""
         theta, alpha, arm_speed, pole_speed = s2[0], s2[1], s2[2], s2[3]
         return {
             "height": -(1.0 + jnp.cos(alpha)),
@@ -213,7 +213,7 @@ def _total(terms: Mapping[str, Scalar]) -> Scalar:
 def furuta_swingup(truth: Any = None, effects: Sequence[AbstractPart] = ()) -> Task:
     """Swing up the Furuta pendulum; ``truth`` None is the published machine.
 
-    ``truth`` is a record of constants (`draw_truth`); ``effects`` are what the real
+    ``truth`` is a record of parameters (`draw_truth`); ``effects`` are what the real
     machine has and its model lacks: effects, delays, lags or offsets. State: theta,
     alpha, and their rates.
     """
@@ -266,11 +266,11 @@ MACHINES: dict[str, tuple[Callable[[], AbstractPlant], Callable[..., Task]]] = {
 
 @in_float64
 def draw_truth(system: AbstractSystem, key: Key, truth: str = "prior") -> Any:
-    """A record of hidden constants, in float32.
+    """A record of hidden parameters, in float32.
 
-    ``truth`` is one of `TRUTHS`: from the system's own prior, or with every constant 2
+    ``truth`` is one of `TRUTHS`: from the system's own prior, or with every parameter 2
     or 3 prior sd from its mean (in virtual space), or a fifth beyond its bounds, each
-    on a random side. Raises `InputError` E145 for another word, E142 where a constant
+    on a random side. Raises `InputError` E145 for another word, E142 where a parameter
     has no bounds to be beyond.
     """
     checks.one_of("draw_truth", TRUTHS, truth=truth)
@@ -347,7 +347,7 @@ def _preset(
     system = with_parts(plant, kinds, period=dt)
     record = plant.nominal() if truth is None else truth
     values = _values(record, plant)
-    # An effect's magnitude is a fixed constant of the machine's table.
+    # An effect's magnitude is a fixed parameter of the machine's table.
     strengths = {e.name: e.magnitude for e in effects if isinstance(e, AbstractEffect)}
     values |= {
         name: jnp.asarray(strengths.get(name, value), jnp.float32)
@@ -367,7 +367,7 @@ def _preset(
 
 
 def _values(record: Any, system: AbstractSystem) -> dict[str, Scalar]:
-    """A record's constants by name, in float32; E145 where one is missing."""
+    """A record's parameters by name, in float32; E145 where one is missing."""
     names = system.parameters.names
     given = (
         dict(record)

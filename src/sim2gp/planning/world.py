@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float
 from sim2gp import checks
 from sim2gp.types import Action, Box, Dynamics, Key, Reward, Scalar, State, check_reward
 
-#: A rollout beyond this magnitude has diverged, whatever its units.
+#: A rollout beyond this magnitude has diverged, in any units.
 DIVERGED = 1e10
 
 

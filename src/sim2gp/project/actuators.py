@@ -4,7 +4,7 @@
     delay = {low = 0.0, high = 0.02}
     tie = true
 
-A table names one input, or several by a pattern; tied inputs share their constants,
+A table names one input, or several by a pattern; tied inputs share their parameters,
 under the first one's name.
 """
 

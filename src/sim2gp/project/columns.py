@@ -1,8 +1,8 @@
 """Which column of a log is which channel of a machine: by names, units and rates.
 
 Names are compared word by word (`pos_meas1` is a position, of the first joint). A
-column that another one's integral follows is a velocity, whatever it is called; how
-steeply tells the units and signs in which the two differ.
+column whose integral another one follows is a velocity, under any name. The slope gives
+the units and signs in which the two differ.
 """
 
 import re

@@ -1,11 +1,11 @@
-"""Groups of logs as variants of one machine, and sums that were weighed.
+"""Groups of logs as variants of one machine, and sums that were measured.
 
     [[logs]]                                  [[logs]]
     name = "bare"                             name = "payload"
     fixed = {"body/hand/mass" = 0.4}          free = ["body/hand/mass"]
 
-Constants that a group does not name are shared with all others. A column of its own has
-the prior of its constant, or of ``[parameters."body/hand/mass @ payload"]``.
+Parameters that a group does not name are shared with all others. A column of its own
+has the prior of its parameter, or of ``[parameters."body/hand/mass @ payload"]``.
 """
 
 from collections.abc import Mapping
@@ -46,7 +46,7 @@ def with_configurations(
         group = spec.logs[i]
         fixed = tuple(group.fixed.items())
         found.append(Variant(name, fixed, tuple(group.free)))
-        try:  # alone, so that a fault has its group's place
+        try:  # alone, so that an error has its group's place
             with_variants(system, found[-1:])
         except InputError as caught:
             wrong = str(caught.got).split(" ")[0]

@@ -1,9 +1,9 @@
 """The first project file: a model and some recordings in, a checked draft out.
 
 Every guess is in the file with its reason, for the user who knows the machine to read.
-Constants of a model's file that the logs do not tell apart are held, and said to be.
-What is written can be identified as it is: it is loaded, with its logs, before it takes
-its place. Without recordings the file says which columns they need.
+Parameters of a model's file that the logs cannot separate are held, and the file says
+so. What is written can be identified as it is: it is loaded, with its logs, before it
+takes its place. Without recordings the file says which columns they need.
 """
 
 import time

@@ -21,7 +21,7 @@ from sim2gp.systems.mujoco.constants import constants_of
 DELAY = 0.04  # s, the longest that a draft lets an input be late
 #: Shortest and longest windows of an arm with servos, s (`benchmarks/arm_windows.py`).
 WINDOWS = 1.0, 5.0
-LISTED = 40  # constants that are named in the file
+LISTED = 40  # parameters that are named in the file
 _GAINS = ("kp", "kv")
 
 
@@ -110,7 +110,7 @@ def _constant_lines(c: Contents, file: bool) -> list[str]:
 def _selected(
     selection: Selection, opened: Sequence[str], value: Mapping[str, str]
 ) -> list[str]:
-    """The open constants by name, then the held ones with what the logs say of them."""
+    """The open parameters, then the held ones with what the logs say of them."""
     rows = ["[parameters]"]
     for name in opened:
         taken = selection.stands_for.get(name)

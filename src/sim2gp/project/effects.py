@@ -32,7 +32,7 @@ def with_effects(
     specs: Mapping[str, Mapping[str, EffectSpec | float]],
     source: ProjectSource,
 ) -> AbstractSystem:
-    """The machine with the effects of the file; magnitudes are constants by name."""
+    """The machine with the effects of the file; magnitudes are parameters by name."""
     plant, parts = plant_of(system), list[AbstractPart]()
     stated: dict[str, Parameter | float] = {}
     for where, kinds in specs.items():
@@ -83,7 +83,7 @@ def _impossible_effect(
 def effect_options(
     what: str, said: EffectSpec | float, known: Collection[str], line: str
 ) -> dict[str, float]:
-    """What an effect has besides its magnitude, each one that it knows (E160)."""
+    """The options of an effect next to its magnitude; E160 for one that it lacks."""
     stated = () if isinstance(said, float) else EFFECT_OPTIONS
     given = {name: getattr(said, name) for name in stated}
     options = {name: value for name, value in given.items() if value is not None}

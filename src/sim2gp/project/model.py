@@ -1,4 +1,4 @@
-"""A model's file as the project's machine: which constants are open, tied, and how.
+"""A model's file as the project's machine: which parameters are open, tied, and how.
 
     system = "robot.xml"
     [parameters."joint/*/damping"]
@@ -6,7 +6,7 @@
     relative_sd = 0.5
 
 Every table of ``[parameters]`` opens what its path or pattern names; without any, all
-usual constants that are not zero in the model are open.
+usual parameters that are not zero in the model are open.
 """
 
 from pathlib import Path

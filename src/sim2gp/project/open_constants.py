@@ -1,8 +1,8 @@
-"""A draft's constants: one linearisation of the logs says which are worth opening.
+"""A draft's parameters: one linearisation of the logs says which are worth opening.
 
 Windows of the logs are simulated and differentiated once, at the file's numbers, with
 all candidates open. The linear fit of that learns the noise, and what the data know of
-each constant once start states and delays are eliminated; `select_parameters` chooses.
+each parameter once start states and delays are eliminated; `select_parameters` chooses.
 """
 
 import time
@@ -51,7 +51,7 @@ def try_selection(
 def select_constants(
     project: Project, logs: Sequence[Log], *, until: float
 ) -> Selection:
-    """Which of a project's open constants the logs tell apart.
+    """Which of a project's open parameters the logs can separate.
 
     Only those of a model's file are ever held: another machine's table has priors of
     its own. Raises `TimeoutError` where the logs cannot be linearised ``until`` (of
@@ -72,7 +72,7 @@ def select_constants(
     fitted = estimate(linear, ParameterPrior(prior, table), starts=zeros, rounds=0)
     if not np.isfinite(fitted.log_evidence):
         raise _not_finite()
-    # Windows that are left out are taken to tell as much as the others.
+    # Windows that are left out are taken to have as much information as the others.
     factor = fitted.information * np.sqrt(len(windows) / batches.size)
     nuisances = [name for name in table.names if name not in plant.names]
     return select_parameters(table, prior, factor, nuisances=nuisances)

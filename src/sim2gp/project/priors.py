@@ -1,4 +1,4 @@
-"""What the file says of a constant, turned into a prior or a fixed value.
+"""What the file says of a parameter, turned into a prior or a fixed value.
 
 ``value`` fixes; ``mean, sd`` are physical moments, inside ``low, high`` where these
 are given too; ``relative_sd`` is an sd as a share of the mean. An sd alone is about the

@@ -45,7 +45,7 @@ SYSTEMS = {
     "two_link": ("two_link", "TwoLink"),
     "uniform_rod_arm": ("two_link", "UniformRodArm"),
 }
-#: What stands for the system of a machine that was made in Python.
+#: The system's name of a machine that was made in Python.
 IN_MEMORY = "in memory"
 MODEL_FILES = (".xml", ".mjcf", ".urdf")
 #: What other tools write before a model's file.

@@ -93,7 +93,7 @@ class BestReadings:
     ``surer[name]``: the sign test's z against the best reading in which the channel
     differs, infinite where it has no other; a channel that was not tried has no entry.
     ``rivals[name]``: that other reading, of all channels that were tried with it.
-    ``images`` readings, this one among them, the machine cannot tell apart: a pendulum
+    ``images`` readings, this one among them, fit the machine equally well: a pendulum
     and its mirror image.
     """
 
@@ -172,7 +172,7 @@ def _settle_readings(
 
 
 def _departs(readings: Readings, plain: Readings) -> tuple[int, int]:
-    """How many channels have another sign or zero than they stand in; another unit."""
+    """How many channels get another sign or zero than in the file; another unit."""
     pairs = [(reading, plain[name]) for name, reading in readings.items()]
     moved = sum((r.sign, r.offset) != (p.sign, p.offset) for r, p in pairs)
     return moved, sum(r.unit != p.unit for r, p in pairs)

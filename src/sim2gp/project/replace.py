@@ -22,8 +22,8 @@ def key(name: str) -> str:
 
 
 def replace_project(path: Path, text: str, check: Callable[[Project], object]) -> None:
-    """Write ``text`` beside ``path``, load and check it there, then put it in place.
+    """Write ``text`` next to ``path``, load and check it there, then put it in place.
 
-    Raises whatever the loading or ``check`` raises; the old file is then untouched.
+    Raises what the loading or ``check`` raises; the old file is then untouched.
     """
     replace_file(path, text.encode(), lambda aside: check(load_project(aside)))

@@ -79,7 +79,7 @@ class EffectSpec(PriorSpec):
     """Width of the edge of a dead zone (the input's unit)."""
 
 
-#: What an effect has beside the prior of its magnitude.
+#: What an effect has next to the prior of its magnitude.
 EFFECT_OPTIONS = tuple(
     name for name in EffectSpec.model_fields if name not in PriorSpec.model_fields
 )

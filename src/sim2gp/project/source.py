@@ -1,7 +1,7 @@
 """The text of a project file: parsed safely, and every key remembered with its line.
 
 TOML runs no code; what remains is size, depth, and values that other tools would
-evaluate. Python's parser forgets where a key stood, so the text is scanned once more:
+evaluate. Python's parser forgets where a key was, so the text is scanned once more:
 `Source.where` names the line of the longest part of a key's path that the file spells.
 """
 
@@ -93,7 +93,7 @@ def _too_large(name: str, got: str, expected: str) -> InputError:
 
 
 def _yaml(name: str, bare: str) -> InputError | None:
-    """A file that begins as YAML does, whatever it is called, is not looked into."""
+    """A file that begins as YAML does is not read, under any name."""
     line = next((x for x in bare.splitlines() if x.strip()), "")
     if not _YAML.match(line):
         return None

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Sequence
 
-#: Sections that stand once for each of their tables, in double brackets.
+#: Sections that occur once for each of their tables, in double brackets.
 LISTS = ("logs", "weighed")
 #: The last part of a channel's name that has two, which needs quotes.
 PARTS = ("velocity", "control")

@@ -1,6 +1,6 @@
 """A film of forecasts over what was recorded, for the report.
 
-Windows follow each other: the recorded motion goes on, the forecast begins anew from
+Windows follow each other: the recorded motion goes on, the forecast starts again from
 the measured state every half second.
 """
 

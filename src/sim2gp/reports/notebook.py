@@ -15,7 +15,7 @@ from sim2gp.runs import load_run as loaded
 
 @runtime_checkable
 class HasReport(Protocol):
-    """Whatever a report can be drawn of."""
+    """Anything that a report can be drawn of."""
 
     @property
     def summary(self) -> dict[str, Any]: ...
@@ -51,7 +51,7 @@ def brief(summary: Mapping[str, Any]) -> str:
 
 
 def _main_table(summary: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
-    """The constants, or else the first table of the report."""
+    """The parameters, or else the first table of the report."""
     constants = summary.get("parameters")
     if isinstance(constants, Mapping):
         columns = ["parameter", "mean", "95 % interval", "unit", "verdict"]

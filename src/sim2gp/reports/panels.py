@@ -25,7 +25,7 @@ LINES = {
     "SIM2GP with the term": ("#1b1f24", ":"),
     "off-policy oracle": ("#1b1f24", "-"),
     "domain randomisation": ("#8b949e", ":"),
-    # Signals of the same model have its colour; a dash says what was flown.
+    # Signals of the same model have its colour; the dash shows which signal was run.
     "SIM2GP, step by step": ("#0072b2", "--"),
     "SIM2GP, random": ("#0072b2", ":"),
     "SIM2GP, chirp": ("#56b4e9", ":"),

@@ -1,4 +1,4 @@
-"""The sections of a report that tell what is known about the parameters."""
+"""The sections of a report that say what is known about the parameters."""
 
 from collections.abc import Mapping
 from typing import Any

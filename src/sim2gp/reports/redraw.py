@@ -19,7 +19,7 @@ def load_summary(run_dir: str | Path) -> tuple[dict[str, Any], dict[str, np.ndar
 
 
 def redraw(run_dir: str | Path) -> Path:
-    """Write report.html anew from what the run stored, and return its path.
+    """Write report.html again from what the run stored, and return its path.
 
     The manifest keeps the checksum of the first report; a run's reader checks only what
     a report is drawn from.

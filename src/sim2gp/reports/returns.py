@@ -1,4 +1,4 @@
-"""The section of a report that tells how well episodes went."""
+"""The section of a report that says how well episodes went."""
 
 from collections.abc import Mapping
 

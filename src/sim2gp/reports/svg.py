@@ -275,7 +275,7 @@ def chart(
 ) -> Markup:
     """A titled chart; `marks` are drawn in their order, cut at the field's edge.
 
-    `said` tells what it shows to those who cannot see it.
+    `said` describes the chart for those who cannot see it.
     """
     width, height = axes.size
     words = f"{title} [{unit}]: {said}" if unit else f"{title}: {said}"

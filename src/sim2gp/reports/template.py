@@ -22,7 +22,7 @@ def breakable(name: object) -> Markup:
 
 
 def code_markup(text: object) -> Markup:
-    """Text in which what stands between backticks is code."""
+    """Text in which words between backticks are code."""
     return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))
 
 

@@ -34,7 +34,7 @@ def _under(arrays: Arrays, prefix: str) -> list[str]:
 
 
 def unit_of(summary: Summary, channel: str) -> str:
-    """The unit of a channel, where the summary tells it."""
+    """The unit of a channel, where the summary gives it."""
     units = summary.get("units") or {}
     if channel in units:
         return str(units[channel])

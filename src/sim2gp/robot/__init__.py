@@ -1,4 +1,4 @@
-"""What runs beside a machine. Reading and evaluating a policy needs no JAX."""
+"""What runs next to a machine. Reading and evaluating a policy needs no JAX."""
 
 from sim2gp.robot.policy import NumpyPolicy as NumpyPolicy
 from sim2gp.robot.policy import load_policy as load_policy

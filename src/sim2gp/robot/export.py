@@ -44,7 +44,7 @@ def export_policy(policy: Policy, out: Path | str, system: AbstractSystem) -> No
         for name, each in zip(("weights", "biases"), layers, strict=True)
         for i, x in enumerate(each)
     }
-    # An angle is seen by its sine and cosine, whatever its scale, which may be inf.
+    # An angle is seen by its sine and cosine; its scale has no effect, and may be inf.
     angle, scale = policy.observe.angle, np.array(policy.observe.scale)
     if angle is not None:
         scale[angle] = 1.0
@@ -76,15 +76,15 @@ def export_model(
     key: Key,
     compiled: bool = False,
 ) -> None:
-    """Write a belief's constants, correlated draws of them, and perhaps its mean step.
+    """Write a belief's parameters, correlated draws of them, and perhaps its mean step.
 
     ``arrays.npz`` holds ``draws/NAME``, in physical units: row ``i`` of all of them is
-    one machine, for whatever trainer randomises its simulator; of a MuJoCo model with a
+    one machine, for a trainer that randomises its simulator; of a MuJoCo model with a
     file, ``variant_000.xml`` and so on are those machines (of a URDF, as MJCF).
     ``compiled`` adds ``step.jax``, the mean step ``(s, a) -> s'`` over ``dt`` seconds
     in float32, for `jax.export.deserialize`; whether another version of JAX reads it is
     JAX's word.
-    Raises `InputError` E134 where the belief has no constants, E135 where writing
+    Raises `InputError` E134 where the belief has no parameters, E135 where writing
     compiled code needs what is not installed, E148 for a period or a number of draws
     that cannot be.
     """
@@ -108,7 +108,7 @@ def write_model(
     about: Mapping[str, Any],
     code: bytes | None = None,
 ) -> dict[str, Any]:
-    """Write constants and ``draws`` of a Gaussian over virtual values; the summary.
+    """Write parameters and ``draws`` of a Gaussian over virtual values; the summary.
 
     ``about`` says what it is a posterior of. Files as `export_model` has them.
     """
@@ -145,7 +145,7 @@ def write_model(
 def _draw_constants(
     posterior: Gaussian, system: AbstractSystem, draws: int, key: Key
 ) -> tuple[dict[str, np.ndarray], dict[str, float]]:
-    """Draws of every constant by name, and the one at the posterior's mean."""
+    """Draws of every parameter by name, and the one at the posterior's mean."""
     table = system.parameters
     tt = jax.vmap(posterior.sample)(jax.random.split(key, draws))
     rows = jax.vmap(table.values)(tt)
@@ -159,7 +159,7 @@ def _draw_constants(
 def _write_variants(
     writer: Writer, system: AbstractSystem, rows: dict[str, np.ndarray]
 ) -> None:
-    """Of a MuJoCo model, its file with each draw's constants (E170)."""
+    """Of a MuJoCo model, its file with each draw's parameters (E170)."""
     model = plant_of(system)
     if not isinstance(model, MuJoCo) or model.source is None:
         return
@@ -170,7 +170,7 @@ def _write_variants(
             values = model.by_path({name: float(x[i]) for name, x in rows.items()})
             main, edited = f"variant_{i:03d}{file.suffix}", file.edited(values)
             made.append((main, edited))
-            # From where the run will stand, everything is as far away as from here.
+            # Relative paths from here are those from the run's final folder.
             for _, name, text in file.texts(edited, main, writer.folder):
                 writer.write_bytes(name, text)
         found = compiled_all([writer.folder / name for name, _ in made])

@@ -3,7 +3,7 @@
     import gymnasium, sim2gp.robot.gymnasium        # the import registers them
     env = gymnasium.make("sim2gp/Furuta-v0", truth="prior")
 
-An environment is a `Task`, step for step: hidden constants, process noise, its reward
+An environment is a `Task`, step for step: hidden parameters, process noise, its reward
 and its clock. Observed are the physical states, in their units and unwrapped; actions
 are shares of the largest input, in [-1, 1]. After ``reset(seed=s)`` the e-th episode
 has the start and the noise that it has in `psrl` with ``key=jax.random.key(s)``. All
@@ -38,7 +38,7 @@ SEEDS = 2**32
 
 
 def register() -> None:
-    """Tell Gymnasium of every environment here; a second call changes nothing."""
+    """Register every environment here with Gymnasium; a second call changes nothing."""
     import gymnasium
 
     for name, machine in NAMES.items():
@@ -64,12 +64,12 @@ def make_environment(
     """The swing-up of ``furuta`` or ``cartpole`` as a `gymnasium.Env`.
 
     ``truth`` is "published", or one of `tasks.TRUTHS`: then every ``reset(seed=)``
-    draws the hidden constants, as the first draw of ``sim2gp demo --seed`` does.
+    draws the hidden parameters, as the first draw of ``sim2gp demo --seed`` does.
     ``params`` sets some of them. ``effects`` is physics that the machine has and its
     model lacks: effects, or words of their catalogue such as ``"coulomb mild"``.
 
-    Raises `InputError` E135 without Gymnasium, E145 for an unknown truth, constant or
-    effect, E101 for a constant that is not finite.
+    Raises `InputError` E135 without Gymnasium, E145 for an unknown truth, parameter or
+    effect, E101 for a parameter that is not finite.
     """
     made = make_machine_spec(machine, truth, params or {}, effects)
     try:
@@ -86,7 +86,7 @@ def _environment_class() -> Any:
     from gymnasium.spaces import Box
 
     class TaskEnv(gymnasium.Env[np.ndarray, np.ndarray]):
-        """A task, one step at a time; `StepOutcome` says what each step tells.
+        """A task, one step at a time; `StepOutcome` is what each step returns.
 
         Terminated where a state leaves the task's bounds, at which it is then seen;
         truncated when the task's time is up.
@@ -171,8 +171,8 @@ def make_machine_spec(
 ) -> MachineSpec:
     """The same, checked; words name effects of the catalogue and their strength.
 
-    Raises `InputError` E145 for an unknown truth, constant or effect, E101 for a
-    constant that is not a finite number.
+    Raises `InputError` E145 for an unknown truth, parameter or effect, E101 for a
+    parameter that is not a finite number.
     """
     if truth not in (PUBLISHED, *TRUTHS):
         known = ", ".join((PUBLISHED, *TRUTHS))
@@ -194,7 +194,7 @@ def _effect(machine: str, words: str) -> AbstractPart:
 
 
 class StepOutcome(eqx.Module):
-    """A step as it is told: the machine's state and what is seen of it."""
+    """The outcome of a step: the machine's state and what is seen of it."""
 
     state: Float[Array, " k"]
     observation: Float[Array, " n"]
@@ -235,7 +235,7 @@ def step_task(
 def step_result(
     met: StepOutcome, over: bool
 ) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-    """A step as Gymnasium tells it (`NotFinite` E203 where it is not finite)."""
+    """A step as Gymnasium returns it (`NotFinite` E203 where it is not finite)."""
     met = jax.device_get(met)
     check_met(met.state, met.reward)
     ended = bool(met.outside)

@@ -1,7 +1,7 @@
 """Many environments of one machine as one compiled program, for `gymnasium.make_vec`.
 
 Each is what it is alone (`sim2gp.robot.gymnasium`), with the next seed, but for the
-last bits of its numbers. After its last step it is begun anew in the next one, whose
+last bits of its numbers. After its last step it starts again in the next one, whose
 action and reward do not count (Gymnasium's ``NEXT_STEP``).
 """
 
@@ -128,7 +128,7 @@ class Fleet:
         return np.array(seen)
 
     def step(self, now: Batch, U: np.ndarray) -> Any:
-        """One period of each; its start anew where an episode was over."""
+        """One period of each; a new start where an episode was over."""
         again = self.over
         met = step_batch(self.tasks, self.bound, self.key, now, U)
         state, seen = met.state, met.observation
@@ -190,7 +190,7 @@ def _vector_class() -> Any:
             return seen, {"status": np.full(self.num_envs, "running", object)}
 
         def step(self, actions: np.ndarray) -> Any:
-            """One period of each, or its start anew. Raises E140, E101, E203."""
+            """One period of each, or a new start. Raises E140, E101, E203."""
             if self.fleet.now is None:
                 raise gymnasium.error.ResetNeeded("call reset before step")
             m = self.fleet.task.actions.low.size
@@ -225,7 +225,7 @@ def batch_step_result(
     ended: Bool[np.ndarray, " N"],
     late: Bool[np.ndarray, " N"],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-    """A step as Gymnasium tells it; what began anew has no reward, and no terms."""
+    """A step as Gymnasium returns it; a new start has no reward, and no terms."""
     met = jax.device_get(met)
     check_met(met.state[~again], met.reward[~again])
     status = np.full(len(again), "running", object)

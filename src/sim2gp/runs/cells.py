@@ -158,7 +158,7 @@ class Cells:
         return ", ".join([*sorted(packages), *words])
 
     def _listed(self, digest: str) -> Source | None:
-        """What a digest stands for; None where its list is gone or damaged."""
+        """The source that a digest names; None where its list is gone or damaged."""
         content = self._content(f"sources/{digest}.json")
         if content is None:
             return None

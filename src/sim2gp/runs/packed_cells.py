@@ -1,8 +1,8 @@
 """The files of a finished study's cells in one: NAME.cells.jsonl.gz.
 
-Each line is a JSON object of a file's name and its text, byte for byte what stood in
-the folder NAME.cells, so that checksums and digests keep their meaning. Reading stops
-at `LIMIT`, whatever the file claims.
+Each line is a JSON object of a file's name and its text, byte for byte as in the folder
+NAME.cells, so that checksums and digests keep their meaning. Reading stops at `LIMIT`,
+even if the file claims less.
 """
 
 import contextlib

@@ -29,7 +29,7 @@ class Task:
     moved: float = field(default_factory=time.monotonic)  # when `done` last changed
 
     def advance(self, note: str = "", count: int = 1) -> None:
-        """``count`` more parts are finished; ``note`` is shown beside them."""
+        """``count`` more parts are finished; ``note`` is shown next to them."""
         if count:
             self.done, self.moved = self.done + count, time.monotonic()
         self.show(self, note)

@@ -31,7 +31,7 @@ class Sink(Protocol):
 class JSONLines:
     """A line for each step: ``{"step": 1, "time": ..., "values": {...}}``.
 
-    JSON has no word for NaN: such values stand in ``not_finite``, as text. An earlier
+    JSON has no word for NaN: such values are in ``not_finite``, as text. An earlier
     file is replaced. Raises `DiskError` E190, or `InputError` E130 for a bad path.
     """
 
@@ -145,7 +145,7 @@ class Nowhere:
 def opened(
     kind: str | None, out: Path, config: Mapping[str, Any] | None = None
 ) -> Iterator[Sink]:
-    """A sink beside the run directory ``out``, closed however the block ends.
+    """A sink next to the run directory ``out``, closed however the block ends.
 
     ``jsonl`` writes ``OUT.jsonl``; ``tensorboard`` a folder in ``OUT.tensorboard`` for
     each time it is run; ``wandb`` writes to ``OUT.wandb``, and sends it where the
@@ -172,7 +172,7 @@ def opened(
 def each_episode(sink: Sink, name: str = "") -> Callable[[Any], None]:
     """What `sim2gp.psrl` calls ``on_episode``: it writes each episode's numbers.
 
-    ``return``, ``failed_plans``, and the constants at the posterior's mean in their
+    ``return``, ``failed_plans``, and the parameters at the posterior's mean in their
     units, where the belief has any; all under ``name``.
     """
 

@@ -2,11 +2,12 @@
 
 Files are written into a hidden sibling of the target, each flushed to the disk, with a
 ``manifest.json`` of their sizes and SHA-256 at the end; then the sibling is renamed to
-the target. An earlier run there is renamed to ``.NAME.previous`` first, read from there
-should the machine stop just then, and removed when the new one stands (files that the
-run did not write are carried over). A failed command removes the sibling and the
-folders it made. ``.NAME.lock`` is locked meanwhile: a second process on the same target
-gets an error. The lock ends with its process, and what a killed one left is removed.
+the target. An earlier run there is first renamed to ``.NAME.previous``. It is read from
+there should the machine stop just then, and removed when the new one is in place (files
+that the run did not write are carried over). A failed command removes the sibling and
+the folders it made. ``.NAME.lock`` is locked meanwhile: a second process on the same
+target gets an error. The lock ends with its process, and what a killed one left is
+removed.
 """
 
 import errno

@@ -153,9 +153,9 @@ def _serve(work: Callable[[Any], Any], jobs: Any, results: Any) -> None:
 
 
 def _follow() -> None:
-    """End with the process that started this one, whatever ended that.
+    """End with the process that started this one, for any end of that process.
 
-    Killed outright it stops no worker, and they would fly the whole study for nobody.
+    A killed process stops no worker, and they would run the whole study for nobody.
     """
     parent = multiprocessing.parent_process()
     if parent is not None:

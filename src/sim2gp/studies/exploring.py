@@ -1,9 +1,9 @@
 """Cells of figures 3 and 5: what a model knows of a machine that it explored itself.
 
-A learner flies episodes for information alone and is tested on what it never flew: the
-swing-up of a planner that knows the truth. Errors are those of one step against the
-noise-free truth, in sd of the machine's own noise: at 1 a prediction is as far off as
-the machine is from itself.
+A learner runs episodes for information alone. It is tested on a motion that it never
+ran: the swing-up of a planner that knows the truth. Errors are those of one step
+against the noise-free truth, in sd of the machine's own noise: at 1 a prediction is as
+far off as the machine is from itself.
 """
 
 import time
@@ -51,10 +51,10 @@ BEGINNINGS = (25, 50, 100, 150, 200)
 
 @dataclass(frozen=True)
 class Explorer:
-    """Who learns, and who chooses what is flown.
+    """Who learns, and who chooses the commands.
 
     model: of `learners.METHODS`.
-    signal: flown instead of plans for information.
+    signal: run instead of plans for information.
     together: `InformationGain`'s.
     world: what is planned in, draws or the mean.
     """
@@ -93,7 +93,7 @@ class Cell(AbstractCell):
 
     @property
     def planner(self) -> AbstractPlanner:
-        """Of what is flown."""
+        """The planner of the commands."""
         signal = METHODS[self.method].signal
         return signal or (QUICK_EXPLORER if self.quick else EXPLORER)
 
@@ -262,7 +262,7 @@ def beginnings(
     *,
     key: Key,
 ) -> list[dict[str, float]]:
-    """What the first transitions alone tell: an episode is long for a simulator."""
+    """Errors after the first transitions alone: an episode is long for a simulator."""
     out = []
     for count in BEGINNINGS:
         rows = data.state[:count], data.action[:count], data.next_state[:count]

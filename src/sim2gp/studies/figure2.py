@@ -112,7 +112,7 @@ class PosteriorSampling(Study):
 def swing_up_claims(
     table: Table, rng: np.random.Generator
 ) -> dict[str, dict[str, Any]]:
-    """The paper's claims and ours, on paired seeds; a figure beside each verdict.
+    """The paper's claims and ours, on paired seeds; a number with each verdict.
 
     Learners are compared by the mean best-seen score over the first five episodes; an
     interval is the central 95 % of bootstrap means over seeds.

@@ -149,7 +149,7 @@ def exploration_claims(
     early: Mapping[Key, Float[np.ndarray, "seeds looks two"]],
     rng: np.random.Generator,
 ) -> dict[str, dict[str, Any]]:
-    """The paper's claims and ours, on paired seeds; a figure beside each verdict."""
+    """The paper's claims and ours, on paired seeds; a number with each verdict."""
     out: dict[str, dict[str, Any]] = {}
     for machine in MACHINES:
         out[f"{machine}_exploring_halves_the_data"] = _halved(

@@ -1,4 +1,4 @@
-"""Physics only: machines as differential equations, with published constants."""
+"""Physics only: machines as differential equations, with published parameters."""
 
 from sim2gp.systems.actuators import (
     Delay,

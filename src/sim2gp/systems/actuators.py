@@ -2,9 +2,9 @@
 
     u_effective(t) = gain u(t - delay) + offset
 
-Each is one part of a machine, with one constant, ``<input>.gain``, ``<input>.offset``
+Each is one part of a machine, with one parameter, ``<input>.gain``, ``<input>.offset``
 (in the input's unit), ``<input>.delay`` and ``<input>.lag`` (in seconds): free with a
-prior, or fixed. Inputs that are driven alike may share one constant. Gain and offset
+prior, or fixed. Inputs that are driven alike may share one parameter. Gain and offset
 act inside `flow`. A delay acts on the held input: a substep of length ``h`` sees its
 mean, ``(U(t + h - tau) - U(t - tau)) / h`` with ``U`` the integral of the held input;
 so the delay ``tau`` has a gradient, which a shift by whole samples has not.
@@ -40,7 +40,7 @@ FADED = 5.0  # time constants after which a past input counts for less than 1 %
 
 
 class AbstractActuator(AbstractPart):
-    """A part on one input; ``tie`` names the input whose constant it shares."""
+    """A part on one input; ``tie`` names the input whose parameter it shares."""
 
     tie: AbstractVar[str]
 
@@ -139,7 +139,7 @@ def neutral_actuators(
 ) -> tuple[AbstractActuator, ...]:
     """Gain, offset and delay of each input, as if there were none.
 
-    ``ties`` are inputs that share the constants of another one, by name.
+    ``ties`` are inputs that share the parameters of another one, by name.
     """
     tie = dict(ties or {})
     return tuple(
@@ -185,6 +185,6 @@ def lagged_means(
         return z + lag * jnp.expm1(-z / lag)
 
     on, off = filtered(since), filtered(since - dt)
-    # The oldest input has no beginning: it is all that is left of a constant.
+    # The oldest input has no beginning: before it the input was constant.
     ever = jnp.zeros_like(on).at[:, -1].set(t - on[:, -1])
     return jnp.diff((on - off + ever) @ held) / h

@@ -1,4 +1,4 @@
-"""A machine with more: parts, free constants, variants, and sums that were measured."""
+"""A machine with more: parts, free parameters, variants, and measured sums."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -30,8 +30,8 @@ def with_parts(
 ) -> AbstractSystem:
     """The machine with these parts as well; one of the same name is replaced.
 
-    The constants of the new parts are fixed at their magnitudes, but for what
-    ``parameters`` says. Without parts it is the system as it is.
+    The parameters of the new parts are fixed at their magnitudes, except those in
+    ``parameters``. Without parts it is the system as it is.
     """
     if not parts:
         return system
@@ -69,7 +69,7 @@ def free_parts(
 def carrying_inputs(system: AbstractSystem, period: float) -> AbstractSystem:
     """The machine as its one-step map needs it: its state has the delayed inputs.
 
-    Its constants are the same, in the same order.
+    Its parameters are the same, in the same order.
     """
     if not (isinstance(system, Machine) and system.longest_delay > 0.0):
         return system
@@ -96,10 +96,10 @@ def with_variants(
 def with_measurements(
     system: AbstractSystem, sums: Sequence[LinearMeasurement]
 ) -> Machine:
-    """The machine, of which some sums of constants were measured.
+    """The machine, of which some sums of parameters were measured.
 
     Of a machine in several variants a sum names columns. Raises `InputError` E142 for a
-    sum that the bounds rule out, E144 for its sd, E145 for an unknown constant, one
+    sum that the bounds rule out, E144 for its sd, E145 for an unknown parameter, one
     that is named twice, or a sum of fixed ones alone.
     """
     table = system.parameters
@@ -123,7 +123,7 @@ def with_measurements(
 def one_variant(
     system: AbstractSystem, belief: Gaussian, name: str | None
 ) -> tuple[AbstractSystem, Gaussian]:
-    """One variant as a machine of its own, and the belief over its constants.
+    """One variant as a machine of its own, and the belief over its parameters.
 
     ``belief`` is one over the joint table's virtual values. A machine without variants
     comes back as it is. Raises `InputError` E152.

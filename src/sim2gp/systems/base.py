@@ -1,4 +1,4 @@
-"""What every machine has in common: channels, constants, an ODE, and one step.
+"""What every machine has in common: channels, parameters, an ODE, and one step.
 
 A system is physics only: no reward, no noise, no reset, no clipping. It is written for
 one point; batches are made at the edge by ``vmap``. The step over one period ``dt`` is
@@ -140,7 +140,7 @@ class AbstractSystem(eqx.Module):
 
     @abc.abstractmethod
     def record(self, values: Mapping[str, Scalar]) -> Any:
-        """This system's constants, picked by name out of ``values``."""
+        """This system's parameters, picked by name out of ``values``."""
 
     @abc.abstractmethod
     def flow(self, params: Any, s: State, a: Action, h: float | Scalar) -> State:
@@ -173,7 +173,7 @@ class AbstractSystem(eqx.Module):
         check_returns(self, "a next state", self.flow, 0.01, name=name)
 
     def nominal(self) -> Any:
-        """The record of published constants; a prior median where there is none."""
+        """The record of published values; a prior median where there is none."""
         values = self.parameters.nominal()
         return self.record({name: jnp.asarray(v, float) for name, v in values.items()})
 
@@ -219,7 +219,7 @@ class AbstractSystem(eqx.Module):
     def values(
         self, tt: Float[AnyArray, " p"], variant: Which = None
     ) -> dict[str, AnyScalar]:
-        """Every constant by name, in physical units, of one variant.
+        """Every parameter by name, in physical units, of one variant.
 
         ``variant`` is an index; only a machine that has several needs it (E152).
         """
@@ -227,7 +227,7 @@ class AbstractSystem(eqx.Module):
 
 
 class Bound(eqx.Module):
-    """A system with its constants: ``s' = f(s, a)``, ready for `jit` and `vmap`."""
+    """A system with its parameters: ``s' = f(s, a)``, ready for `jit` and `vmap`."""
 
     system: AbstractSystem
     params: Any
@@ -296,7 +296,7 @@ def rk4(
     """One classical Runge-Kutta step of length ``h`` seconds under a constant input.
 
     The barriers end XLA's fusion at each stage. Without them the compiler evaluates a
-    stage anew for each of its uses, and the derivative of a step costs a hundred times
+    stage again for each of its uses, and the derivative of a step costs a hundred times
     the step (measured on 2 cores: a Jacobian in 8 parameters at 2,000 states takes
     430 ms without and 7 to 14 ms with them).
     """
@@ -328,7 +328,7 @@ def table_for(record: type, parameters: Parameters | None) -> Parameters:
 
 
 def table_of(parameters: Parameters | Sequence[Parameter]) -> Parameters:
-    """Constants as a table, all of them free."""
+    """Parameters as a table, all of them free."""
     if isinstance(parameters, Parameters):
         return parameters
     return Parameters(tuple(parameters))

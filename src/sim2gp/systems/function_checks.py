@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 
 def names_of(table: Parameters) -> tuple[str, ...]:
-    """Names of all constants, those that are learned and then those that are fixed."""
+    """Names of all parameters, those that are learned and then those that are fixed."""
     return *table.names, *(name for name, _ in table.fixed)
 
 
 def named_once(table: Parameters, *channels: Sequence["Channel"]) -> None:
-    """Every constant, state and input has a name of its own (E145)."""
+    """Every parameter, state and input has a name of its own (E145)."""
     names = [*names_of(table), *(c.name for group in channels for c in group)]
     for name in names:
         if names.count(name) > 1:

@@ -26,7 +26,7 @@ from sim2gp.types import AnyArray
 def simulator_of(system: AbstractSystem) -> AbstractSimulator | None:
     """The simulator that moves whole windows of a machine; None where JAX does.
 
-    Its constants are those of the plant, then the magnitudes of the machine's effects
+    Its parameters are those of the plant, then the magnitudes of the machine's effects
     on the joints.
     """
     plant = plant_of(system)
@@ -38,7 +38,7 @@ def simulator_of(system: AbstractSystem) -> AbstractSimulator | None:
 
 
 class OnHost(NamedTuple):
-    """What a simulator on the host needs of a machine's constants: names, or numbers.
+    """What a simulator on the host needs of a machine's parameters: names, or numbers.
 
     theta: of the simulator.
     offset: the plant's states minus the system's.
@@ -53,7 +53,7 @@ class OnHost(NamedTuple):
 
 
 def names_on_host(simulator: AbstractSimulator, system: AbstractSystem) -> OnHost:
-    """Names of constants, empty for zero (E145 for a lag)."""
+    """Names of parameters, empty for zero (E145 for a lag)."""
     plant = plant_of(system)
     altering: tuple[str, ...] = ()
     offset: dict[str, str] = {}
@@ -72,7 +72,7 @@ def names_on_host(simulator: AbstractSimulator, system: AbstractSystem) -> OnHos
 def numbers_on_host(
     names: OnHost, system: AbstractSystem, tt: Float[np.ndarray, " p"], variant: int
 ) -> tuple[OnHost, OnHost]:
-    """The constants at virtual values, (q,) of each kind, and their slopes, (q, p)."""
+    """The parameters at virtual values, (q,) of each kind, and their slopes, (q, p)."""
     table, known = system.parameters, {"": 0.0} | dict(system.parameters.fixed)
     column: Callable[[str], str] = str
     if system.variants:

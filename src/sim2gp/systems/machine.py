@@ -2,9 +2,10 @@
 
 ``Machine(plant, effects, sensors, actuators, variants)`` is a system. The plant is
 physics: a bundled machine, a MuJoCo model, or the user's function. Each part around it
-is a small record with one constant. Constants of the machine are the plant's and those
-of its parts, fixed at their magnitudes: ``parameters`` gives them priors, or other
-values, and `free_parts` (`sim2gp.systems.assemble`) gives each part its own prior.
+is a small record with one parameter. Parameters of the machine are the plant's and
+those of its parts, fixed at their magnitudes: ``parameters`` gives them priors, or
+other values, and `free_parts` (`sim2gp.systems.assemble`) gives each part its own
+prior.
 
     machine = Machine(Furuta(), effects=[Coulomb("theta", 2e-3)])
     machine = free_parts(machine, [Delay("voltage", 0.02)])
@@ -55,7 +56,7 @@ from sim2gp.types import Action, Scalar, State
 
 
 class MachineParams(eqx.Module):
-    """Constants of the plant, and of each part by name."""
+    """Parameters of the plant, and of each part by name."""
 
     plant: Any
     parts: dict[str, Scalar]
@@ -117,7 +118,7 @@ class Machine(AbstractSystem):
             check_effect(self.plant, effect)
 
     def _magnitudes(self) -> Parameters:
-        """The constants of the parts, fixed; a shared one is that of its own input."""
+        """The parameters of the parts, fixed; a shared one is that of its own input."""
         names = [*names_of(self.plant.parameters), *(p.place for p in self.parts)]
         for part in self.parts:
             if names.count(part.place) > 1:
@@ -218,7 +219,7 @@ class Machine(AbstractSystem):
         return self._moved(params, s + offset, a, h) - offset
 
     def altered(self, constants: Float[Array, " r"], a: Action) -> Action:
-        """The plant's input where ``a`` arrives, by the constants named `altering`.
+        """The plant's input where ``a`` arrives, by the parameters named `altering`.
 
         Each entry depends on the same one of ``a`` alone.
         """
@@ -227,7 +228,7 @@ class Machine(AbstractSystem):
 
     @property
     def altering(self) -> tuple[str, ...]:
-        """Names of the constants that alter inputs."""
+        """Names of the parameters that alter inputs."""
         effects = (e for e in self.effects if isinstance(e, AbstractInputEffect))
         parts = (*self._of(Gain), *self._of(Offset), *effects)
         return tuple(dict.fromkeys(part.name for part in parts))
@@ -258,7 +259,7 @@ class Machine(AbstractSystem):
 
     @property
     def delaying(self) -> dict[str, str]:
-        """Names of the constants that delay inputs, by input (E145 for a lag)."""
+        """Names of the parameters that delay inputs, by input (E145 for a lag)."""
         for part in self.actuators:
             if isinstance(part, Lag):
                 raise error("lag_over_windows", name=part.name, channel=part.where)
@@ -302,13 +303,13 @@ class Machine(AbstractSystem):
     def _each(
         self, params: MachineParams, kind: type[Gain | Offset | Delay]
     ) -> Float[Array, " m"]:
-        """The constants of one kind of actuator, of each input."""
+        """The parameters of one kind of actuator, of each input."""
         found = {part.where: params.parts[part.name] for part in self._of(kind)}
         none = jnp.full_like(next(iter(found.values())), kind.neutral)
         return jnp.stack([found.get(channel.name, none) for channel in self.actions])
 
     def _range(self, name: str) -> tuple[float, float]:
-        """Least and largest value of a constant, in any variant."""
+        """Least and largest value of a parameter, in any variant."""
         fixed = [*self.parameters.fixed, *(x for c in self.variants for x in c.fixed)]
         low = high = [value for known, value in fixed if known == name]
         free = [p for p in self.parameters.free if p.name.split(AT)[0] == name]
@@ -331,7 +332,7 @@ def as_machine(system: AbstractSystem) -> Machine:
 def _completed(
     own: Parameters, given: Parameters, variants: Sequence[Variant]
 ) -> Parameters:
-    """The given table with the constants that it does not mention (E145)."""
+    """The given table with the parameters that it does not mention (E145)."""
     known = {name.split(AT)[0] for name in names_of(given)}
     for name in sorted(known - set(names_of(own))):
         raise unknown_parameter(name, names_of(own))

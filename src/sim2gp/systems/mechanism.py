@@ -30,7 +30,7 @@ class AbstractMechanism(AbstractODE):
     """Two joints ``q``: ``M(q) dv/dt = forces(q, v, a)``, solved in closed form.
 
     States are ``(q1, q2, v1, v2)``. A locked joint keeps its place: its velocity counts
-    as zero whatever the state says.
+    as zero for any state.
     """
 
     locked: AbstractVar[tuple[bool, bool]]

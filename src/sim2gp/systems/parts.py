@@ -1,8 +1,8 @@
 """A part of a machine: one scalar more than its plant has, with its name and prior.
 
 Effects, sensors and actuators are parts. A machine holds them in tuples
-(`sim2gp.systems.machine`); the constant of each is named ``<where>.<what>``, but for
-actuators that share the one of another input.
+(`sim2gp.systems.machine`); the parameter of each is named ``<where>.<what>``, except
+for actuators that share that of another input.
 """
 
 import abc
@@ -41,19 +41,19 @@ class AbstractPart(eqx.Module):
 
     @property
     def name(self) -> str:
-        """Name of the constant, which is that of the place unless it is shared."""
+        """Name of the parameter, which is that of the place unless it is shared."""
         return self.place
 
     @abc.abstractmethod
     def unit(self, plant: AbstractPlant) -> str:
-        """Unit of the constant; E103 or E145 where the plant cannot have the part."""
+        """Unit of the parameter; E103 or E145 where the plant cannot have the part."""
 
     @abc.abstractmethod
     def parameter(self, plant: AbstractPlant) -> Parameter:
-        """The constant with its prior, to free it."""
+        """The parameter with its prior, to free it."""
 
 
 def around_nothing(part: AbstractPart, plant: AbstractPlant, sd: float) -> Parameter:
-    """A constant that is zero in the mean."""
+    """A parameter that is zero in the mean."""
     unit = part.unit(plant)
     return Parameter(part.name, unit, part.meaning, "identity", mean=0.0, sd=sd)

@@ -118,7 +118,7 @@ def simulate(
 ) -> Float[Array, "L n"]:
     """States at the rows of one window, from ``x0`` at its first.
 
-    ``added`` is a constant that every input has besides.
+    ``added`` is a constant that is added to every input.
     """
 
     def step(x: Array, row: tuple[Array, Array]) -> tuple[Array, Array]:

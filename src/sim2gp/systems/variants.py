@@ -1,9 +1,9 @@
-"""Variants of one machine: which constants they share, and which each has alone.
+"""Variants of one machine: which parameters they share, and which each has alone.
 
-Logs of one robot with and without its payload share nearly all constants. A joint fit
-has one vector of free columns: those of shared constants, and for a constant that some
-variant has alone a column of its own, named ``<constant> @ <variant>``. Variant ``g``
-of the machine has the constants
+Logs of one robot with and without its payload share nearly all parameters. A joint fit
+has one vector of free columns: those of shared parameters, and for a parameter that
+some variant has alone a column of its own, named ``<parameter> @ <variant>``. Variant
+``g`` of the machine has the parameters
 
     theta_g = G_g (theta, known),    G_g a selection of columns and of known values,
 
@@ -23,7 +23,7 @@ from sim2gp.inference.parameters import Parameter, Parameters, unknown_parameter
 from sim2gp.systems.function_checks import names_of
 from sim2gp.types import AnyArray, AnyScalar
 
-#: Between a constant and the one variant whose column it is.
+#: Between a parameter and the one variant whose column it is.
 AT = " @ "
 #: The index of a variant; a machine without variants needs none.
 Which = Int[AnyArray, ""] | int | None
@@ -31,9 +31,9 @@ Which = Int[AnyArray, ""] | int | None
 
 @dataclass(frozen=True)
 class Variant:
-    """What one variant has alone; all other constants are shared.
+    """What one variant has alone; all other parameters are shared.
 
-    ``fixed`` are constants whose value is known in it, ``own`` those that are learned
+    ``fixed`` are parameters whose value is known in it, ``own`` those that are learned
     for it by themselves.
     """
 
@@ -42,9 +42,9 @@ class Variant:
     own: tuple[str, ...] = ()
 
     def column(self, constant: str) -> str:
-        """The free column, or the name of the known value, that a constant has in it.
+        """The free column, or the name of the known value, that a parameter has in it.
 
-        A value that is fixed in this variant is named ``<constant> @ <name>``, too: it
+        A value that is fixed in this variant is named ``<parameter> @ <name>``, too: it
         is no column of the table.
         """
         alone = constant in self.own or constant in dict(self.fixed)
@@ -54,10 +54,10 @@ class Variant:
 def values_of(
     columns: Mapping[str, AnyScalar], variants: Sequence[Variant], index: Which
 ) -> dict[str, AnyScalar]:
-    """The constants of one variant out of all columns and known values.
+    """The parameters of one variant out of all columns and known values.
 
-    ``index`` may be traced: constants that differ are gathered, the others stay as they
-    are. Raises `InputError` E152 where there are several and none is chosen.
+    ``index`` may be traced: parameters that differ are gathered, the others stay as
+    they are. Raises `InputError` E152 where there are several and none is chosen.
     """
     if not variants:
         return dict(columns)
@@ -82,9 +82,9 @@ def joint_table(
 ) -> Parameters:
     """The columns of all variants of a machine with this table.
 
-    ``priors`` are those of columns, by ``<constant> @ <variant>``; a column without one
-    has the prior of its constant, independently. Raises `InputError` E145 for an
-    unknown constant or column, and for one that is stated twice or is not free.
+    ``priors`` are those of columns, by ``<parameter> @ <variant>``; a column without
+    one has the prior of its parameter, independently. Raises `InputError` E145 for an
+    unknown parameter or column, and for one that is stated twice or is not free.
     """
     given = dict(priors or {})
     for c in variants:
@@ -109,7 +109,7 @@ def joint_table(
 def own_table(
     table: Parameters, variants: Sequence[Variant], name: str | None
 ) -> tuple[Parameters, tuple[int, ...]]:
-    """One variant's constants, and where the free ones are in the joint table.
+    """One variant's parameters, and where the free ones are in the joint table.
 
     Raises `InputError` E152 for an unknown variant, or none where there are some.
     """
@@ -125,7 +125,7 @@ def own_table(
             free.append(dataclasses.replace(p, name=constant))
             places.append(i)
             known.pop(constant, None)
-    # A posterior knows what was weighed already.
+    # A posterior already includes the measured sums.
     return Parameters(tuple(free), tuple(known.items())), tuple(places)
 
 
@@ -150,7 +150,7 @@ def which(name: str | None, known: Sequence[str]) -> InputError:
 
 
 def _check(table: Parameters, variant: Variant) -> None:
-    """Constants that the table has, each stated once, own ones free (E145)."""
+    """Parameters that the table has, each stated once, own ones free (E145)."""
     fixed, own = dict(variant.fixed), variant.own
     for name in (*fixed, *own):
         if name not in names_of(table):

@@ -8,8 +8,8 @@ A command acts on accelerations at once, so second differences of a position ove
 D integrates twice and takes the same difference, so a held command needs no derivative.
 The share of what the states leave open that commands explain, R^2(k), has its peak
 where they belong. A controller's commands depend on the rows before them and explain
-their noise, too: a peak at k < 0 counts only where commands explain little as they
-stand.
+their noise, too: a peak at k < 0 counts only where commands explain little in their own
+rows.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,7 +33,7 @@ Values = Float[np.ndarray, " N"]
 def alignment_notes(
     log: Log, states: Sequence[ChannelLike], delay: float = 0.0
 ) -> list[Note]:
-    """Whether commands explain the motion best some rows from where they stand (W118).
+    """Whether commands explain the motion best if they are shifted by some rows (W118).
 
     ``delay`` (s) is what the model may take up.
     """

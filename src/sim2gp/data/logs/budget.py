@@ -110,7 +110,8 @@ class Meter:
     def measure(self, pieces: Iterator[bytes], declared: int, what: str) -> None:
         """Unpack one piece and throw it away: it is no larger than it declares.
 
-        Libraries unpack a chunk as a whole, whatever it declares; afterwards they may.
+        Libraries unpack a chunk as a whole, even beyond its declared size. They may do
+        so afterwards.
         """
         self.piece(declared, what)
         self.claim(declared, what)
@@ -139,7 +140,7 @@ class _OutOfTime(BaseException):
 
 @contextmanager
 def readable(meter: Meter) -> Iterator[None]:
-    """Whatever a parser raises inside becomes E125: the file is cut off or damaged.
+    """Any error of a parser inside becomes E125: the file is cut off or damaged.
 
     Parsers of other projects raise anything on bytes that they did not expect, and may
     loop: after the budget's seconds the thread is interrupted (E126). Errors of ours

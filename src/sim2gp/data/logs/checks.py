@@ -1,6 +1,6 @@
 """Is this recording what it claims to be? Each check raises, or returns notes.
 
-Errors (E1xx) are faults no fit can survive; notes (W1xx) are facts the reader of a
+Errors (E1xx) make every fit impossible; notes (W1xx) are facts that the reader of a
 result should know. Nothing is repaired silently. Position and velocity of a joint are
 compared through displacements: over k rows, ``q_{i+k} - q_i`` against the integral of
 dq, whose slope is 1 for a healthy pair, -1 for a flipped sign, 57.3 for degrees.
@@ -97,7 +97,7 @@ def plain_clock(column: Column, source: str) -> None:
 def rate(time: Values, cuts: Mask, source: str, *, in_seconds: bool) -> list[Note]:
     """A period that is no control period is a unit (E107); jitter is stated (W110).
 
-    ``in_seconds`` tells that the format itself gives the unit.
+    ``in_seconds`` says that the format itself gives the unit.
     """
     steps = np.diff(time)
     period = float(np.median(steps))
@@ -274,7 +274,7 @@ def unused_columns(names: Sequence[str], source: str) -> list[Note]:
 
 
 def check_all_used(logs: Sequence[Log]) -> None:
-    """Whoever is strict takes every column (E105)."""
+    """A strict reader needs every column (E105)."""
     for log in logs:
         for note in log.notes:
             if note.code == "W105":
@@ -286,7 +286,7 @@ def check_all_used(logs: Sequence[Log]) -> None:
 
 
 def shared_rows(train: Sequence[Log], test: Sequence[Log]) -> list[Note]:
-    """Rows that stand in both sets: a test on them proves nothing (W128).
+    """Rows that are in both sets: a test on them proves nothing (W128).
 
     Rows at rest, alike in every log that begins with them, do not count.
     """

@@ -1,8 +1,8 @@
 """Folders of robot learning: LeRobot (v2.x, v3) and Minari, one log per episode.
 
 LeRobot: ``meta/info.json`` and Parquet files, read with pyarrow alone; rows are split
-by ``episode_index``, whatever file they stand in. Minari: ``data/main_data.hdf5``, read
-with h5py alone; an episode of T actions has T + 1 observations.
+by ``episode_index``, in any of the files. Minari: ``data/main_data.hdf5``, read with
+h5py alone; an episode of T actions has T + 1 observations.
 """
 
 import json

@@ -2,7 +2,7 @@
 
 Only what lies in the file itself is read: links to other files, and data that a file
 says to lie elsewhere, are refused. The library unpacks a chunk as a whole, as far as
-its bytes go, whatever the file declares: each chunk is measured before.
+its bytes go, and not only to its declared size: each chunk is measured before.
 """
 
 import math

@@ -1,7 +1,7 @@
 """A log: one uninterrupted recording of a machine, in the system's names and units.
 
-What was measured stands in ``channels``, what was commanded in ``inputs``. A sample
-that must not count has False in its channel's mask; its value is then a stand-in.
+``channels`` has what was measured, ``inputs`` what was commanded. A sample that must
+not count has False in its channel's mask; its value is then a placeholder.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,7 +31,7 @@ class ChannelLike(Protocol):
 
 @dataclass(frozen=True)
 class Column:
-    """Where a channel stands in a file, and how its numbers become the channel's.
+    """Where a channel is in a file, and how its numbers become the channel's.
 
     ``value = sign * scale * number + offset``, the number first converted from
     ``unit``, the offset in the channel's unit. Numbers at or beyond ``saturation``

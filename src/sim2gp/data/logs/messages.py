@@ -65,7 +65,7 @@ def collect_streams(
         )
         if asked is None or number == 0:
             seen |= dict.fromkeys(fields)
-        # In one order, whatever that of the joints in this message.
+        # In one order, which need not be that of the joints in this message.
         names = tuple(sorted(fields if asked is None else asked & fields.keys()))
         if not names:
             continue

@@ -3,8 +3,7 @@
 The order matters: drop excluded rows, convert the unit, unwrap angles (a turn is 2 pi
 before any sign or scale), apply sign, scale and offset, mask, bring all streams on one
 clock, then cut the recording where time has a gap or rows were excluded. Excluded rows
-are cut out and not only masked, because whatever disturbed the machine there also moved
-it.
+are cut out and not only masked, because what disturbed the machine there also moved it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -46,7 +45,7 @@ class _Plan:
     limits: Mapping[str, tuple[float, float]]
 
     def held(self, among: Sequence[ChannelLike], table: LogTable) -> dict[str, Column]:
-        """The columns of some channels that stand in a table."""
+        """The columns of some channels that are in a table."""
         found = {c.name: self.columns.get(c.name) for c in among}
         return {
             name: spec
@@ -77,7 +76,7 @@ def read_log(
     """Read a file, a folder or columns into logs without gaps, episode by episode.
 
     A number for an input holds it constant. ``time`` is a column, in a bag "header" or
-    "log"; ``period`` in s stands for it where rows are even; ``episode`` is a column of
+    "log"; ``period`` in s replaces it where rows are even; ``episode`` is a column of
     numbers. ``exclude`` lists intervals of the file's time in s; a log is cut around
     them. ``limits`` are end stops of states, in their units: samples there are masked.
     ``keep_first`` drops further rows of a stamp; a ``longest_delay`` is the model's.
@@ -169,7 +168,7 @@ def _assembled(
 def _unread_columns(tables: Sequence[LogTable]) -> list[str]:
     """The columns that were not read, but for a format's own.
 
-    A message of a bag has the fields of its type, whoever needs them.
+    A message of a bag has the fields of its type, even if nobody needs them.
     """
     return [
         name
@@ -241,7 +240,7 @@ def _time(table: LogTable, plan: _Plan) -> Values:
 
 
 def _or_constant(error: InputError, plan: _Plan) -> InputError:
-    """What is missing may be an input's column: a number can stand for it."""
+    """What is missing may be an input's column: a number can replace it."""
     for action in plan.actions:
         spec = plan.columns[action.name]
         column = spec.column if isinstance(spec, Column) else None
@@ -289,7 +288,7 @@ def _measured_channels(
         mask = np.isfinite(raw) & ~absent
         if not mask.any():
             raise _too_short(f"{source}:column {spec.column}", 0)
-        # A stand-in between neighbours keeps filters sane; the mask keeps it out.
+        # A value between its neighbours keeps filters finite; the mask excludes it.
         raw = np.interp(index, index[mask], raw[mask])
         notes += said + checks.counter_wraps(raw, spec.column, source)
         values = _converted(raw, spec, state.unit, source, state.angle)

@@ -2,7 +2,7 @@
 
 The first line names the columns, the rest are rows of numbers separated by commas.
 Spaces around names and a byte-order mark are accepted. Only the columns that are asked
-for are parsed, by numpy; a fault is then looked for cell by cell, to name its line.
+for are parsed, by numpy; an error is then looked for cell by cell, to name its line.
 Lines are counted as an editor counts them: the header is line 1.
 """
 

@@ -15,7 +15,7 @@ def pieces(content: bytes, kind: str, what: str) -> Iterator[bytes]:
     """Unpacked bytes in pieces of at most `STEP`; ``kind`` is "zstd", "lz4" and so on.
 
     ``what`` names the file where a package is missing (E135). ValueError for another
-    compression, and whatever its library raises on damaged bytes.
+    compression, and any error of its library for damaged bytes.
     """
     if kind in ("", "none"):
         yield content

@@ -12,7 +12,7 @@ Pareto law whose shape ``k`` says how many moments they have: below .5 the varia
 finite and the Gaussian is near the posterior, above .7 importance sampling itself fails
 (Vehtari, Simpson, Gelman, Yao and Gabry 2024, J. Machine Learning Research 25). The
 shape by Zhang and Stephens 2009 (Technometrics 51); smoothed weights give the exact
-posterior's mean and sd, told in sd of the Gaussian.
+posterior's mean and sd, in sd of the Gaussian.
 """
 
 import math
@@ -37,8 +37,8 @@ from sim2gp.types import Key, in_float64
 DRAWS = 256
 STEPS = 3  # of Gauss-Newton for the start states of a draw
 FINE, STRAINED = 0.5, 0.7  # of k
-MOVED, STRETCHED = 0.5, 1.5  # a mean in sd, a ratio of sds: what is told by name
-#: An sd below this many draws' worth of weights is not told.
+MOVED, STRETCHED = 0.5, 1.5  # mean in sd, ratio of sds: beyond these, named
+#: An sd below this many draws' worth of weights is not reported.
 ENOUGH = 20.0
 
 
@@ -67,7 +67,7 @@ class ImportanceCheck:
         return "strained" if far or self.k > FINE else "fine"
 
     def far(self) -> Bool[np.ndarray, " p"]:
-        """Constants whose mean or sd is another than the Gaussian's."""
+        """Parameters whose mean or sd differs from the Gaussian's."""
         return differs(self.shift, self.ratio)
 
     def as_dict(self, names: tuple[str, ...]) -> dict[str, Any]:
@@ -106,7 +106,7 @@ def describe_shifts(
     shift: Float[np.ndarray, " p"],
     ratio: Float[np.ndarray, " p"],
 ) -> list[str]:
-    """The constants that differ, and how."""
+    """The parameters that differ, and how."""
     return [
         f"{names[j]} (mean by {shift[j]:.1f} sd, sd times {ratio[j]:.2f})"
         for j in np.flatnonzero(differs(shift, ratio))
@@ -118,7 +118,7 @@ def moment_changes(
     shift: Float[np.ndarray, " p"],
     ratio: Float[np.ndarray, " p"],
 ) -> dict[str, Any]:
-    """Of all constants, for summary.json."""
+    """Of all parameters, for summary.json."""
     return {
         name: {"shift": finite_or_none(s), "sd_ratio": finite_or_none(r)}
         for name, s, r in zip(names, shift, ratio, strict=True)
@@ -126,7 +126,7 @@ def moment_changes(
 
 
 def standardised_directions(posterior: Gaussian) -> Float[np.ndarray, "p p"]:
-    """A row for each constant: its direction among the standardised unknowns."""
+    """A row for each parameter: its direction among the standardised unknowns."""
     scale = np.asarray(posterior.scale)
     found: np.ndarray = scale / np.linalg.norm(scale, axis=1)[:, None]
     return found

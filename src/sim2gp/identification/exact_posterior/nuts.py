@@ -1,6 +1,6 @@
 """Draws of the exact posterior by NUTS, to hold Laplace's Gaussian against.
 
-All unknowns of a fit are drawn, at its noise and weights: the constants and the start
+All unknowns of a fit are drawn, at its noise and weights: the parameters and the start
 states of the windows,
 
     log p(z, e | data) = -L(z, e) + const,
@@ -55,7 +55,7 @@ MIXED, ENOUGH = 1.01, 400.0  # split R-hat, effective draws
 class ChainSummary:
     """``shift`` and ``ratio`` are NUTS' mean and sd in those of the Gaussian.
 
-    ``draws`` are effective ones, of the constant that has the fewest; ``divergent``
+    ``draws`` are effective ones, of the parameter that has the fewest; ``divergent``
     counts the paths that the sampler gave up.
     """
 
@@ -71,7 +71,7 @@ class ChainSummary:
         return self.r_hat <= MIXED and self.draws >= ENOUGH and self.divergent == 0
 
     def far(self) -> Bool[np.ndarray, " p"]:
-        """Constants whose mean or sd is another than the Gaussian's."""
+        """Parameters whose mean or sd differs from the Gaussian's."""
         return differs(self.shift, self.ratio)
 
     def as_dict(self, names: tuple[str, ...]) -> dict[str, Any]:
@@ -214,7 +214,7 @@ def summarise_chains(
     divergent: Bool[np.ndarray, "chains S"],
     unit: Float[np.ndarray, "p p"],
 ) -> ChainSummary:
-    """Moments per constant, whose direction in ``a`` is its row of ``unit``."""
+    """Moments per parameter, whose direction in ``a`` is its row of ``unit``."""
     from blackjax.diagnostics import effective_sample_size, potential_scale_reduction
 
     x = draws @ unit.T

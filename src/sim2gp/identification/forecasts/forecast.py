@@ -1,7 +1,7 @@
 """Open-loop forecasts of windows, and the band that they are predicted to stay in.
 
-A forecast errs by its start, by its constants, and by what the model does not know. For
-a window's output at horizon h, to first order,
+A forecast has errors from its start, from its parameters, and from what the model does
+not know. For a window's output at horizon h, to first order,
 
     V(h) = max over h' <= h of
            J_s S_s J_s^T + J_d S_d J_d^T + J_z S_z J_z^T + resolution^2
@@ -126,7 +126,7 @@ def compile_forecast(system: AbstractSystem, grid: Grid) -> None:
 def _forecast_batch(
     system: AbstractSystem, posterior: Gaussian, windows: Windows
 ) -> tuple[Array, Array, Array, Array]:
-    """Outputs at all rows, their slopes in start and input, variance by constants."""
+    """Outputs at all rows, their slopes in start and input, variance by parameters."""
     n, m = windows.start.shape[1], windows.area.shape[2]
 
     def one(window: Windows) -> tuple[Array, Array, Array, Array]:
@@ -163,7 +163,7 @@ def _forecast_parts(
     states: Float[AnyArray, "*W L n"],
     slopes: Float[AnyArray, "*W L n k"],
 ) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
-    """Outputs, their slopes in start and input, and their variance by constants."""
+    """Outputs, their slopes in start and input, and their variance by parameters."""
     outputs = np.asarray(window.outputs)
     n, J = states.shape[-1], slopes[..., outputs, :]
     inputs = n + window.area.shape[-1]
@@ -191,7 +191,7 @@ def _window_batch(grid: Grid, which: np.ndarray, rows: np.ndarray) -> Windows:
 
 @dataclass(frozen=True)
 class Band:
-    """What a forecast's spread is made of, besides the posterior."""
+    """What a forecast's spread is made of, in addition to the posterior."""
 
     start_sd: Float[np.ndarray, " n"]
     input_sd: Float[np.ndarray, " m"]

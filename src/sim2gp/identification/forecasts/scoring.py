@@ -2,7 +2,8 @@
 
 CRPS (Gneiting & Raftery 2007) is the expected absolute error of a draw less half the
 expected distance of two draws: in the channel's unit, the absolute error where there is
-no spread, and it rewards an honest one. Of a Gaussian with sd ``s`` and error ``e``,
+no spread, and best for a calibrated spread. Of a Gaussian with sd ``s`` and error
+``e``,
 
     CRPS = s [z (2 Phi(z) - 1) + 2 phi(z) - 1 / sqrt(pi)],     z = e / s
 
@@ -136,7 +137,7 @@ def format_change(found: PairedComparison) -> str:
 def selection_sentence(
     what: Mapping[str, str], against: Sequence[PairedComparison], kept: int, unit: str
 ) -> str:
-    """What the logs support, as one would say it to whoever runs the machine.
+    """What the logs support, in a sentence for the user of the machine.
 
     ``what`` gives each model in words, by name. ``against`` holds each against the
     first, the simulator alone.

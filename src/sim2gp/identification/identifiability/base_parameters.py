@@ -1,6 +1,6 @@
 """Base parameters: combinations that the data do determine where single ones fail.
 
-Sums ``theta_i + sum c_j theta_j`` or products ``theta_i prod theta_j^c_j``, whichever
+Sums ``theta_i + sum c_j theta_j`` or products ``theta_i prod theta_j^c_j``: those that
 have the same null space at every point tried; the rest hold at the MAP only and are
 marked "locally". (The classical base parameters of robot identification are the linear
 case: Gautier and Khalil, "Direct calculation of minimum set of inertial parameters of
@@ -97,7 +97,7 @@ def _combination_entry(
     used = [int(i) for i in np.flatnonzero(weights)]
     names = [spec.names[block.index[i]] for i in used]
     units = [spec.parameters.units[block.index[i]] for i in used]
-    # The parameter that the combination stands in for has weight one and goes first.
+    # The parameter that the combination replaces has weight one and goes first.
     order = sorted(range(len(used)), key=lambda n: weights[used[n]] != 1.0)
     terms = [(float(weights[used[n]]), names[n]) for n in order]
     if kind == "linear":

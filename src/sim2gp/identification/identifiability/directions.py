@@ -2,7 +2,7 @@
 
 A flat direction is a *move* ``dtheta = diag(dtheta/dtt) L0 v`` that the data cannot
 see; a determined one is a *measurement*, the covector ``L0^-T v``. Null directions are
-told one trade-off at a time (`null_space`), the others as the decomposition has them.
+reported one trade-off at a time (`null_space`), the others as in the decomposition.
 """
 
 import math

@@ -1,16 +1,16 @@
-"""Which constants to open: those whose effect no others can take over.
+"""Which parameters to open: those whose effect no others can take over.
 
-``J`` holds, for each constant, the change of all predictions in noise sd that one prior
+``J`` has, for each parameter, the change of all predictions in noise sd that one prior
 sd of it makes; what start states and nuisances (delays) can take over is projected out.
 QR with column pivoting takes the largest effect first, then the largest of what is left
 of the others, and so on:
 
-    J P = Q [ R11  R12 ]        |R_kk|: effect of constant k after all before it,
+    J P = Q [ R11  R12 ]        |R_kk|: effect of parameter k after all before it,
             [  0   R22 ]        root of the sum of squares over the data.
 
-From the first ``|R_kk| < SILENT`` on constants are held. A held constant that is one
+From the first ``|R_kk| < SILENT`` on, parameters are held. A held parameter that is one
 prior sd away changes the predictions of all the data together by less than `SILENT`
-noise sd, once the open ones have moved by ``C = R11^-1 R12``. So these stand for the
+noise sd, once the open ones have moved by ``C = R11^-1 R12``. So they represent the
 base parameters
 
     z_i + sum_j C_ij z_j        i open, j held
@@ -36,17 +36,17 @@ from sim2gp.inference.parameters import Parameters
 from sim2gp.types import in_float64
 
 SILENT = 0.05  # noise sd, over all of the data
-#: Posterior sd by which a held constant, one prior sd away, moves an open one: less is
-#: not worth a word.
+#: Posterior sd by which a held parameter, one prior sd away, moves an open one: less is
+#: not reported.
 MOVED = 0.1
 
 
 class Selection(NamedTuple):
     """What to open and what to hold.
 
-    held: of each constant, the share of its prior sd that the data leave where all are
+    held: of each parameter, the share of its prior sd that the data leave where all are
         open.
-    stands_for: of an open constant, the held ones that it takes over, each with its
+    stands_for: of an open parameter, the held ones that it takes over, each with its
         weight in ``open + sum weight held`` (physical units, about the prior's mean).
     """
 
@@ -62,11 +62,11 @@ def select_parameters(
     *,
     nuisances: Collection[str] = (),
 ) -> Selection:
-    """Hold what the data do not tell apart from the rest.
+    """Hold the parameters that the data cannot separate from the rest.
 
     ``information`` is the factor of the data's Fisher, whitened by the prior, about the
-    prior's mean; ``nuisances`` are free constants that are never held. Nothing is held
-    where the data tell no constant at all.
+    prior's mean; ``nuisances`` are free parameters that are never held. Nothing is held
+    where the data determine no parameter at all.
     """
     A, L0 = np.asarray(information), np.asarray(prior.scale)
     sd = np.asarray(prior.sd())

@@ -52,7 +52,7 @@ class Spectrum(eqx.Module):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the free constants."""
+        """Names of the free parameters."""
         return self.parameters.names
 
     @property

@@ -71,7 +71,7 @@ def parameter_entries(spec: Spectrum) -> dict[str, dict[str, Any]]:
 def add_plain(
     entries: dict[str, dict[str, Any]], parameters: Parameters, posterior: Gaussian
 ) -> None:
-    """Beside corrected intervals those of the posterior that counts every sample."""
+    """Add the intervals of the plain posterior, which counts every sample."""
     mean, sd = np.asarray(posterior.mean), np.asarray(posterior.scale)
     moments = physical_moments(parameters, mean, np.linalg.norm(sd, axis=1))
     for j, entry in enumerate(entries.values()):

@@ -1,11 +1,11 @@
 """The corrected intervals of a fit: of its windows, and of what its simulator may lack.
 
-Every effect of the machine's library that is no constant in disguise becomes one more
-unknown beside the machine's own, at nothing where the fit stands. The windows are
-linearised there, `sim2gp.identification.intervals.scatter` says where all of them lie,
-and they are linearised there again, until the centre stays: physics that is missing may
-have taken the fit far from it. The noise stays the fit's, which has the misfit in it:
-that makes intervals rather too wide than too narrow.
+Every effect of the machine's library becomes one more unknown, unless a parameter of
+the machine acts alike. It is zero at the fit. The windows are linearised there,
+`sim2gp.identification.intervals.scatter` gives the posterior of all unknowns, and they
+are linearised there again, until the centre stays: physics that is missing may have
+taken the fit far from it. The noise stays the fit's, which has the misfit in it: that
+makes intervals rather too wide than too narrow.
 """
 
 from collections.abc import Sequence
@@ -36,14 +36,14 @@ from sim2gp.systems.effects.registry import smooth_effects
 from sim2gp.systems.parts import AbstractPart
 from sim2gp.types import in_float64
 
-#: Sine of the angle to the constants' span below which an effect is one of them in
-#: another shape, such as dry friction's with another width.
+#: Sine of the angle to the parameters' span below which an effect is one of them in
+#: another shape, such as dry friction with another width.
 DISGUISE = 0.02
 TRUSTED = 1.0  # nats that a centre may cost beyond what the linear misfit says
 GAIN = 0.5  # of a gain that the linear misfit predicts: what may fail to come
 HALVINGS = 6
 ROUNDS = 6  # linearisations
-SETTLED = 0.1  # of its sd: what no constant's centre moves by any more
+SETTLED = 0.1  # of its sd: no parameter's centre moves by more than this
 
 
 def compile_corrected(system: AbstractSystem, cut: Windows) -> None:
@@ -64,7 +64,7 @@ def corrected_windows(
     group: Int[np.ndarray, " W"],
     effects: Sequence[AbstractPart] | None = None,
 ) -> CorrectedFit:
-    """The corrected posterior of a fit's constants, checked with the simulator itself.
+    """The corrected posterior of a fit's parameters, checked with the simulator itself.
 
     ``effects`` are what it may lack, with their prior sd: None is its library, which a
     model of the user's own does not have. Raises `NotFinite` E203.
@@ -130,7 +130,7 @@ def _with_effects_at_zero(
 def _identifiable_effects(
     pulls: Pulls, own: Int[np.ndarray, " p"]
 ) -> Int[np.ndarray, " k"]:
-    """The other columns that show, and that no constants of the machine mimic."""
+    """The other columns with an effect that no parameters of the machine mimic."""
     A = np.asarray(np.linalg.qr(np.concatenate(list(pulls.factors)), mode="r"))
     others = np.setdiff1d(np.arange(A.shape[1]), own)
     kept = [j for j in others if sine_to(A[:, own], A[:, j])[0] > DISGUISE]

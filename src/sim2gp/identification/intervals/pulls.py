@@ -1,4 +1,4 @@
-"""What every window of a fit says of the constants alone: its pulls.
+"""What every window of a fit says of the parameters alone: its pulls.
 
 The windows' rows ``[J_e J_z r]``, whitened by prior and noise, the start state ``e``
 eliminated by a QR of each window's own. `sim2gp.identification.intervals.scatter` asks
@@ -37,11 +37,11 @@ class Pulls:
         return np.swapaxes(self.factors, 1, 2) @ self.factors
 
     def of(self, which: Int[np.ndarray, " q"]) -> "Pulls":
-        """Those of some constants, the others held."""
+        """Those of some parameters, the others held."""
         return Pulls(self.factors[..., which], self.scores[:, which], self.group)
 
     def at(self, dz: Float[np.ndarray, " p"]) -> "Pulls":
-        """Where the constants are ``dz`` further, of a machine that is linear."""
+        """The pulls where the parameters are ``dz`` further, for a linear machine."""
         return Pulls(self.factors, self.scores + self.fisher @ dz, self.group)
 
 

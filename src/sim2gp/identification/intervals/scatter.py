@@ -1,10 +1,10 @@
 """Intervals that hold where residuals are coloured: how far do windows really scatter?
 
 Laplace's posterior counts every sample as new. Of a real machine they never are, and
-its 95 % intervals then hold the truth in a half of all cases or fewer. What the errors
-of windows do to the constants shows in how the windows pull them, whatever is wrong
-with the samples inside. In whitened coordinates (``tt = mu0 + L0 z``), with every
-window's start state eliminated,
+its 95 % intervals then hold the truth in a half of all cases or fewer. The effect of
+the windows' errors on the parameters shows in how the windows pull them, for any kind
+of error inside. In whitened coordinates (``tt = mu0 + L0 z``), with every window's
+start state eliminated,
 
     u_w = J_w^T r_w,    F_w = J_w^T J_w,    F = sum F_w,    R^T R = F + I,
     v_w = R^-T u_w,     P_w = R^-T F_w R^-1.
@@ -42,7 +42,7 @@ each ``tau`` has a Gaussian posterior and an evidence,
 
     log p(tau) = 1/2 |Q_1^T d|^2 - log |T|,    [F_c^1/2 D; I] = Q T,  D = diag(1, tau),
 
-and what is told of the constants is their mixture's mean and covariance: what the data
+and the parameters are reported with their mixture's mean and covariance: what the data
 leave open of the effects widens the intervals, what they say of them moves the centre.
 """
 
@@ -74,7 +74,7 @@ MUCH = 3.0  # times as wide: a summary says why, wherever it names the interval
 
 @dataclass(frozen=True)
 class CorrectedFit:
-    """The corrected posterior, or the plain one where windows are too few to tell.
+    """The corrected posterior, or the plain one where windows are too few.
 
     ``inflation`` is ``kappa^2``, the samples that count as one; ``lag`` the ``b``
     successive windows taken together; ``freedom`` the degrees of freedom ``nu``;
@@ -101,9 +101,9 @@ def correct_posterior(
 ) -> CorrectedFit:
     """The posterior as wide as the windows' pulls scatter, about the data's centre.
 
-    ``plain`` has the point where the pulls were linearised, and is what is told of too
-    few windows; ``effects`` marks what the simulator may lack, believed with the
-    library's own sd. Raises `NotFinite` E203 for a pull that is not a number.
+    ``plain`` has the point where the pulls were linearised. It is returned where
+    windows are too few; ``effects`` marks what the simulator may lack, believed with
+    the library's own sd. Raises `NotFinite` E203 for a pull that is not a number.
     """
     for what in (pulls.factors, pulls.scores):
         must_be_finite("pulls of windows", what, "the intervals")

@@ -1,4 +1,4 @@
-"""Which intervals the constants of a run have, and which effects they allow for."""
+"""Which intervals the parameters of a run have, and which effects they allow for."""
 
 import math
 from collections.abc import Mapping
@@ -22,7 +22,7 @@ def interval_entry(
     parameters: Mapping[str, Mapping[str, Any]],
     windows: int,
 ) -> dict[str, Any]:
-    """The entry "intervals" of a summary; ``parameters`` are those of its constants."""
+    """The entry "intervals" of a summary, given the entries of its parameters."""
     widened = [entry["widened"] or 1.0 for entry in parameters.values()]
     return {
         "which": "corrected" if honest.enough else "plain",

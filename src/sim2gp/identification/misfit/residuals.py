@@ -20,7 +20,7 @@ from sim2gp.inference.gaussian import Gaussian
 from sim2gp.systems.base import Channel
 from sim2gp.types import in_float64
 
-PAST = 3  # earlier inputs that are tried beside the present one: a delay shows there
+PAST = 3  # earlier inputs that are tried, too: a delay shows there
 
 
 @in_float64

@@ -4,14 +4,14 @@ A posterior is only as good as its model: with dry friction of a size that reduc
 chi-squared does not see, intervals of the damping never cover the truth. Each test
 looks at the residuals ``e = (I - P) r``, where ``P`` projects on what the fit could
 move: the columns of the Jacobian, and of the nuisances of each group (start states).
-In a linear model with Gaussian noise ``e`` then holds noise alone, whatever the prior.
+In a linear model with Gaussian noise ``e`` then has noise alone, for any prior.
 
     chi2        sum e^2 / dof against 1, where the noise is known; where it was
                 estimated from the same residuals the test says nothing, and says so
     ljung_box   correlation of e from row to row over `LAGS` lags, inside a group
                 (Ljung and Box 1978)
     f_test      do features of the inputs, random but fixed, explain e?
-    split_half  would two halves of the data give other constants? Early against late
+    split_half  would two halves of the data give other parameters? Early against late
                 rows, and gentle against vigorous ones (Chow 1960)
 
 All but the first are free of the noise's scale; F and split-half tests are exact in the
@@ -35,7 +35,7 @@ from sim2gp.identification.misfit.words import Finding, make_finding, misfit_ver
 
 LEVEL = 1e-3
 LAGS = 20
-FEATURES = 12  # random ones, beside one for each input
+FEATURES = 12  # random ones, and one for each input
 FEATURE_SEED = 0  # names one set of functions; the same data get the same verdict
 PAIRS = 50  # a lag with fewer pairs of rows is left out
 SPARE = 5  # degrees of freedom that must be left for each one that is tested
@@ -307,7 +307,7 @@ def features(x: Float[np.ndarray, "N k"], count: int) -> Float[np.ndarray, "N _"
 
 
 def _split_half(data: ProjectedResiduals, x: Float[np.ndarray, "N k"]) -> Result:
-    """Would constants of their own for each half explain the residuals?
+    """Would parameters of their own for each half explain the residuals?
 
     The columns are those of the Jacobian with the sign turned in one half. In
     the linear case the squares they explain are the squared Mahalanobis distance of

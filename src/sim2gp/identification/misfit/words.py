@@ -21,7 +21,7 @@ class Finding:
     """One test: its statistic and p value (NaN where it does not apply), and words.
 
     ``freedom`` are the statistic's degrees of freedom, those of the numerator of an F;
-    ``cause`` is the likely cause of an alarm, where the test can tell.
+    ``cause`` is the likely cause of an alarm, where the test can name one.
     """
 
     statistic: float
@@ -134,7 +134,7 @@ _SHORT = {
 
 
 def misfit_verdict(tests: Mapping[str, Finding], count: int, rows: str) -> str:
-    """All of it in a sentence or two; of the alarms, the most telling one."""
+    """The verdict in a sentence or two; of the alarms, the most important one."""
     if all(math.isnan(finding.p) for finding in tests.values()):
         return f"{count} {rows} are too few to test the model on."
     raised = [name for name in _SHORT if tests[name].alarm]

@@ -1,8 +1,9 @@
 """Data with a likelihood that any version of a machine can be fitted to.
 
 A search for missing physics fits many machines to the same rows: the bare one, and each
-with one more constant. `OneStepData` are exact states of a simulated task, `WindowData`
-the windows of real logs. Both give the evidence of a machine, and its linearisation.
+with one more parameter. `OneStepData` are exact states of a simulated task,
+`WindowData` the windows of real logs. Both give the evidence of a machine, and its
+linearisation.
 """
 
 import abc
@@ -32,7 +33,7 @@ from sim2gp.inference.prior import ParameterPrior
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import in_float64
 
-DRAWN = 2  # starts of a one-step fit beside the prior's mean
+DRAWN = 2  # random starts of a one-step fit, next to the prior's mean
 
 
 class AbstractData(abc.ABC):

@@ -1,4 +1,4 @@
-"""Three answers told apart: nothing is missing, this effect is, or none of these.
+"""One of three answers: nothing is missing, this effect is, or none of these.
 
 An effect is missing when its evidence makes "nothing" improbable (`search_candidates`);
 whether the library holds the truth is asked of what the best fit leaves over

@@ -2,14 +2,14 @@
 
 With the bare machine at its MAP, each candidate's magnitude ``x`` is one more unknown.
 Linearised there (at ``x = 0``, or at a few magnitudes where nothing is not smooth), the
-likelihood of constants, nuisances and ``x`` is linear least squares, whose evidence, EM
-for the noise included, costs a QR of small factors: at fixed noise its gain is that of
-the efficient score test with the prior,
+likelihood of parameters, nuisances and ``x`` is linear least squares, whose evidence,
+EM for the noise included, costs a QR of small factors: at fixed noise its gain is that
+of the efficient score test with the prior,
 
     log B = 1/2 c_x^2 - log R_xx,      [R c] the factor of data and prior, x last,
 
-half the squared score over its information, what the other constants can explain
-projected out, minus Occam's price of one more constant.
+half the squared score over its information, what the other parameters can explain
+projected out, minus Occam's price of one more parameter.
 
 Errors of real logs are not independent from sample to sample. With several clusters of
 windows the data's part of a gain is divided by the inflation of the magnitude's
@@ -40,17 +40,17 @@ from sim2gp.systems.effects.registry import Candidate
 from sim2gp.types import in_float64
 
 ROUNDS = 5  # EM for the noise, of a linearised fit
-ALIAS = 1e-5  # sine of the angle to the others' span below which nothing can tell
-SHARED = 0.3  # of a column: a constant that explains so much of it is named
+ALIAS = 1e-5  # sine of the angle to the others' span; less cannot be separated
+SHARED = 0.3  # of a column: a parameter that explains so much of it is named
 FARTHEST = 3.0  # prior sd, of a refit's start
 
 
 @dataclass(frozen=True)
 class ScoredCandidate:
-    """A candidate beside the bare machine, by one linearisation.
+    """A candidate compared with the bare machine, by one linearisation.
 
     ``gain`` is the evidence that it is worth, nats; ``sine`` the part of its effect
-    that no constant of the machine can mimic, ``partners`` those that mimic the rest.
+    that no parameter of the machine can mimic, ``partners`` those that mimic the rest.
     ``starts`` are where a fit of ``system`` should start, whitened by its prior, the
     best first.
     """
@@ -64,7 +64,7 @@ class ScoredCandidate:
 
     @property
     def alias(self) -> bool:
-        """Whether the effect is one of the machine's own constants in disguise."""
+        """Whether one of the machine's own parameters has the same effect."""
         return self.sine < ALIAS
 
 
@@ -259,7 +259,7 @@ def _extended(
 def _select_columns(
     blocks: np.ndarray, system: AbstractSystem, names: Sequence[str | None], n: int
 ) -> np.ndarray:
-    """The factors of some constants' columns, in this order; None is an empty one.
+    """The factors of some parameters' columns, in this order; None is an empty one.
 
     The ``n`` nuisances stay before them, the residuals behind.
     """

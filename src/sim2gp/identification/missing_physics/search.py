@@ -1,8 +1,8 @@
 """What physics is missing: every effect of a library scored, the best few fitted.
 
 The score tests (`score_candidates`) rank by one linearisation; then the best are
-fitted. An effect whose column lies in the span of the machine's own constants can never
-be told from them and is not ranked.
+fitted. An effect whose column lies in the span of the machine's own parameters can
+never be separated from them and is not ranked.
 """
 
 import math

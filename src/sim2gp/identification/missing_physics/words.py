@@ -16,8 +16,8 @@ from sim2gp.identification.words import digits, join_names, quantity
 def candidate_rows(found: Explanation) -> list[dict[str, Any]]:
     """One entry for each candidate, by falling evidence; aliases last.
 
-    ``evidence_gain`` is None where nothing can tell; ``value`` and ``sd`` are those of
-    a fit (``fitted``), else of a linearisation, and None without.
+    ``evidence_gain`` is None where the data cannot decide; ``value`` and ``sd`` are
+    those of a fit (``fitted``), else of a linearisation, and None without.
     """
     fitted = {r.scored.candidate.name: r for r in found.search.refitted}
     rows = [

@@ -1,4 +1,4 @@
-"""How a machine stands, and what it carries: tilts and payloads."""
+"""The tilt of a machine, and what it carries: tilts and payloads."""
 
 import math
 from typing import Any, ClassVar

@@ -25,7 +25,7 @@ def coulomb(v: Scalar, level: Scalar, width: float | Scalar) -> Scalar:
     """Smoothed dry friction ``level tanh(v / width)``, to be subtracted from a force.
 
     The velocity is clipped before the division, so that neither an overflow nor
-    ``0 inf`` can enter a gradient, whatever the width.
+    ``0 inf`` can enter a gradient, for any width.
     """
     edge = _SATURATED * width
     return level * jnp.tanh(jnp.clip(v, -edge, edge) / width)

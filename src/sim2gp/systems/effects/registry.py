@@ -75,7 +75,7 @@ _BY_NAME: dict[str, Any] = {
     for kind in kinds
     if not issubclass(kind, AbstractActuator)  # these have tables of their own
 }
-#: Effects by the last part of their constant's name, ``<channel>.<effect>``.
+#: Effects by the last part of their parameter's name, ``<channel>.<effect>``.
 NAMES = tuple(sorted(_BY_NAME))
 
 SHARE = 0.2  # of what the machine does: the prior sd of an effect
@@ -94,7 +94,7 @@ def named(what: str, where: str, magnitude: float, **options: float) -> Abstract
 
 
 def options_of(what: str) -> tuple[str, ...]:
-    """What an effect has besides its channel, magnitude and name."""
+    """The options of an effect, without its channel, magnitude and name."""
     return _options(ALIASES.get(what) or _BY_NAME[what])
 
 
@@ -149,7 +149,7 @@ class Candidate:
 
     @property
     def name(self) -> str:
-        """Name of its constant: ``<where>.<what>``."""
+        """Name of its parameter: ``<where>.<what>``."""
         return self.effect.name
 
     @property
@@ -318,7 +318,7 @@ def _of_any(plant: AbstractPlant) -> list[Candidate]:
 def _accelerations(plant: AbstractPlant) -> list[float]:
     """The largest slope of each state that inputs and weight give at rest, per second.
 
-    With nominal constants; 1 for a state that does not move.
+    With nominal parameters; 1 for a state that does not move.
     """
     params, joints = plant.nominal(), joints_of(plant)
     away = np.asarray([0.5 * (c in joints) for c in plant.physical_states])

@@ -1,4 +1,4 @@
-"""Constants of a MuJoCo model by path: what can be learned, and how it is set.
+"""Parameters of a MuJoCo model by path: what can be learned, and how it is set.
 
 | path                      | unit         | what is set                              |
 |---------------------------|--------------|------------------------------------------|
@@ -87,7 +87,7 @@ class Constant:
     get: Callable[[Any], float]
     put: Callable[[Any, float], None]
     block: BodyInertia | None = None  # sets several of them at once
-    sign: float = 1.0  # of the number that tied constants share
+    sign: float = 1.0  # of the number that tied parameters share
 
     @property
     def kind(self) -> str:
@@ -99,7 +99,7 @@ class Constant:
 
 
 def constants_of(model: Any) -> dict[str, Constant]:
-    """Every constant of a compiled model that can be learned, by path.
+    """Every parameter of a compiled model that can be learned, by path.
 
     What is set in proportion is so to the numbers of this model, however often it is.
     """
@@ -115,7 +115,7 @@ def constants_of(model: Any) -> dict[str, Constant]:
 
 
 def matching(known: dict[str, Constant], pattern: str) -> list[Constant]:
-    """The constants that a path or pattern names; E170 where there is none."""
+    """The parameters that a path or pattern names; E170 where there is none."""
     found = [
         c
         for path, c in known.items()
@@ -131,7 +131,7 @@ def matching(known: dict[str, Constant], pattern: str) -> list[Constant]:
 
 
 def tied(constants: Sequence[Constant], model: Any) -> list[list[Constant]]:
-    """Constants that are one number for each quantity.
+    """Parameters that are one number for each quantity.
 
     Where two bodies are mirror images in the model they stay so: what a mirror turns
     round has the other sign.
@@ -153,9 +153,9 @@ def _sign(first: Constant, other: Constant, model: Any) -> float:
 
 
 def set_constants(model: Any, pairs: Iterable[tuple[Constant, float]]) -> None:
-    """Give constants values, as they stand; `mujoco.mj_setConst` derives the rest.
+    """Set parameters to values and nothing else; `mujoco.mj_setConst` derives the rest.
 
-    Of tied constants it is the value that they share.
+    Of tied parameters it is the value that they share.
     """
     blocks: dict[BodyInertia, dict[str, float]] = {}
     for constant, value in pairs:

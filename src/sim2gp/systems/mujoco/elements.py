@@ -1,9 +1,10 @@
 """The text of a model's file as a tree, for checks: nothing in it is resolved.
 
-MuJoCo's own parser reads UTF-8 whatever a file declares, and knows no document types.
-What the two parsers could understand differently is refused here: document types and
-their entities, processing instructions, XInclude, and text that is not well formed. Of
-the forms that MuJoCo reads all the same, those that real models have are let through.
+MuJoCo's own parser reads UTF-8 even if a file declares another encoding, and knows no
+document types. What the two parsers could understand differently is refused here:
+document types and their entities, processing instructions, XInclude, and text that is
+not well formed. Of the forms that MuJoCo reads all the same, those that real models
+have are let through.
 """
 
 import math
@@ -51,7 +52,7 @@ def parsed(data: bytes, where: str) -> Any:
         line = data.count(b"\n", 0, error.start) + 1
         raise _refused(f"{where}:line {line}", "bytes that are not UTF-8") from None
     parser = etree.XMLParser(
-        encoding="utf-8",  # whatever the file declares, as MuJoCo reads it
+        encoding="utf-8",  # MuJoCo ignores what the file declares
         resolve_entities=False,
         load_dtd=False,
         no_network=True,

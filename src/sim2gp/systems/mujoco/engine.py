@@ -1,7 +1,7 @@
 """C MuJoCo as a simulator on the host: batches of rows, in several threads.
 
-A row's constants are set in a copy of the model, and what MuJoCo derives from masses
-and lengths when it compiles a model is derived anew for every value that they take.
+A row's parameters are set in a copy of the model. What MuJoCo derives from masses and
+lengths when it compiles a model is derived again for each of their values.
 """
 
 import copy
@@ -36,7 +36,7 @@ KEPT = 32
 
 
 class Engine(AbstractSimulator):
-    """C MuJoCo with some constants of a model open; the model itself stays as it is."""
+    """C MuJoCo with some parameters of a model open; the model does not change."""
 
     def __init__(
         self, model: Any, constants: Sequence[Sequence[Constant]], table: Parameters
@@ -61,7 +61,7 @@ class Engine(AbstractSimulator):
         self._known: dict[tuple[bytes, float], Model] = {}
 
     def with_values(self, theta: Float[np.ndarray, " p"]) -> Any:
-        """A copy of the model in which the open constants have these values."""
+        """A copy of the model in which the open parameters have these values."""
         import mujoco
 
         model = copy.copy(self.model)
@@ -69,7 +69,7 @@ class Engine(AbstractSimulator):
         return model
 
     def _set(self, model: Any, theta: Float[np.ndarray, " p"], data: Any) -> None:
-        """All open constants, and what MuJoCo derives of them; ``data`` is scratch."""
+        """All open parameters, and what MuJoCo derives of them; ``data`` is scratch."""
         import mujoco
 
         both = zip(self.constants, theta, strict=True)
@@ -197,7 +197,7 @@ class Engine(AbstractSimulator):
         return states[:, 0], J[:, 0]
 
     def _linearised(self, theta: Float[np.ndarray, " p"], h: float) -> Model:
-        """The numbers of the model and what the constants change of them."""
+        """The numbers of the model and what the parameters change of them."""
         key = theta.tobytes(), float(h)
         with self._lock:
             if key not in self._known:

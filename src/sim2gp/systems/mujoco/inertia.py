@@ -85,7 +85,7 @@ def upper_factor(P: Four) -> Four:
 
 
 def mirror_sign(one: Four, other: Four, name: str) -> float:
-    """Sign of a number of ``other``, the mirror image of a body, beside ``one``'s.
+    """Sign of a number of ``other``, the mirror image of a body, relative to ``one``'s.
 
     With ``M`` a diagonal of signs and ``other = M one M``, the deformation that keeps
     them images of each other is ``M U M``. The fewest mirrors that do are taken; bodies

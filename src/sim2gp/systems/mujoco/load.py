@@ -1,7 +1,7 @@
 """A model's file becomes a compiled model: files checked, compiled in a child process.
 
-A compiler that crashes or runs away on somebody's file ends the child and not whoever
-asked. Files that a model names must lie in its own folder or below, or in ``root``:
+A compiler that crashes or never ends on somebody's file ends the child and not the
+caller. Files that a model names must lie in its own folder or below, or in ``root``:
 they are read here (`sim2gp.systems.mujoco.sources`), and the child opens no others.
 A URDF has no actuators: every hinge and slide gets a motor, ``<joint>.motor``
 (`sim2gp.systems.mujoco.compile_child`).
@@ -38,7 +38,7 @@ def compiled(path: Path, root: Path | None = None) -> Any:
     not installed, E147 or E170 with MuJoCo's words where it is no possible body or no
     model, E170 for a number that is not finite, E171 where it names files outside
     ``root`` (its own folder) or the compiler crashed or took more than a minute, E172
-    for two files that MuJoCo could not tell apart.
+    for two files that MuJoCo would take for one.
     """
     home = Path(os.path.realpath(path)).parent
     sources = read_sources(path, home if root is None else root)

@@ -3,8 +3,8 @@
 Its solver loops until it has converged, which JAX cannot differentiate backwards. So a
 flow is given its dense Jacobian by forward mode, and is then linear in its tangents
 either way. What MuJoCo derives from masses and lengths when it compiles a model is a
-function of the constants here as well, as `mujoco.mj_setConst` has it for the C engine:
-without it contacts and dry friction would be of another softness.
+function of the parameters here as well, as `mujoco.mj_setConst` has it for the C
+engine: without it contacts and dry friction would be of another softness.
 """
 
 import copy
@@ -33,7 +33,7 @@ _UNKNOWN = (
 
 
 class MJXEngine:
-    """A model in MJX with some constants open, each an affine function of its value."""
+    """A model in MJX with some parameters open, which its arrays are affine in."""
 
     def __init__(self, model: Any, constants: Sequence[Sequence[Constant]]) -> None:
         every = [c for group in constants for c in group]
@@ -86,7 +86,7 @@ class MJXEngine:
             return jnp.where(h > 0.0, moved, s)
 
     def with_values(self, theta: Float[Array, " p"]) -> Any:
-        """The model with these constants, and what is derived of them."""
+        """The model with these parameters, and what is derived of them."""
         changes = {}
         for name, (at_one, slope) in self.affine.items():
             one, by = (jnp.asarray(x, theta.dtype) for x in (at_one, slope))
@@ -121,7 +121,7 @@ def _(engine: MJXEngine, primals: Any, tangents: Any) -> Any:
 def _affine(
     model: Any, constants: Sequence[Sequence[Constant]]
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Arrays that constants decide: where all are one, and the slope in each."""
+    """Arrays that depend on parameters: where all are one, and the slope in each."""
     names = [name for name in dir(model) if name[0] != "_"]
     arrays = {n: getattr(model, n) for n in names}
     fields = [

@@ -1,4 +1,4 @@
-"""A model's files with other constants in them, and the proof that they say them.
+"""A model's files with other parameters in them, and the proof that they contain them.
 
 The source's own text is edited (`sim2gp.systems.mujoco.text_edits`), so that a reader
 sees in a diff what was learned and nothing else. What was written is compiled again and
@@ -22,10 +22,10 @@ from sim2gp.systems.mujoco.text_edits import Document, Edits, Element, read_file
 from sim2gp.systems.mujoco.write_back import MJCF
 from sim2gp.systems.mujoco.write_urdf import URDF
 
-#: Of a constant that was written, and of every number that MuJoCo makes of the file.
+#: Of a parameter that was written, and of every number that MuJoCo makes of the file.
 SAME, DERIVED_SAME = 1e-9, 1e-6
 SIX_DIGITS = 1e-4  # of the numbers of a file that MuJoCo has written
-#: Numbers of the model that no constant decides, or that only speed depends on.
+#: Numbers of the model that no parameter decides, or that only speed depends on.
 _APART = ("bvh_aabb", "oct_aabb", "body_iquat", "body_inertia")
 
 
@@ -40,10 +40,10 @@ class Edited:
 
 
 class ModelFile:
-    """A model's file, read once, to be written with other constants in it.
+    """A model's file, read once, to be written with other parameters in it.
 
     ``model`` is what it compiles to. A URDF may be written ``as MJCF``, with motors;
-    MuJoCo then chooses the words, with six digits but for the constants.
+    MuJoCo then chooses the words, with six digits except for the parameters.
     """
 
     def __init__(self, source: Path, model: Any, *, mjcf: bool = False) -> None:
@@ -58,9 +58,9 @@ class ModelFile:
         self.constants = constants_of(model)
 
     def edited(self, values: Mapping[str, float]) -> Edited:
-        """The edits that give constants, by path, these values.
+        """The edits that give parameters, by path, these values.
 
-        Raises `InputError` E170 for a constant that the text does not show.
+        Raises `InputError` E170 for a parameter that the text does not show.
         """
         changed = {
             path: float(value)
@@ -160,7 +160,7 @@ class ModelFile:
     def check(self, edited: Edited, made: Any) -> None:
         """Every number of a compiled file is what was wanted.
 
-        Raises `InputError` E170 with the first constant, or array, that is another.
+        Raises `InputError` E170 with the first parameter, or array, that is another.
         """
         for name in ("nbody", "njnt", "ngeom", "nu"):
             pair = [int(getattr(m, name)) for m in (made, edited.wanted)]

@@ -22,7 +22,7 @@ from sim2gp.inference.parameters import Parameter, Parameters
 
 ARRAYS = ("value", "nominal", "min_value", "max_value")
 LARGEST = 1_000_000  # bytes
-#: Of a constant without bounds: as many prior sd to each side of its median.
+#: Of a parameter without bounds: as many prior sd to each side of its median.
 WIDE = 3.0
 _KEY = re.compile(r"""^('(?:[^']|'')*'|"(?:[^"\\]|\\.)*"|[^\s'"?#&*-].*):$""")
 _FIELD = re.compile(r"^  (\w+):(?: (.+))?$")
@@ -78,12 +78,12 @@ def write_sysid(
     values: Mapping[str, float] | None = None,
     names: Mapping[str, str] | None = None,
 ) -> None:
-    """A table of constants as a file for `mujoco.sysid.ParameterDict.load_from_disk`.
+    """A table of parameters as a file for `mujoco.sysid.ParameterDict.load_from_disk`.
 
     ``values`` are those to begin from, such as a posterior's; nominal ones where it is
     silent. ``names`` are theirs and ours, as in `read_sysid`. Bounds are those of the
-    prior; a constant without them gets `WIDE` prior sd, and its value. Fixed constants
-    are frozen.
+    prior; a parameter without them gets `WIDE` prior sd, and its value. Fixed
+    parameters are frozen.
 
     Raises `InputError` E145 for a name that the table does not have, E101 for a value
     that is not finite, E130 where the file cannot be written.

@@ -1,10 +1,10 @@
-"""Any MuJoCo model as a system: C MuJoCo steps it, constants are found by path.
+"""Any MuJoCo model as a system: C MuJoCo steps it, parameters are found by path.
 
 The state is ``(qpos, qvel, act)`` of hinges and slides; a substep is MuJoCo's own, no
 longer than the model's time step. Derivatives are central differences
 (`sim2gp.systems.plants.external`): every feature of MuJoCo can be used, nothing is
 compiled. What MuJoCo derives from masses and lengths when it compiles a model is
-derived anew for every value that they take.
+derived again for each of their values.
 """
 
 import copy
@@ -40,14 +40,14 @@ from sim2gp.systems.mujoco.unsupported import check_supported
 from sim2gp.systems.plants.external import flow
 from sim2gp.types import Action, Scalar, State
 
-#: Without a stated prior a constant is within this factor of the model's number.
+#: Without a stated prior a parameter is within this factor of the model's number.
 FACTOR = 3.0
 #: Sd of the ten numbers of an inertia; of its shifts, in radii of gyration.
 SHARE = 0.2
 
 
 class MuJoCo(AbstractPlant):
-    """A MuJoCo model whose constants are named by path
+    """A MuJoCo model whose parameters are named by path
     (`sim2gp.systems.mujoco.constants`).
 
     Its joints are the states, ``<joint>`` and ``<joint>.velocity``, then activations of
@@ -55,12 +55,12 @@ class MuJoCo(AbstractPlant):
     it is None, dampings, armatures, dry frictions and masses that are not zero in the
     model. Those in one inner sequence are tied: one number for each quantity, under the
     first one's name. Priors are within a factor of 3 of the model's number; ``priors``
-    replaces them by name, or fixes the constant. ``root`` is the folder that the
+    replaces them by name, or fixes the parameter. ``root`` is the folder that the
     model's files must lie in, its own if None; ``source`` the file that a compiled
     model was made of.
 
     Raises `InputError` E130, E170 and E171 for a file that is no model, E170 for what
-    the model does not have, E142 for a constant that is zero in the model and has no
+    the model does not have, E142 for a parameter that is zero in the model and has no
     prior, E172 for what is not supported (`sim2gp.systems.mujoco.unsupported`).
     """
 
@@ -107,7 +107,7 @@ class MuJoCo(AbstractPlant):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Those of the engine's constants, in their order."""
+        """The names of the engine's parameters, in their order."""
         return self.engine.names
 
     @property
@@ -127,13 +127,13 @@ class MuJoCo(AbstractPlant):
         return tuple(c.name for i, c in enumerate(self.inputs) if is_servo(model, i))
 
     def by_path(self, values: Mapping[str, float]) -> dict[str, float]:
-        """Values by name as those of every constant: what is tied has the same."""
+        """Values of all parameters by path, from those by name; tied ones are equal."""
         groups = zip(self.names, self.engine.constants, strict=True)
         known = ((values[n], group) for n, group in groups if n in values)
         return {c.path: c.sign * float(value) for value, group in known for c in group}
 
     def file(self, *, mjcf: bool = False) -> ModelFile:
-        """The model's file, to be written with other constants (``mjcf``: as MJCF).
+        """The model's file, to be written with other parameters (``mjcf``: as MJCF).
 
         Raises `InputError` E170 where there is no file.
         """
@@ -155,7 +155,7 @@ class MuJoCo(AbstractPlant):
         return float(self.engine.model.opt.timestep)
 
     def record(self, values: Mapping[str, Scalar]) -> Float[Array, " p"]:
-        """Values in the order of the engine's constants."""
+        """Values in the order of the engine's parameters."""
         return jnp.stack([jnp.asarray(values[name]) for name in self.names])
 
     def flow(
@@ -196,7 +196,7 @@ def _groups(
     known: dict[str, Constant],
     constants: Sequence[str | Sequence[str]] | None,
 ) -> list[list[Constant]]:
-    """The open constants; each inner list is one number for each quantity."""
+    """The open parameters; each inner list is one number for each quantity."""
     if constants is None:
         # No gain of a motor or a servo: where it is free, so is the scale of all
         # masses and forces.
@@ -260,7 +260,7 @@ def _prior(
 def _described(
     table: Parameters, priors: Mapping[str, Parameter | float]
 ) -> dict[str, Parameter | float]:
-    """The priors; one that names no unit has the constant's, and its meaning."""
+    """The priors; one that names no unit has the parameter's, and its meaning."""
     known = {p.name: p for p in table.free}
     return {
         name: dataclasses.replace(p, unit=known[name].unit, meaning=known[name].meaning)

@@ -1,8 +1,8 @@
 """The text of a model's files, changed attribute by attribute.
 
-Every element knows where its start tag stands in its file. Edits are collected, and
-applied to the bytes at the end: what no edit names (comments, order, white space, the
-way that other numbers are written) stays as it is.
+Every element knows where its start tag is in its file. Edits are collected, and applied
+to the bytes at the end: what no edit names (comments, order, white space, the way that
+other numbers are written) stays as it is.
 """
 
 import re
@@ -31,7 +31,7 @@ class Document:
 class Element:
     """One element: its attributes, its place in its file, and its relatives.
 
-    The children of an ``include`` stand in its place, as MuJoCo reads them.
+    The children of an ``include`` are in its place, as MuJoCo reads them.
     """
 
     tag: str
@@ -46,7 +46,7 @@ class Element:
         return (child for child in self.children if child.tag in tags)
 
     def stated(self, name: str) -> str:
-        """An attribute as it stands in the file, with its tabs and line breaks."""
+        """An attribute as it is in the file, with its tabs and line breaks."""
         tag = _TAG.match(self.document.data, self.start)
         pairs = _ATTRIBUTE.finditer(tag.group()) if tag else ()
         found = {p.group(1).decode(): p.group(2).decode()[1:-1] for p in pairs}

@@ -1,4 +1,4 @@
-"""Which attribute of an MJCF file says a constant, and what it must say instead.
+"""Which attribute of an MJCF file has a parameter, and what it must say instead.
 
 An attribute that a class of defaults states is put on the element itself, so that no
 other element changes. A mass goes onto geoms that state theirs, else the body gets an
@@ -19,7 +19,7 @@ from sim2gp.systems.mujoco.text_edits import Edits, Element, number
 
 _AXES = ("com_x", "com_y", "com_z")
 _ORIENTATIONS = ("quat", "axisangle", "euler", "xyaxes", "zaxis")
-#: Attribute of a shortcut that states a servo's constant.
+#: Attribute of a shortcut that states a servo's parameter.
 _SERVO = {("position", "kp"), ("position", "kv"), ("velocity", "kv")}
 _SERVO |= {("intvelocity", "kp"), ("intvelocity", "kv"), ("damper", "kv")}
 
@@ -81,7 +81,7 @@ class MJCF:
     def say(
         self, edits: Edits, wanted: Any, constants: Sequence[Constant]
     ) -> dict[str, str]:
-        """Edits that make these constants those of ``wanted``; all can be said."""
+        """Edits that make these parameters those of ``wanted``; all can be written."""
         masses: dict[int, set[str]] = {}
         for constant in constants:
             kind, quantity, i = constant.kind, constant.quantity, constant.index

@@ -1,4 +1,4 @@
-"""Which element of a URDF says a constant; what it has no words for is named.
+"""Which element of a URDF has a parameter; what a URDF cannot express is named.
 
 Links that fixed joints weld together are one body of the model: their masses and
 inertias change in the same proportion.
@@ -30,7 +30,7 @@ class URDF:
     def say(
         self, edits: Edits, wanted: Any, constants: Sequence[Constant]
     ) -> dict[str, str]:
-        """Edits that make constants those of ``wanted``; why others cannot be said."""
+        """Edits that give parameters the values of ``wanted``; why others cannot."""
         unsaid = {}
         inertias: set[int] = set()
         for constant in constants:

@@ -2,9 +2,9 @@
 
     s' = step(params, s, a, h)       h seconds later, the input held
 
-It is called on the host and differentiated by central differences, which asks of it
-that it be the same function every time: no noise, no memory. NaN says that it cannot
-follow; an exception is a fault, and is told as one.
+It is called on the host and differentiated by central differences. So it must be the
+same function every time: no noise, no memory. NaN says that it cannot follow; an
+exception is reported as an error.
 """
 
 import math
@@ -33,7 +33,7 @@ from sim2gp.types import Action, Scalar, State
 
 Step = Callable[[dict[str, Any], np.ndarray, np.ndarray, Any], Any]
 #: Steps of differences where numbers come back in single precision: rounding is large.
-COARSE = 0.1, 3e-3  # of constants, of states and inputs
+COARSE = 0.1, 3e-3  # of parameters, of states and inputs
 
 
 class Called(AbstractSimulator):
@@ -56,7 +56,7 @@ class Called(AbstractSimulator):
         rows = np.flatnonzero(good & (h > 0.0))
         with self._lock:
             if self.batched and rows.size:
-                # Copies: whatever the function writes into is its own.
+                # Copies: the function may write into them.
                 out[rows] = self.asked(theta[rows], s[rows], a[rows], h[rows])
             elif not self.batched:
                 for i in rows:
@@ -93,15 +93,15 @@ class Called(AbstractSimulator):
 class BlackBox(AbstractPlant):
     """A simulator that is a function ``step(params, s, a, h)`` of NumPy arrays.
 
-    ``params`` are the constants by name, ``s`` the states, ``a`` the inputs, and ``h``
+    ``params`` are the parameters by name, ``s`` the states, ``a`` the inputs, and ``h``
     a time in seconds; what comes back are the states after it. A ``batched`` function
-    gets rows of each (of constants and times, arrays) and returns rows: that is much
+    gets rows of each (of parameters and times, arrays) and returns rows: that is much
     faster. ``max_substep`` (s) divides longer steps, for a function that takes one step
     of an integrator at each call. What computes in single precision is differenced
     coarsely; its slopes are good to a thousandth.
 
     Raises `InputError` E145 for names that are there twice, E148 for a substep that is
-    not positive, and, from two calls at rest with nominal constants, E140, E123 and
+    not positive, and, from two calls at rest with nominal parameters, E140, E123 and
     E173, the last one too where the two differ.
     """
 

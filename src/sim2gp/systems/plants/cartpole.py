@@ -12,7 +12,7 @@ pole's length:
     m_p l cos(theta) x'' + 4/3 m_p l^2 theta'' = -B_p theta' - m_p g l sin(theta)
 
 The centrifugal term has a plus: with a minus, which some public simulators print, the
-undamped machine loses energy. Constants: Quanser IP02 manual, short pole.
+undamped machine loses energy. Parameters: Quanser IP02 manual, short pole.
 """
 
 from collections.abc import Mapping
@@ -30,7 +30,7 @@ from sim2gp.types import Action, Scalar
 
 
 class CartPoleParams(eqx.Module):
-    """Constants to be learned; boxes are [0.5, 2] times the published value."""
+    """Parameters to be learned; boxes are [0.5, 2] times the published value."""
 
     cart_mass: Scalar = bounded(0.19, 0.76, "kg", "cart", nominal=0.38)
     pole_mass: Scalar = bounded(0.0635, 0.254, "kg", "pole", nominal=0.127)

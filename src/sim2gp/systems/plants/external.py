@@ -5,8 +5,8 @@
 
 The derivative is a matrix times its tangent, so it is forward and reverse mode alike.
 What crosses between JAX and the host are pairs of 32-bit words: JAX puts a callback's
-arguments on a device first, in whatever thread it runs in, and a thread that does not
-know of `in_float64` would round them.
+arguments on a device first, in the thread that it happens to run in, and a thread that
+does not know of `in_float64` would round them.
 
 An `InputError` that a simulator raises ends the program that asked; the host raises it
 again (`sim2gp.types.in_float64`).
@@ -27,7 +27,7 @@ from jaxtyping import Array, Bool, Float, Int
 from sim2gp.inference.parameters import Parameters
 from sim2gp.types import Action, AnyArray, Scalar, State
 
-#: What a constant changes by less, of the largest number, it does not change.
+#: What a parameter changes by less, of the largest number, it does not change.
 ROUNDING = 16.0 * float(np.finfo(float).eps)
 #: Rows whose slopes are found at once: more do not fit the processor's cache.
 BLOCK = 1024
@@ -37,10 +37,10 @@ BLOCK = 1024
 class Differences:
     """How far apart the points are that a simulator is differenced at.
 
-    scale: of each constant, what a difference is small against; ``low`` and ``high``
+    scale: of each parameter, what a difference is small against; ``low`` and ``high``
         are never crossed.
-    constants, states: steps in scales: of constants, which act weakly within one period
-        (rounding rules) and smoothly, and of states and inputs.
+    constants, states: steps in scales: of parameters, which act weakly within one
+        period (rounding rules) and smoothly, and of states and inputs.
     """
 
     scale: Float[np.ndarray, " p"]
@@ -51,7 +51,7 @@ class Differences:
 
     @classmethod
     def of(cls, table: Parameters, names: Sequence[str]) -> "Differences":
-        """Of constants in this order; one that a table does not free is never moved."""
+        """Of parameters in this order; one that a table does not free never moves."""
         free = {p.name: p for p in table.free}
         given = [free.get(name) for name in names]
         spread = dict(zip(table.names, _spreads(table), strict=True))
@@ -71,7 +71,7 @@ def _spreads(table: Parameters) -> list[float]:
 
 
 class Arguments(NamedTuple):
-    """What a rollout of ``W`` windows depends on: constants, starts, inputs, spans."""
+    """What a rollout of ``W`` windows depends on: parameters, starts, inputs, spans."""
 
     theta: Float[AnyArray, "W p"]
     x0: Float[AnyArray, "W n"]
@@ -97,7 +97,7 @@ class Rolled(NamedTuple):
 class AbstractSimulator(abc.ABC):
     """A simulator on the host; two are equal only if they are the same object.
 
-    ``names`` are those of its constants ``theta``, in their order.
+    ``names`` are those of its parameters ``theta``, in their order.
     """
 
     names: tuple[str, ...]
@@ -120,7 +120,7 @@ class AbstractSimulator(abc.ABC):
         a: Float[np.ndarray, "B m"],
         h: Float[np.ndarray, " B"],
     ) -> tuple[Float[np.ndarray, "B n"], Float[np.ndarray, "B n pnm"]]:
-        """`flow` and its Jacobian in constants, state and input, in one call."""
+        """`flow` and its Jacobian in parameters, state and input, in one call."""
         x = np.concatenate([theta, s, a], axis=1)
         p, n, m = theta.shape[1], s.shape[1], a.shape[1]
         by = self.differences
@@ -140,7 +140,7 @@ class AbstractSimulator(abc.ABC):
         up, down = out[1 : K + 1], out[K + 1 :]
         apart = np.einsum("kbk->kb", points[1 : K + 1] - points[K + 1 :])
         moved = up - down
-        # What a constant changes within rounding it does not change at all.
+        # What a parameter changes within rounding it does not change at all.
         nothing = ROUNDING * np.maximum(1.0, np.abs(out[0]).max(axis=1, initial=0.0))
         moved[:p][np.abs(moved[:p]) <= nothing[:, None]] = 0.0
         J = moved / apart[..., None]

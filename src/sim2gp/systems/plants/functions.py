@@ -1,8 +1,8 @@
-"""Your own differential equation as a system: a function, its constants, its channels.
+"""Your own differential equation as a system: a function, its parameters, its channels.
 
     ds/dt = ode(params, s, a),      integrated by RK4, the input held
 
-`AbstractODE` says the same as a class, with a record of constants.
+`AbstractODE` is the same as a class, with a record of parameters.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -22,9 +22,9 @@ Constants = dict[str, Scalar]
 class ODE(AbstractODE):
     """A machine whose equation is a function ``ode(params, s, a)`` of JAX arrays.
 
-    It is written for one point: ``params`` are the constants by name, ``s`` the states,
-    ``a`` the inputs, and what comes back is the time derivative of ``s``, per second.
-    ``max_substep`` (s) is the longest step of RK4 within a period.
+    It is written for one point: ``params`` are the parameters by name, ``s`` the
+    states, ``a`` the inputs, and what comes back is the time derivative of ``s``, per
+    second. ``max_substep`` (s) is the longest step of RK4 within a period.
 
     Raises `InputError` E145 for a name that is there twice, E148 for a substep that is
     not positive, and, from one trace of the function, E140 for a derivative of another
@@ -71,7 +71,7 @@ class ODE(AbstractODE):
         return self.longest
 
     def record(self, values: Mapping[str, Scalar]) -> Constants:
-        """The constants by name, without those of others."""
+        """The parameters by name, without those of others."""
         return {name: values[name] for name in names_of(self.parameters)}
 
     def ode(self, params: Any, s: State, a: Action) -> State:

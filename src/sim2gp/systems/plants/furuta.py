@@ -13,7 +13,7 @@ HANGING, ``alpha = pi`` upright. With ``l = Lp / 2``, ``Jp = Mp Lp^2 / 12`` and
                             - Mp g l sin(alpha)
 
 The published model leaves ``Jp`` out of ``A`` and of the ``sin(2 alpha)`` terms;
-`sim2gp.systems.effects.geometry.RodInertia` puts it back. Constants: Quanser
+`sim2gp.systems.effects.geometry.RodInertia` puts it back. Parameters: Quanser
 Qube-Servo 2 manual; dampings as in public drivers and simulators of that rig, which
 disagree by decades and therefore get logarithmic boxes.
 """
@@ -33,7 +33,7 @@ from sim2gp.types import Action, Scalar
 
 
 class FurutaParams(eqx.Module):
-    """Constants of the rig; boxes are [0.5, 2] times the published value."""
+    """Parameters of the rig; boxes are [0.5, 2] times the published value."""
 
     motor_resistance: Scalar = bounded(
         4.2, 16.8, "ohm", "terminal resistance of the motor", nominal=8.4

@@ -2,7 +2,7 @@
 
 State ``(q1, q2, q1', q2')``: ``q1`` is the angle of link 1, 0 = HANGING, ``q2`` that of
 link 2 relative to link 1. Inputs are the joint torques. Inertias are about the *joints*
-and first moments are constants of their own, so that everything but the lengths enters
+and first moments are parameters of their own, so that everything but the lengths enters
 linearly. With ``c, s = cos(q2), sin(q2)``, ``h = m2r2 l1`` and the gear ratio ``gr``:
 
     M11 = I1 + I2 + m2 l1^2 + 2 h c + (gr^2 + 1) Ir
@@ -44,7 +44,7 @@ STATES = (
 
 
 class TwoLinkParams(eqx.Module):
-    """Constants of an arm of desk to human size; boxes of about two to four decades.
+    """Parameters of an arm of desk to human size; boxes of about two to four decades.
 
     A fixed base leaves ``m2``, ``m1r1`` and ``I1`` collinear: only ``m1r1 + l1 m2`` and
     ``I1 + l1^2 m2`` act. Without rotors the inertia matrix is positive definite where
@@ -171,7 +171,7 @@ _SHAPES = {"tanh": coulomb, "arctangent": coulomb_arctangent}
 
 
 class UniformRodParams(eqx.Module):
-    """Constants of the paper's horizontal arm (no values are published; SI)."""
+    """Parameters of the paper's horizontal arm (no values are published; SI)."""
 
     m1: Scalar = bounded(0.4, 2.0, "kg", "mass of rod 1", nominal=1.0)
     b1: Scalar = bounded(
@@ -190,7 +190,7 @@ class UniformRodArm(AbstractMechanism):
 
     ``I1 = m1 l1^2 / 3``, ``m2r2 = m2 l2 / 2``, ``I2 = m2 l2^2 / 3``; no rotors, gravity
     or dry friction. The lengths are known unless the table frees them; with all six
-    constants free the map ``l -> c l, m -> m / c^2`` leaves the motion as it is.
+    parameters free the map ``l -> c l, m -> m / c^2`` leaves the motion as it is.
 
     | state              | symbol   | unit  | zero                       |
     |--------------------|----------|-------|----------------------------|
@@ -251,7 +251,7 @@ class UniformRodArm(AbstractMechanism):
         )
 
     def as_two_link(self, params: UniformRodParams) -> TwoLinkParams:
-        """The same arm in the general constants (the length ``l1`` beside them)."""
+        """The same arm in the general parameters, with the length ``l1``."""
         p, none = params, jnp.zeros_like(params.m1)
         return TwoLinkParams(
             m1r1=0.5 * p.m1 * p.l1,

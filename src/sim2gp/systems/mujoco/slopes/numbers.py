@@ -1,7 +1,7 @@
 """The numbers of a compiled model that its equation of motion is made of.
 
-Each constant moves some of them; how, is told by differences of the compiled model,
-which cost no simulation.
+Each parameter changes some of them. Differences of the compiled model say how, without
+a simulation.
 """
 
 from collections.abc import Callable
@@ -39,7 +39,7 @@ class Numbers(NamedTuple):
 
 
 class Tree(NamedTuple):
-    """What no constant moves: who carries whom, and which joint each actuator drives.
+    """What no parameter changes: who carries whom, which joint each actuator drives.
 
     ``above[i, j]``: whether joint ``i`` moves joint ``j`` (not itself).
     """
@@ -90,7 +90,7 @@ def tree_of(model: Any) -> Tree | None:
 
 
 def numbers_of(model: Any) -> Numbers:
-    """The numbers as they stand, in a model whose derived numbers are up to date."""
+    """The numbers of a model whose derived numbers are up to date."""
     drag, rate = _dry_friction(model)
     weightless = model.opt.disableflags & NO_GRAVITY
     affine = np.asarray([[1.0, 0.0, 0.0], [1.0, 1.0, 1.0]])  # gains: fixed, affine
@@ -119,7 +119,7 @@ def moved_by(
     low: Float[np.ndarray, " p"],
     high: Float[np.ndarray, " p"],
 ) -> list[Numbers]:
-    """Derivatives of the numbers in each constant; ``at`` is the model of values."""
+    """Derivatives of the numbers in each parameter; ``at`` is the model of values."""
     found = []
     for i in range(theta.size):
         up, down = theta.copy(), theta.copy()

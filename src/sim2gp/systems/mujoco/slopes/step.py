@@ -1,4 +1,4 @@
-"""The derivative of one step of MuJoCo in constants, state and input, in closed form.
+"""The derivative of one step of MuJoCo in parameters, state and input, in closed form.
 
 A step of length ``h`` ends at ``v' = v + h a``, ``q' = q + h v'``, where ``a`` solves
 
@@ -29,7 +29,7 @@ LEFT_OVER = 1e-6
 
 
 class Model(NamedTuple):
-    """A compiled model with its numbers, and what each constant changes of them."""
+    """A compiled model with its numbers, and what each parameter changes of them."""
 
     model: Any
     tree: Tree
@@ -44,7 +44,7 @@ def in_closed_form(model: Any) -> bool:
 
 
 class Slopes(NamedTuple):
-    """``da`` by constants, position, velocity and input; where they hold."""
+    """``da`` by parameters, position, velocity and input; where they hold."""
 
     by: Float[np.ndarray, "B n k"]
     hold: Bool[np.ndarray, " B"]
@@ -145,7 +145,7 @@ def _dry_friction(
 def _sticking(
     of: Model, at: Equation, point: tuple[np.ndarray, ...], h: float
 ) -> tuple[Batch, Batch, Batch, Batch]:
-    """Derivatives of ``D (a0 + rate v)`` by ``a``, ``q``, ``v`` and constants.
+    """Derivatives of ``D (a0 + rate v)`` by ``a``, ``q``, ``v`` and parameters.
 
     ``M da0 = (M + h K) da + dM (a - a0) + h dK a``, where ``lag = a0 - a``.
     """
