@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
+import sim2gp as sg
 import sim2gp.experiment_design as d
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.systems import Delay, free_parts
@@ -44,3 +45,35 @@ def delayed():
     """The same pendulum behind an input with an unknown delay."""
     system = pendulum()
     return free_parts(system, [Delay("voltage")])
+
+
+def pushed(params, s, a):
+    """A mass on a rail that brakes it."""
+    return jnp.stack([s[1], params["gain"] * a[0] - params["drag"] * s[1]])
+
+
+def rail_experiment() -> d.Experiment:
+    """Two seconds of a mass on a rail; corrected, its belief is wider and elsewhere."""
+    system = sg.systems.ODE(
+        pushed,
+        [
+            sg.Parameter("gain", "1/kg", "of the input", "log_bounded", 0.5, 8.0),
+            sg.Parameter("drag", "1/s", "of the rail", "log_bounded", 0.05, 2.0),
+        ],
+        [sg.Channel("x", "m"), sg.Channel("x.velocity", "m/s")],
+        [sg.Channel("force", "N", low=-1.0, high=1.0)],
+        max_substep=0.1,
+    )
+    prior = system.parameters.prior()
+    return d.Experiment(
+        system,
+        prior,
+        jnp.asarray([1e-2]),
+        jnp.zeros(2),
+        jnp.asarray([0.05, 1.0]),
+        (0,),
+        0.1,
+        20,
+        10,
+        corrected=Gaussian(prior.mean + 0.3, 1.5 * prior.scale[:, ::-1]),
+    )

@@ -73,7 +73,7 @@ def test_worth_is_that_of_the_definition() -> None:
     expected = goal.nats(experiment.belief.scale, scale)
     assert nats == pytest.approx(float(expected), rel=1e-6)
     np.testing.assert_allclose(told @ told.T, scale @ scale.T, rtol=1e-5, atol=1e-9)
-    ahead = by_samples.sensitivity(experiment, U, 12)
+    ahead = by_samples.sensitivity_at(experiment, U, 12)
     expected = sensitivity_at(experiment, U, 12)
     size = float(jnp.abs(expected).max())
     np.testing.assert_allclose(ahead, expected, rtol=0.0, atol=1e-6 * size)

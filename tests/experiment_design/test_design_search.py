@@ -17,11 +17,11 @@ from design_cases import (
     delayed,
     experiment,
     limits,
+    rail_experiment,
 )
 from sim2gp.errors import InputError
 from sim2gp.experiment_design import by_gradients, search
 from sim2gp.experiment_design.limits import excess
-from sim2gp.inference.gaussian import Gaussian
 
 pytestmark = pytest.mark.usefixtures("float64")
 
@@ -190,22 +190,59 @@ def test_no_commands_keep_limits_that_nothing_can(found) -> None:
             d.optimise_commands(e, d.DOptimal(), box, signal, key=jax.random.key(0))
 
 
-def test_limits_hold_for_the_corrected_posterior_and_nats_are_of_the_plain() -> None:
+@pytest.fixture(scope="module")
+def on_a_rail():
+    """A short search of a small machine: by day the only one from end to end."""
+    with jax.enable_x64(True), pytest.MonkeyPatch.context() as patch:
+        for name, value in {**QUICK, "BLOCK": 5}.items():
+            patch.setattr(by_gradients, name, value)
+        e, signal = rail_experiment(), d.MultisineCommands(0.1, 20)
+        box = limits(e.system, {"x": (-0.5, 0.5)}, start=(0.0, 0.0))
+        key = jax.random.key(0)
+        best = d.optimise_commands(e, d.DOptimal(), box, signal, key=key, draws=1)
+        return e, box, signal, best
+
+
+def test_a_search_ends_within_limits_and_says_what_its_commands_are_worth(
+    on_a_rail,
+) -> None:
+    e, box, signal, best = on_a_rail
+    assert best.violations <= search.ALLOWED
+    assert np.abs(best.states[:, 0]).max() <= 0.5
+    U = jnp.asarray(best.commands)
+    assert float(jnp.max(jnp.abs(U))) <= 1.0
+
+    draws = jax.random.normal(jax.random.key(5), (20, signal.coefficients, 1))
+    smaller, here = 0.1 * jnp.max(jnp.abs(U)), jnp.zeros((1, 2))
+    nats = [
+        float(by_gradients._worth(e, d.DOptimal(), here, V)[0])
+        for V in (U, *(smaller * signal.commands(c, box) for c in draws))
+    ]
+    assert best.nats == pytest.approx(nats[0], rel=1e-9)
+    assert best.nats > max(nats[1:])
+    ahead = d.prediction_rows(e, box, 0.5, jax.random.key(1))
+    assert ahead.shape == (4, 2)
+    assert float(jnp.min(jnp.linalg.norm(ahead, axis=0))) > 0.0
+
+
+def test_limits_hold_for_the_corrected_posterior_and_nats_are_of_the_plain(
+    on_a_rail,
+) -> None:
     """Machines, their extent and the middle against single simulations."""
-    e, goal = experiment(), d.DOptimal()
-    shifted = Gaussian(e.belief.mean + 0.3, 3.0 * e.belief.scale[:, ::-1])
-    wide = dataclasses.replace(e, corrected=shifted)
-    box, U = limits(e.system), commands()
-    draws = jax.random.normal(jax.random.key(2), (5, 3))
+    wide, box, _, best = on_a_rail
+    e, goal = dataclasses.replace(wide, corrected=wide.belief), d.DOptimal()
+    shifted, U = wide.corrected, 2.0 * jnp.asarray(best.commands)
+    draws = jax.random.normal(jax.random.key(2), (QUICK["CHECKED"], 2))
     states, beyond = by_gradients._plausible_states(wide, box, U, draws)
     one = eqx.filter_jit(d.trajectory)
-    for z, S, far in zip(draws, states, beyond, strict=True):
+    for z, S, far in list(zip(draws, states, beyond, strict=True))[:5]:
         tt = shifted.mean + shifted.scale @ z
         alone = one(e, tt, U)
         np.testing.assert_allclose(S, alone, rtol=1e-6, atol=1e-8)
         assert float(far) == pytest.approx(float(excess(box, alone)), rel=1e-6)
-    told, scale, middle = by_gradients._worth(wide, goal, draws, U)
-    expected = by_gradients._worth(e, goal, draws, U)
-    assert float(told) == pytest.approx(float(expected[0]), rel=1e-12)
+    here = jnp.zeros((1, 2))
+    nats, scale, middle = by_gradients._worth(wide, goal, here, U)
+    expected = by_gradients._worth(e, goal, here, U)
+    assert float(nats) == pytest.approx(float(expected[0]), rel=1e-12)
     np.testing.assert_allclose(scale, expected[1], rtol=1e-12)
     np.testing.assert_allclose(middle, one(e, shifted.mean, U), rtol=1e-6, atol=1e-8)

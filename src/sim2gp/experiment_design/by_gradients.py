@@ -22,13 +22,15 @@ from sim2gp.experiment_design.experiment import (
     Experiment,
     information,
     posterior_scale,
-    sensitivity_at,
     trajectory,
+)
+from sim2gp.experiment_design.experiment import (
+    sensitivity_at as sensitivity_at,
 )
 from sim2gp.experiment_design.goals import AbstractGoal
 from sim2gp.experiment_design.limits import LimitBox, all_excess, excess, narrow_limits
+from sim2gp.experiment_design.search_method import SearchPrograms
 from sim2gp.experiment_design.signals import AbstractCommandSignal
-from sim2gp.experiment_design.ways import SearchPrograms
 from sim2gp.models.training import adamw, descend
 from sim2gp.types import Key, single
 
@@ -44,7 +46,7 @@ CHEAP, COST = 2.0, 15.0  # at first and at last, for a half of the box, in nats 
 CHECKED = 1000  # draws that the result is held against
 
 
-def compiled_programs(
+def search_programs(
     experiment: Experiment,
     signal: AbstractCommandSignal,
     goal: AbstractGoal,

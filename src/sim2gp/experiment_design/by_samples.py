@@ -23,8 +23,8 @@ from sim2gp.experiment_design.experiment import (
 )
 from sim2gp.experiment_design.goals import AbstractGoal
 from sim2gp.experiment_design.limits import LimitBox, all_excess, narrow_limits
+from sim2gp.experiment_design.search_method import SearchPrograms
 from sim2gp.experiment_design.signals import AbstractCommandSignal
-from sim2gp.experiment_design.ways import SearchPrograms
 from sim2gp.systems.host import simulator_of
 from sim2gp.types import Key
 
@@ -38,7 +38,7 @@ CHEAP, COST = 10.0, 100.0  # of a half of the box, for each direction asked abou
 States = Float[np.ndarray, "K times n"]
 
 
-def host_programs(
+def search_programs(
     experiment: Experiment,
     signal: AbstractCommandSignal,
     goal: AbstractGoal,
@@ -56,10 +56,10 @@ def host_programs(
     )
 
 
-def sensitivity(
+def sensitivity_at(
     experiment: Experiment, commands: Float[Array, "T m"], periods: int
 ) -> Float[Array, "k p"]:
-    """`sensitivity_at`."""
+    """`experiment.sensitivity_at`, by the simulator's own slopes."""
     U, tt = np.asarray(commands), experiment.belief.mean
     states = states_of(experiment, U, np.asarray(tt)[None])[0]
     first = np.arange(0, experiment.steps - periods + 1, periods)

@@ -8,7 +8,6 @@ that had no part in the search, made smaller where it did not.
 
 import math
 from collections.abc import Callable
-from types import ModuleType
 
 import equinox as eqx
 import jax
@@ -22,6 +21,7 @@ from sim2gp.experiment_design import by_gradients, by_samples
 from sim2gp.experiment_design.experiment import Experiment
 from sim2gp.experiment_design.goals import AbstractGoal
 from sim2gp.experiment_design.limits import LimitBox
+from sim2gp.experiment_design.search_method import SearchMethod
 from sim2gp.experiment_design.signals import AbstractCommandSignal, MultisineCommands
 from sim2gp.systems.host import simulator_of
 from sim2gp.types import AnyArray, Key, in_float64
@@ -82,12 +82,12 @@ def optimise_commands(
     )
     informed = informed.at[0].set(0.0)
     about = experiment, signal, goal, limits, informed, trials, held_out
-    improve, check, told = by.ways(*about)
+    improve, check, information = by.search_programs(*about)
 
     def one(key: Key) -> DesignResult:
         U = signal.commands(jnp.asarray(improve(key), float), limits)
         U, states, bad = _kept(check, U)
-        worth, scale, middle = told(U)
+        worth, scale, middle = information(U)
         low, high = np.quantile(np.asarray(states), [0.05, 0.95], axis=0)
         return DesignResult(
             np.asarray(U),
@@ -152,10 +152,12 @@ def prediction_rows(
     experiment, limits = jax.tree.map(jnp.asarray, (experiment, limits))
     signal = MultisineCommands(experiment.period, experiment.steps)
     U = signal.commands(MILD * signal.random(key, limits.low.size), limits)
-    rows: Array = _by(experiment).sensitivity(experiment, U, periods)
+    rows: Array = _by(experiment).sensitivity_at(experiment, U, periods)
     return rows
 
 
-def _by(experiment: Experiment) -> ModuleType:
+def _by(experiment: Experiment) -> SearchMethod:
     """The kind of search that a machine admits."""
-    return by_gradients if simulator_of(experiment.system) is None else by_samples
+    if simulator_of(experiment.system) is None:
+        return by_gradients  # each is checked: of both at once a type says nothing
+    return by_samples
