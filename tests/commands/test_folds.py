@@ -50,7 +50,7 @@ def test_the_last_recording_is_left_out_with_all_its_pieces() -> None:
     np.testing.assert_array_equal(part.train, of == 0)
     np.testing.assert_array_equal(part.known, grid.log == 0)
     np.testing.assert_array_equal(part.test, grid.log > 0)
-    assert (part.recordings, part.words, part.until) == (1, "b", math.inf)
+    assert (part.recordings, part.words, part.until) == (1, "the log b", math.inf)
 
 
 def test_the_end_of_the_only_recording_is_left_out() -> None:
@@ -63,7 +63,7 @@ def test_the_end_of_the_only_recording_is_left_out() -> None:
     assert not (part.known & part.test).any()
     assert grid.since[part.known].max() + 0.1 <= split
     assert part.until == pytest.approx(split)
-    assert part.words == "the last 25 % of a"
+    assert part.words == "the last 25 % of the log a"
 
 
 def test_too_short_a_recording_holds_nothing_out() -> None:

@@ -144,13 +144,13 @@ def test_identify_forecasts_a_log_that_it_left_out(run: Path) -> None:
     """Oracle: the same machine, whose errors are far below those of standing still."""
     stored = load_run(run)
     about, x = stored.summary["held_out"], stored.arrays
-    assert about["left_out"] == "log2"
+    assert about["left_out"] == "the log log2"
     assert about["windows"] == 7  # every 0.1 s, half a second before the log's end
     assert about["open_loop_rmse"]["alpha"] < 0.2 * about["hold_rmse"]["alpha"]
     ratio = about["trivial"]["alpha"]["ratio"]
     assert ratio < 0.2
     for words in (about["headline"], (run / "report.html").read_text()):
-        assert "A fit without log2 predicts it 0.5 s ahead" in words
+        assert "A fit without the log log2 predicts it 0.5 s ahead" in words
         assert f"rad, {ratio:.2g} times the error of holding still" in words
     assert about["calibration"]["channels"]["alpha"]["verdict"] == "too few to say"
     logs = {key.split("/")[1] for key in x if key.startswith("unseen/")}
@@ -158,7 +158,7 @@ def test_identify_forecasts_a_log_that_it_left_out(run: Path) -> None:
     both = [x[f"{kind}/log2/predicted/alpha"] for kind in ("unseen", "trace")]
     assert 1e-6 < np.nanmax(np.abs(both[0] - both[1])) < 0.1  # by another fit
     text = (run / "report.html").read_text()
-    for words in ('id="heldout"', 'id="calibration"', 'id="machine"', "without log2"):
+    for words in ('id="heldout"', 'id="calibration"', 'id="machine"', "without the log log2"):
         assert words in text
     command = stored.summary["command_line"]
     assert command == (

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import sim2gp as sg
 from hostile_models import tetrahedron
 from servo_arm import LINKS, model_text, record
 from sim2gp.cli import main
@@ -65,11 +66,43 @@ def test_signs_and_units_of_a_servo_arm(tmp_path: Path, capsys: Any) -> None:
     project = load_project(tmp_path / "arm.toml")
     assert 1.99 < project.spec.likelihood.window <= 2.0
     names = project.system.parameters.names
-    assert told["open_constants"] == 8
-    assert "held_constants" not in told
+    assert told["open_parameters"] == 8
+    assert "held_parameters" not in told
     assert "body/link1/mass" in names
     assert not [name for name in names if name.endswith(("/kp", "/kv"))]
     assert "the gains of the servos" in text
+
+
+def test_a_model_without_motors_is_fitted_to_its_swinging(
+    tmp_path: Path, capsys: Any
+) -> None:
+    model = """<mujoco><worldbody><body><joint name="hinge" axis="0 1 0" damping=".01"/>
+    <geom type="capsule" size=".01" fromto="0 0 0 0 0 -.3" mass=".5"/>
+    </body></worldbody></mujoco>"""
+    (tmp_path / "arm.xml").write_text(model)
+    assert (
+        main(["init", str(tmp_path / "arm.xml"), "--out", str(tmp_path / "a.toml")])
+        == 0
+    )
+    capsys.readouterr()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.toml", "arm.xml"]
+    truth = mujoco.MjModel.from_xml_string(model)
+    truth.dof_damping[:] = 0.02
+    data, rows = mujoco.MjData(truth), []
+    data.qpos[:] = 1.5
+    for _ in range(1000):
+        rows.append([data.time, *data.qpos])
+        mujoco.mj_step(truth, data)
+    header = "time,hinge"
+    np.savetxt(tmp_path / "run.csv", rows, delimiter=",", header=header, comments="")
+    told, text = drafted(tmp_path, capsys=capsys)
+    assert "actuators" not in text
+    assert told["open_parameters"] == 1  # its mass is no other parameter
+    project = load_project(tmp_path / "arm.toml")
+    found = sg.identify(project, held_out=False, progress=sg.Progress(quiet=True))
+    low, high = found.parameters["joint/hinge/damping"].interval
+    assert low <= 0.02 <= high
+    assert high - low < 1e-3
 
 
 def test_a_short_log_is_one_window(tmp_path: Path, capsys: Any) -> None:
@@ -95,7 +128,7 @@ def test_what_was_not_tried_is_named(
     reason = "the 0.01 s were over" if len(option) == 2 else "--no-readings"
     late = len(option) == 2  # then what to open is not known, either
     assert text.count(f"not tried: {reason}") == 4 + late
-    assert "held_constants" not in told
+    assert "held_parameters" not in told
     assert told["warnings"] == [
         "W160 not tried how to read joint1, joint2, servo1, servo2"
     ]

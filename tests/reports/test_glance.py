@@ -10,6 +10,11 @@ from sim2gp.reports.document import write_report
 from sim2gp.reports.glance import glance, unique
 
 ENTRY = {"mean": 2.0, "sd": 0.1, "q025": 1.8, "q975": 2.2, "verdict": "identified"}
+PRESSED = (
+    ENTRY
+    | {"verdict": "at_bound", "mean": 2.9, "low": 0.5, "high": 3.0}
+    | {"unit": "kg"}
+)
 SUMMARY: dict[str, Any] = {
     "command": "identify",
     "headline": "2 of 2 constants are identified.",
@@ -31,7 +36,7 @@ def test_each_question_has_its_answer() -> None:
     assert said["What was learned"] == SUMMARY["headline"]
     assert said["How sure"] == (
         "Standard deviations are 7.5 % of the values (median; at most 10 %). "
-        "The intervals allow for errors of the model."
+        "The intervals allow for correlated errors, not missing physics."
     )
     assert said["Does it predict"] == SUMMARY["held_out"]["headline"]
     assert said["What is missing"] == SUMMARY["misfit"]["verdict"]
@@ -47,6 +52,9 @@ def test_each_question_has_its_answer() -> None:
             "sim2gp design RUN: an experiment that tells more of mass.",
         ),
         ({"longer": {"advised": True, "text": "window = 1"}}, "window = 1"),
+        ({"parameters": {"mass": PRESSED}}, "upper end of its range, 3 kg"),
+        ({"parameters": {"mass": PRESSED | {"mean": 1.0}}}, "a smaller low in"),
+        ({"parameters": {"lag": PRESSED | {"mean": 0.0, "low": 0.0}}}, "evaluate RUN"),
     ],
 )
 def test_the_next_step_is_the_one_that_helps(

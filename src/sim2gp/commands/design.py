@@ -135,9 +135,9 @@ def design(
         task.advance(f"{found.nats:.1f} nats")
     name = source.name
     summary = _design_summary(name, asked, experiment, goal, found, seed)
-    summary["warnings"] = notes
     if isinstance(source, Identification):
         summary |= widths(source)
+    summary["warnings"] = [*notes, *summary.get("warnings", ())]
     return NextExperiment(
         summary | provenance(began),
         _design_arrays(experiment, box, found),

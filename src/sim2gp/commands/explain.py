@@ -37,6 +37,7 @@ from sim2gp.identification.missing_physics.words import (
     candidate_table,
     missing_physics_headline,
 )
+from sim2gp.identification.words import bound_warnings
 from sim2gp.inference.estimate import Estimate
 from sim2gp.planning.tasks import MACHINES
 from sim2gp.project import Project, load_project
@@ -124,7 +125,10 @@ def explain(
         "misfit_as_it_is": None if found.bare is None else found.bare.as_dict(),
         "log_evidence": float(found.search.bare.log_evidence),
         "added": None,
-        "warnings": [f"no fit with {name}" for name in found.search.failed],
+        "warnings": [
+            *bound_warnings(run.summary.get("parameters") or {}),
+            *(f"no fit with {name}" for name in found.search.failed),
+        ],
         "tables": [candidate_table(found, candidates)],
     }
     return MissingPhysics(

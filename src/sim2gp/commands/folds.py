@@ -66,7 +66,9 @@ def leave_out(
     """All but the logs with these indices."""
     test = np.isin(grid.log, left)
     others = {log.source for k, log in enumerate(logs) if k not in left}
-    return Part(~np.isin(of, left), ~test, test, len(others), logs[left[0]].name)
+    return Part(
+        ~np.isin(of, left), ~test, test, len(others), f"the log {logs[left[0]].name}"
+    )
 
 
 def split_held_out(
@@ -86,7 +88,7 @@ def split_held_out(
         since = np.asarray([logs[k].time[row] for k, row in places])
         train = since + np.asarray(windows.span).sum(axis=1) <= split
         known, test = grid.since + CURVE[0] <= split, grid.since >= split
-        words = f"the last {100 * LAST:.0f} % of {logs[0].name}"
+        words = f"the last {100 * LAST:.0f} % of the log {logs[0].name}"
         found = Part(train, known, test, 1, words, split)
     seen = np.asarray(windows.mask)[found.train].any()
     judged_by = np.asarray(grid.windows.mask)[

@@ -17,6 +17,7 @@ from sim2gp.commands.result import PROJECT, AbstractResult
 from sim2gp.data.logs import Budget, Log
 from sim2gp.errors import error
 from sim2gp.identification.forecasts.forecast import Band
+from sim2gp.identification.words import bound_warnings
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.parameters import Parameters
 from sim2gp.project import Project, load_project
@@ -185,7 +186,8 @@ def posterior_entries(summary: Mapping[str, Any], which: Width) -> dict[str, Any
     """Which posterior left a run, for the summary of what it left for.
 
     ``which`` as asked, ``widened`` the least and the most by which the corrected sd
-    exceed the plain ones, and ``why`` in a sentence where that is much.
+    exceed the plain ones, and ``why`` in a sentence where that is much. Parameters at
+    an end of their range are ``warnings``.
     """
     entries = summary["parameters"].values()
     ratios = [entry["widened"] for entry in entries if entry.get("widened")]
@@ -194,6 +196,7 @@ def posterior_entries(summary: Mapping[str, Any], which: Width) -> dict[str, Any
         "posterior": which,
         "widened": [min(ratios), max(ratios)] if ratios else None,
         "why": about.get("why"),
+        "warnings": bound_warnings(summary["parameters"]),
     }
 
 

@@ -35,6 +35,7 @@ from sim2gp.identification.intervals.discrepancy import (
 from sim2gp.identification.intervals.scatter import CorrectedFit
 from sim2gp.identification.intervals.words import interval_entry, missing_physics_table
 from sim2gp.identification.misfit.residuals import misfit_of_windows
+from sim2gp.identification.words import bound_warnings
 from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.parameters import Parameters
@@ -167,7 +168,11 @@ def _identification_summary(
             "input_sd": dict(zip(actions, band.input_sd.tolist(), strict=True)),
             "inflation": band.inflation,
         },
-        "warnings": [*note_lines(logs), *clock_warnings(logs, system)],
+        "warnings": [
+            *bound_warnings(found["parameters"]),
+            *note_lines(logs),
+            *clock_warnings(logs, system),
+        ],
         "trace_note": "Forecasts of half a second from causal starts, of the logs that "
         "were fitted; they know the recorded inputs and nothing else of the future.",
         **listed,
@@ -178,13 +183,16 @@ def _identification_summary(
 def identified_headline(parameters: dict[str, dict[str, Any]]) -> str:
     """How many parameters the logs determine, and which they do not."""
     sure = [n for n, entry in parameters.items() if entry["verdict"] == "identified"]
-    rest = [n for n in parameters if n not in sure]
+    ends = [n for n, entry in parameters.items() if entry["verdict"] == "at_bound"]
+    rest = [n for n in parameters if n not in {*sure, *ends}]
     text = f"{len(sure)} of {len(parameters)} parameters are identified"
     if sure:
         text += f" ({', '.join(sure)})"
-    return (
-        f"{text}; not by these logs alone: {', '.join(rest)}." if rest else f"{text}."
-    )
+    if ends:
+        text += f"; at an end of its range: {', '.join(ends)}"
+    if rest:
+        text += f"; not by these logs alone: {', '.join(rest)}"
+    return f"{text}."
 
 
 def _count_of_logs(logs: Sequence[Log]) -> str:
@@ -204,12 +212,12 @@ def _noise_words(
         times = noise[name] / float(floor)
         out.append(
             f"The noise of {name}, {noise[name]:.2g} {unit[name]}, is {times:.0f} "
-            "times the rounding of its sensor: the rest is error of the start and of "
-            "the model, which is not independent from sample to sample: the plain "
-            "posterior, which takes it for that, is narrower than it should be."
+            "times the rounding of its recorded numbers: noise of the sensor, or "
+            "errors of the model. Errors of the model are alike in neighbouring "
+            "samples; the plain posterior is too narrow then."
             if times > 3.0
             else f"The noise of {name}, {noise[name]:.2g} {unit[name]}, is that of "
-            "its sensor's rounding: these windows show no other error."
+            "the rounding of its recorded numbers: these windows show no other error."
         )
     return out
 

@@ -54,14 +54,17 @@ def init(
         started=time.monotonic(),
         budget=Budget().times(max(1.0, seconds / 60.0)),  # of reading: more on request
     )
-    if logs:
-        with progress.task("init", 3) as task:
-            return draft_summary(draft_project(replace(asked, step=task.advance)), out)
     table = out.with_name(f"{out.stem}-experiment.csv")
-    check_absent(table)
-    with progress.task("init", 2) as task:
+    if not logs:
+        check_absent(table)
+    with progress.task("init", 3 if logs else 2) as task:
         draft = draft_project(replace(asked, step=task.advance))
         summary = draft_summary(draft, out)
+        if logs:
+            return summary
+        if not draft.system.actions:
+            task.advance("no experiment: the machine has no inputs")
+            return summary | {"headline": f"Wrote {out}, which says what a log needs"}
         until = asked.started + seconds
         found = safe_excitation(draft.system, key=jax.random.key(seed), until=until)
         task.advance("a first experiment")

@@ -87,8 +87,8 @@ def forecast_unseen(
     )
     if part.recordings == 1:
         summary["text"] += (
-            " One recording says nothing of how others differ: the bands are twice as "
-            "wide as its own errors ask for."
+            " One recording does not show how much others differ. So the bands are "
+            "twice as wide as this recording needs, and hold more than their share."
         )
     return Unseen(summary, arrays | shares | traces, found, picture)
 

@@ -1,8 +1,9 @@
-"""Numbers, units and combinations of parameters as text."""
+"""Numbers, units, combinations of parameters and their bounds as text."""
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -88,3 +89,27 @@ def unit_product(terms: Iterable[tuple[float, str]]) -> str:
     kept = [(s, p) for s, p in total.items() if abs(p) > 1e-9]
     kept.sort(key=lambda item: item[1] < 0.0)
     return " ".join(s if p == 1.0 else f"{s}^{digits(p, 3)}" for s, p in kept)
+
+
+def bound_warnings(entries: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """What to do about each parameter that the data press against an end of its range.
+
+    At zero nothing: less than nothing cannot be, and the data show none of it.
+    """
+    found = []
+    for name, entry in entries.items():
+        low, high = entry.get("low"), entry.get("high")
+        if entry.get("verdict") != "at_bound" or low is None or high is None:
+            continue
+        is_upper = high - entry["mean"] < entry["mean"] - low
+        end, word, way = (
+            ("upper", "high", "larger") if is_upper else ("lower", "low", "smaller")
+        )
+        if entry[word] != 0.0:
+            found.append(
+                f"{name} is at the {end} end of its range, "
+                f"{quantity(entry[word], entry['unit'])}. If the true value is beyond "
+                f"it, all values of this fit are wrong: write a {way} {word} in the "
+                "project file, and run identify again."
+            )
+    return found

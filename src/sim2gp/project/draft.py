@@ -20,6 +20,7 @@ from sim2gp.data.logs.formats import read_recordings
 from sim2gp.data.logs.units import UNITS
 from sim2gp.errors import InputError
 from sim2gp.identification.identifiability.selection import Selection
+from sim2gp.identification.words import join_names
 from sim2gp.project.columns import Match, match, time_column
 from sim2gp.project.draft_text import Contents, draft_text
 from sim2gp.project.open_constants import try_selection
@@ -352,7 +353,13 @@ def draft_summary(draft: Draft, out: Path) -> dict[str, Any]:
         for name, m in draft.columns.items()
         if name not in surer and "not tried" in m.why
     ]
-    warnings = [f"W160 the logs hardly tell how {n} is to be read" for n in doubts]
+    warnings = []
+    if doubts:
+        are = "is" if len(doubts) == 1 else "are"
+        warnings.append(
+            f"W160 the logs hardly show how {join_names(doubts)} {are} to be read: "
+            "check unit, sign and offset in the file"
+        )
     if untried:
         warnings.append(f"W160 not tried how to read {', '.join(untried)}")
     return {
@@ -360,7 +367,7 @@ def draft_summary(draft: Draft, out: Path) -> dict[str, Any]:
         "headline": f"Wrote {out}: read it, then sim2gp identify {out}",
         "file": str(out),
         "columns": table,
-        "open_constants": len(draft.system.parameters) - len(held),
-        **({"held_constants": list(held)} if held else {}),
+        "open_parameters": len(draft.system.parameters) - len(held),
+        **({"held_parameters": list(held)} if held else {}),
         "warnings": warnings,
     }

@@ -10,6 +10,7 @@ from pathlib import Path
 from sim2gp.data.logs import Column
 from sim2gp.identification.identifiability.selection import Selection
 from sim2gp.identification.words import digits, linear_sum
+from sim2gp.inference.parameters import Parameter
 from sim2gp.project.columns import Match
 from sim2gp.project.project import is_model
 from sim2gp.project.replace import key as toml_key
@@ -67,6 +68,8 @@ def draft_text(c: Contents) -> str:
     rows += ["", *(_log_lines(c) if c.files else _wanted(c.system))]
     if isinstance(c.system, MuJoCo) and c.system.servos:
         rows += ["", *_window(c.longest if c.files else math.inf)]
+    if not c.system.actions:
+        return "\n".join(rows) + "\n"
     rows += ["", "# Inputs act late on most machines; delay = 0.0 takes that out."]
     delay = f"delay = {{low = 0.0, high = {DELAY}}}"
     if isinstance(c.system, MuJoCo) and len(c.system.actions) > 1:
@@ -84,20 +87,22 @@ def _constant_lines(c: Contents, file: bool) -> list[str]:
     selection = c.selection or Selection({}, {})
     opened = [p for p in table if p.name not in selection.held]
     whose = "within a factor of three of the file's numbers" if file else "as bundled"
-    rows = [f"# {len(opened)} parameters are open, {whose}:"]
+    count = "1 parameter is" if len(opened) == 1 else f"{len(opened)} parameters are"
+    rows = [f"# {count} open, {whose}:"]
     if c.unselected:
         rows.append(f"# (which of them the logs tell apart is {c.unselected})")
-    value = {p.name: f"{nominal[p.name]:.4g} {p.unit}".rstrip() for p in table}
+    value = {p.name: _value_and_range(p, nominal[p.name]) for p in table}
     if selection.held:
         rows += _selected(selection, [p.name for p in opened], value)
-        rows.append('# To say what you know: "NAME" = {mean = ..., sd = ...}')
+        known = "{mean = ..., sd = ...} or {low = ..., high = ...}"
+        rows.append(f'# To say what you know: "NAME" = {known}')
     else:
         rows += [f"#   {p.name} = {value[p.name]}" for p in table[:LISTED]]
         if len(table) > LISTED:
             rows.append(f"#   and {len(table) - LISTED} more")
         example = toml_key(table[0].name) if table else "NAME"
         known = f"[parameters.{example}] mean = ... sd = ..."
-        rows.append(f"# To say what you know: {known}")
+        rows.append(f"# To say what you know: {known}, or low = ... high = ...")
     if _has_servos(c.system):
         rows += [
             "# Not open, as the model has them: the gains of the servos, kp and kv.",
@@ -105,6 +110,15 @@ def _constant_lines(c: Contents, file: bool) -> list[str]:
             "# and targets do not tell. Open one if you know the masses.",
         ]
     return rows
+
+
+def _value_and_range(parameter: Parameter, value: float) -> str:
+    """The file's number, and how far from it a fit may go."""
+    text = f"{value:.4g} {parameter.unit}".rstrip()
+    ends = parameter.low, parameter.high
+    if not all(map(math.isfinite, ends)):
+        return text
+    return f"{text}, from {ends[0]:.3g} to {ends[1]:.3g}"
 
 
 def _selected(
@@ -172,9 +186,10 @@ def _wanted(system: AbstractSystem) -> list[str]:
     if rates:
         rows.append("# and, where they are measured, the velocities")
         rows += [f"#   {c.name} in {c.unit}" for c in rates]
+    if system.actions:
+        rows.append("# Record the commands that were sent, in the units of the model.")
     rows += [
-        "# Record the commands that were sent, in the units of the model. Then run",
-        "# sim2gp init MODEL LOG --out FILE for another draft, or add the log here:",
+        "# Then run sim2gp init MODEL LOG --out FILE for another draft, or add it:",
         "# [[logs]]",
         '# files = ["run.csv"]',
         "# [logs.columns]",

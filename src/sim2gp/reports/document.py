@@ -7,6 +7,7 @@ from typing import Any
 
 from markupsafe import Markup
 
+from sim2gp.identification.words import bound_warnings
 from sim2gp.reports import data, parameters
 from sim2gp.reports.animation import player
 from sim2gp.reports.experiment import experiment
@@ -50,10 +51,7 @@ def _report_problems(summary: Summary) -> list[tuple[str, str]]:
         found.append(("bad", "The fit did not converge; its numbers are not a result."))
     elif status and str(status) not in ("ok", "done", "converged", "complete"):
         found.append(("bad", f"Status: {status}."))
-    pressed = _names_with_verdict(summary, "at_bound")
-    if pressed:
-        text = "The data press these against the edge of their range"
-        found.append(("bad", f"{text}: {pressed}."))
+    found += [("bad", w) for w in bound_warnings(summary.get("parameters") or {})]
     idle = _names_with_verdict(summary, "dead")
     if idle:
         found.append(("bad", f"The data do not depend on: {idle}."))

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from statistics import median
 from typing import Any
 
+from sim2gp.identification.words import bound_warnings
 from sim2gp.reports.numbers import format_number
 from sim2gp.reports.parameters import Summary
 
@@ -46,11 +47,13 @@ def _width_answer(summary: Summary) -> str:
         if len(shares) > 1:
             words += f" (median; at most {format_number(max(shares), 2)} %)"
         said.append(f"{words}.")
-    which = (summary.get("intervals") or {}).get("which")
-    if which == "corrected":
-        said.append("The intervals allow for errors of the model.")
-    elif which:
-        said.append("The intervals take the model for right: there are few windows.")
+    about = summary.get("intervals") or {}
+    if about.get("which") == "corrected" and about.get("allowed_for"):
+        said.append("The intervals allow for correlated errors and missing physics.")
+    elif about.get("which") == "corrected":
+        said.append("The intervals allow for correlated errors, not missing physics.")
+    elif about:
+        said.append("The intervals assume a correct model: there are few windows.")
     check = summary.get("check") or {}
     if check.get("text"):
         said.append(str(check["text"]))
@@ -73,14 +76,13 @@ def _misfit_answer(summary: Summary) -> str:
 
 def _next_command(summary: Summary) -> str:
     """The command that helps most."""
-    misfit = summary.get("misfit") or {}
+    misfit, entries = summary.get("misfit") or {}, _entries(summary)
+    if pressed := bound_warnings(entries):
+        return " ".join(pressed)
     if misfit.get("alarm"):
         return "sim2gp explain RUN says which physics may be missing."
-    open_ = [
-        name
-        for name, entry in _entries(summary).items()
-        if entry.get("verdict") not in ("identified", "dead")
-    ]
+    settled = "identified", "dead", "at_bound"
+    open_ = [n for n, entry in entries.items() if entry.get("verdict") not in settled]
     if open_:
         names = _first_names(open_)
         return f"sim2gp design RUN: an experiment that tells more of {names}."

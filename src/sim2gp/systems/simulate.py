@@ -51,7 +51,7 @@ def inputs_of(
             integral = xp.interp(t, window.knots, area)
         return xp.diff(integral) / h
 
-    return each_window(channel, window.area.T, delays).T
+    return _of_each_input(channel, window, delays)
 
 
 def inputs_by_delay(
@@ -65,6 +65,17 @@ def inputs_by_delay(
         early, late = np.interp(sides, window.knots, area)
         return -np.diff((late - early) / blur) / h
 
+    return _of_each_input(channel, window, delays)
+
+
+def _of_each_input(
+    channel: Callable[[AnyArray, AnyScalar], AnyArray],
+    window: HeldInputs,
+    delays: Float[AnyArray, " m"],
+) -> Float[AnyArray, "L m"]:
+    """A column for each input; a machine may have none."""
+    if not delays.size:
+        return library(window.area).zeros((window.span.size, 0))
     return each_window(channel, window.area.T, delays).T
 
 

@@ -200,8 +200,8 @@ def _scores_by_horizon(
         "rows": rows,
         "note": "For each channel: the root mean square error of the model, one "
         "horizon after each start (every 0.1 s); of holding still (held); of a linear "
-        "regression on start and inputs; and the shares of samples inside the 90 % and "
-        "the 95 % band.",
+        "regression on start and inputs (-: too few windows to learn from); and the "
+        "shares of samples inside the 90 % and the 95 % band.",
     }
 
 
@@ -236,7 +236,8 @@ def _scores_by_log(
         "columns": columns,
         "rows": rows,
         "note": "The regression knows all inputs of the window. If a controller made "
-        "them, they depend on the angles that are to be predicted.",
+        "them, they depend on the angles that are to be predicted. -: too few windows "
+        "to learn from.",
     }
 
 
@@ -256,7 +257,7 @@ def _against_by_log(
 
 def _regression_text(regression: float) -> str:
     """An error of the regression, which may have had too few windows to learn from."""
-    return f"{regression:.4f}" if np.isfinite(regression) else "not enough windows"
+    return f"{regression:.4f}" if np.isfinite(regression) else "-"
 
 
 def forecast_traces(found: Forecast, band: Band, grid: Grid) -> Picture:

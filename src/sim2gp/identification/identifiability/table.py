@@ -147,6 +147,8 @@ def _note(spec: Spectrum, j: int, verdict: str, partners: tuple[str, ...]) -> st
         text = f"pressed against its {end} bound of {quantity(bound, p.unit)}"
         if abs(spec.prior_mean[j]) > BOUND:
             text += ", where its prior already put it"
+        elif bound == 0.0:
+            text = "zero, as far as the data show"
     elif verdict == "traded_off":
         text = f"only together with {join_names(partners)}: see the combinations"
     elif verdict == "prior_dominated":
