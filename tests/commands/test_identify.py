@@ -158,7 +158,12 @@ def test_identify_forecasts_a_log_that_it_left_out(run: Path) -> None:
     both = [x[f"{kind}/log2/predicted/alpha"] for kind in ("unseen", "trace")]
     assert 1e-6 < np.nanmax(np.abs(both[0] - both[1])) < 0.1  # by another fit
     text = (run / "report.html").read_text()
-    for words in ('id="heldout"', 'id="calibration"', 'id="machine"', "without the log log2"):
+    for words in (
+        'id="heldout"',
+        'id="calibration"',
+        'id="machine"',
+        "without the log log2",
+    ):
         assert words in text
     command = stored.summary["command_line"]
     assert command == (

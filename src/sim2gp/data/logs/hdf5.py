@@ -65,8 +65,10 @@ def entries_of(file: Any, where: str, meter: Meter) -> dict[str, LazyArray]:
     h5py = import_optional("h5py", "hdf5", "an HDF5 file")
     found: dict[str, LazyArray] = {}
 
-    def visit(name: str, item: Any) -> None:
+    def visit(name: str | bytes, item: Any) -> None:
         meter.tick()
+        if isinstance(name, bytes):  # what h5py makes of a name that is not UTF-8
+            raise ValueError(f"dataset {name[:40]!r}")
         if isinstance(item, h5py.Dataset) and item.shape:
             found[name] = _lazy_dataset(item, f"{where}:dataset {name}", meter)
 

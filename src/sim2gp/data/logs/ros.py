@@ -104,6 +104,8 @@ def _opened(
             # None chosen means all to the library.
             for about, logged, raw in reader.messages(chosen) if chosen else ():
                 meter.tick()
+                if not isinstance(logged, int):  # SQLite keeps any type in any column
+                    raise ValueError(f"{about.topic[:80]}: time {str(logged)[:40]}")
                 meter.place = f"{about.topic[:80]}, logged at {logged} ns"
                 content = decoders.decoded(about, raw)
                 yield Message(about.topic, logged, content)
