@@ -198,7 +198,7 @@ def test_friction_that_the_simulator_lacks_is_in_the_intervals(
     found = corrected_windows(likelihood, belief, one)
     assert found.missing > 0.99
     assert {"q1.coulomb", "q2.coulomb"} <= set(found.effects)
-    assert not any("back_emf" in name for name in found.effects)  # a damping, again
+    assert not any("viscous" in name for name in found.effects)  # a damping, again
     assert found.posterior.scale.shape == (4, 4)
     assert away(truth, found.posterior).max() < 2.0
     about = interval_entry(UniformRodArm(), found, {}, 50)

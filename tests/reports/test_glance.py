@@ -53,7 +53,7 @@ def test_each_question_has_its_answer() -> None:
         ),
         ({"longer": {"advised": True, "text": "window = 1"}}, "window = 1"),
         ({"parameters": {"mass": PRESSED}}, "upper end of its range, 3 kg"),
-        ({"parameters": {"mass": PRESSED | {"mean": 1.0}}}, "a smaller low in"),
+        ({"parameters": {"mass": PRESSED | {"mean": 1.0}}}, "a smaller "),
         ({"parameters": {"lag": PRESSED | {"mean": 0.0, "low": 0.0}}}, "evaluate RUN"),
     ],
 )

@@ -109,7 +109,7 @@ def bound_warnings(entries: Mapping[str, Mapping[str, Any]]) -> list[str]:
             found.append(
                 f"{name} is at the {end} end of its range, "
                 f"{quantity(entry[word], entry['unit'])}. If the true value is beyond "
-                f"it, all values of this fit are wrong: write a {way} {word} in the "
+                f"it, all values of this fit are wrong: write a {way} `{word}` in the "
                 "project file, and run identify again."
             )
     return found
