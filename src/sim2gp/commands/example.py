@@ -98,7 +98,7 @@ has
 so the drawing is wrong about both masses. `identify` does not know these numbers. Its
 results are in `runs/arm/`: open `report.html`.
 
-`arm.xml` is the same arm as a MuJoCo model. With `pip install 'sim2gp[mujoco]'`
+`arm.xml` is the same arm as a MuJoCo model. With the extra `mujoco` installed,
 
     sim2gp init arm.xml first.csv second.csv --out mujoco.toml
 
