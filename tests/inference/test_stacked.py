@@ -195,9 +195,9 @@ def test_one_step_data_and_windows_of_an_arm_are_one_least_squares() -> None:
     )
     covariance = np.linalg.inv(dense.jac.T @ dense.jac)[:p, :p]
     scale = np.asarray(prior.scale)
-    np.testing.assert_allclose(
-        found.posterior.mean, np.asarray(prior.at(jnp.asarray(dense.x[:p]))), atol=1e-7
-    )
+    away = found.posterior.mean - np.asarray(prior.at(jnp.asarray(dense.x[:p])))
+    # A descent ends where a step saves less than 1e-12 of the cost.
+    assert np.max(np.abs(away / found.posterior.sd())) < 1e-5
     np.testing.assert_allclose(
         found.posterior.covariance(), scale @ covariance @ scale.T, rtol=1e-5
     )

@@ -53,9 +53,7 @@ def test_friction_laws():
         assert float(got) == pytest.approx(expected, abs=1e-15)
 
 
-@pytest.mark.parametrize(
-    "dtype", [jnp.float32, pytest.param(jnp.float64, marks=pytest.mark.nightly)]
-)
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 @pytest.mark.parametrize("name", machines.every())
 def test_gradients_are_finite_at_rest_and_at_speed(name, dtype):
     system = machines.every()[name]
