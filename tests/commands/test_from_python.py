@@ -20,7 +20,10 @@ pytest.importorskip("mujoco", reason="the extra `mujoco` is not installed")
 NOTEBOOK = Path(__file__).resolve().parents[2] / "examples" / "from_python.py"
 QUIET = sg.Progress(quiet=True)
 #: What depends on where, when and how a run was made.
-_OF_THE_RUN = ("command_line", "wall_seconds", "project", "title", "versions", "device")
+_OF_THE_RUN = (
+    *("command_line", "wall_seconds", "project", "title", "versions", "device"),
+    "seconds_of_cells",
+)
 
 
 @pytest.fixture(scope="module")
