@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 import numpy as np
 
-import sim2gp as sg
 import sim2gp.experiment_design as d
+from rail_mass import DT, rail_mass
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.systems import Delay, free_parts
 from simulated_logs import pendulum
@@ -47,23 +47,9 @@ def delayed():
     return free_parts(system, [Delay("voltage")])
 
 
-def pushed(params, s, a):
-    """A mass on a rail that brakes it."""
-    return jnp.stack([s[1], params["gain"] * a[0] - params["drag"] * s[1]])
-
-
 def rail_experiment() -> d.Experiment:
     """Two seconds of a mass on a rail; corrected, its belief is wider and elsewhere."""
-    system = sg.systems.ODE(
-        pushed,
-        [
-            sg.Parameter("gain", "1/kg", "of the input", "log_bounded", 0.5, 8.0),
-            sg.Parameter("drag", "1/s", "of the rail", "log_bounded", 0.05, 2.0),
-        ],
-        [sg.Channel("x", "m"), sg.Channel("x.velocity", "m/s")],
-        [sg.Channel("force", "N", low=-1.0, high=1.0)],
-        max_substep=0.1,
-    )
+    system = rail_mass()
     prior = system.parameters.prior()
     return d.Experiment(
         system,
@@ -72,7 +58,7 @@ def rail_experiment() -> d.Experiment:
         jnp.zeros(2),
         jnp.asarray([0.05, 1.0]),
         (0,),
-        0.1,
+        DT,
         20,
         10,
         corrected=Gaussian(prior.mean + 0.3, 1.5 * prior.scale[:, ::-1]),

@@ -15,6 +15,7 @@ from scipy.stats import multivariate_normal
 
 import sim2gp as sg
 from mass_task import mass_task, single
+from rail_mass import DT, rail_mass
 from sim2gp.data import one_step_log as stepping
 from sim2gp.errors import InputError
 from sim2gp.models.auto import log_scores
@@ -28,24 +29,10 @@ from sim2gp.systems import Delay, free_parts
 from sim2gp.types import single as in_float32
 
 KEY = jax.random.key(0)
-DT, D, ROWS, CAPACITY = 0.1, 2, 16, 20  # the rows of an episode: one program
+D, ROWS, CAPACITY = 2, 16, 20  # the rows of an episode: one program
 
 
-def pushed(params, s, a):
-    """A mass on a rail that brakes it."""
-    return jnp.stack([s[1], params["gain"] * a[0] - params["drag"] * s[1]])
-
-
-SYSTEM = sg.systems.ODE(
-    pushed,
-    [
-        sg.Parameter("gain", "1/kg", "of the input", "log_bounded", 0.5, 8.0),
-        sg.Parameter("drag", "1/s", "of the rail", "log_bounded", 0.05, 2.0),
-    ],
-    [sg.Channel("x", "m"), sg.Channel("x.velocity", "m/s")],
-    [sg.Channel("force", "N", low=-1.0, high=1.0)],
-    max_substep=DT,
-)
+SYSTEM = rail_mass()
 TRUTH = {"gain": single(2.0)[0], "drag": single(0.4)[0]}
 TINY = {"hidden": (5,), "steps": 100, "refit_steps": 0}
 
