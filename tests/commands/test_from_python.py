@@ -21,8 +21,13 @@ NOTEBOOK = Path(__file__).resolve().parents[2] / "examples" / "from_python.py"
 QUIET = sg.Progress(quiet=True)
 #: What depends on where, when and how a run was made.
 _OF_THE_RUN = (
-    *("command_line", "wall_seconds", "project", "title", "versions", "device"),
+    "command_line",
+    "wall_seconds",
     "seconds_of_cells",
+    "project",
+    "title",
+    "versions",
+    "device",
 )
 
 

@@ -235,7 +235,7 @@ def test_limits_hold_for_the_corrected_posterior_and_nats_are_of_the_plain(
     draws = jax.random.normal(jax.random.key(2), (QUICK["CHECKED"], 2))
     states, beyond = by_gradients._plausible_states(wide, box, U, draws)
     one = eqx.filter_jit(d.trajectory)
-    for z, S, far in list(zip(draws, states, beyond, strict=True))[:5]:
+    for z, S, far in zip(draws[:5], states[:5], beyond[:5], strict=True):
         tt = shifted.mean + shifted.scale @ z
         alone = one(e, tt, U)
         np.testing.assert_allclose(S, alone, rtol=1e-6, atol=1e-8)

@@ -81,13 +81,14 @@ def windowed() -> dict[str, tuple[sg.AbstractSystem, list[Any], dict[str, Any]]]
     both_weigh = LinearMeasurement(("weight", "payload"), (1.0, 9.81), 2.0, 0.05)
     known = with_measurements(arm, [both_weigh])
     pair = [payload_arm.log(0, seed=1), payload_arm.log(1, seed=2)]
-    return {
-        "actuated": (actuated, [late], {"window": 0.2}),
-        "robust": (bare, [late], {"window": 0.2, "robust": True}),
-        "one_step": (bare, [exact], {"window": 0.0}),
-        "groups": (both, pair, {"window": 0.2}),
-        "measured_sum": (known, pair[:1], {"window": 0.2}),
-    }
+    made: list[tuple[sg.AbstractSystem, list[Any], dict[str, Any]]] = [
+        (actuated, [late], {"window": 0.2}),
+        (bare, [late], {"window": 0.2, "robust": True}),
+        (bare, [exact], {"window": 0.0}),
+        (both, pair, {"window": 0.2}),
+        (known, pair[:1], {"window": 0.2}),
+    ]
+    return dict(zip(WINDOWED, made, strict=True))
 
 
 class Whitened(NamedTuple):

@@ -29,7 +29,7 @@ from sim2gp.experiment_design.experiment import (
 )
 from sim2gp.experiment_design.goals import AbstractGoal
 from sim2gp.experiment_design.limits import LimitBox, all_excess, excess, narrow_limits
-from sim2gp.experiment_design.search_method import SearchPrograms
+from sim2gp.experiment_design.search_method import SearchProblem, SearchPrograms
 from sim2gp.experiment_design.signals import AbstractCommandSignal
 from sim2gp.models.training import adamw, descend
 from sim2gp.types import Key, single
@@ -46,16 +46,9 @@ CHEAP, COST = 2.0, 15.0  # at first and at last, for a half of the box, in nats 
 CHECKED = 1000  # draws that the result is held against
 
 
-def search_programs(
-    experiment: Experiment,
-    signal: AbstractCommandSignal,
-    goal: AbstractGoal,
-    limits: LimitBox,
-    informed: Float[Array, "D p"],
-    trials: Float[Array, "N p"],
-    held_out: Float[Array, "K p"],
-) -> SearchPrograms:
+def search_programs(problem: SearchProblem) -> SearchPrograms:
     """Programs of JAX; they begin to be compiled here."""
+    experiment, signal, goal, limits, informed, trials, held_out = problem
     nothing = jnp.zeros((experiment.steps, limits.low.size))
     rough, coarse = _coarser(experiment, signal)
     improve = _climber(rough, coarse, goal, limits, informed, trials)

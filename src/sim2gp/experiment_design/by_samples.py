@@ -23,7 +23,7 @@ from sim2gp.experiment_design.experiment import (
 )
 from sim2gp.experiment_design.goals import AbstractGoal
 from sim2gp.experiment_design.limits import LimitBox, all_excess, narrow_limits
-from sim2gp.experiment_design.search_method import SearchPrograms
+from sim2gp.experiment_design.search_method import SearchProblem, SearchPrograms
 from sim2gp.experiment_design.signals import AbstractCommandSignal
 from sim2gp.systems.host import simulator_of
 from sim2gp.types import Key
@@ -38,17 +38,10 @@ CHEAP, COST = 10.0, 100.0  # of a half of the box, for each direction asked abou
 States = Float[np.ndarray, "K times n"]
 
 
-def search_programs(
-    experiment: Experiment,
-    signal: AbstractCommandSignal,
-    goal: AbstractGoal,
-    limits: LimitBox,
-    informed: Float[Array, "D p"],
-    trials: Float[Array, "N p"],
-    held_out: Float[Array, "K p"],
-) -> SearchPrograms:
+def search_programs(problem: SearchProblem) -> SearchPrograms:
     """Loops of the host around its simulator."""
-    draws, guards, others = map(np.asarray, (informed, trials, held_out))
+    experiment, signal, goal, limits, *sampled = problem
+    draws, guards, others = map(np.asarray, sampled)
     return SearchPrograms(
         sampling_search(experiment, signal, goal, limits, draws, guards),
         lambda U: states_and_excess(experiment, limits, np.asarray(U), others),

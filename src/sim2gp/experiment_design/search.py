@@ -21,7 +21,7 @@ from sim2gp.experiment_design import by_gradients, by_samples
 from sim2gp.experiment_design.experiment import Experiment
 from sim2gp.experiment_design.goals import AbstractGoal
 from sim2gp.experiment_design.limits import LimitBox
-from sim2gp.experiment_design.search_method import SearchMethod
+from sim2gp.experiment_design.search_method import SearchMethod, SearchProblem
 from sim2gp.experiment_design.signals import AbstractCommandSignal, MultisineCommands
 from sim2gp.systems.host import simulator_of
 from sim2gp.types import AnyArray, Key, in_float64
@@ -81,8 +81,10 @@ def optimise_commands(
         for k, count in zip(others, (draws, by.TRIALS, by.CHECKED), strict=True)
     )
     informed = informed.at[0].set(0.0)
-    about = experiment, signal, goal, limits, informed, trials, held_out
-    improve, check, information = by.search_programs(*about)
+    problem = SearchProblem(
+        experiment, signal, goal, limits, informed, trials, held_out
+    )
+    improve, check, information = by.search_programs(problem)
 
     def one(key: Key) -> DesignResult:
         U = signal.commands(jnp.asarray(improve(key), float), limits)

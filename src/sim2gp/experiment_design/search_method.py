@@ -12,6 +12,22 @@ from sim2gp.experiment_design.signals import AbstractCommandSignal
 from sim2gp.types import AnyArray, Key
 
 
+class SearchProblem(NamedTuple):
+    """What is searched for, and draws of the parameters in units of the belief.
+
+    informed: the information is their mean; trials: they must keep the limits while
+        searching; held_out: what is found is held against them.
+    """
+
+    experiment: Experiment
+    signal: AbstractCommandSignal
+    goal: AbstractGoal
+    limits: LimitBox
+    informed: Float[Array, "D p"]
+    trials: Float[Array, "N p"]
+    held_out: Float[Array, "K p"]
+
+
 class SearchPrograms(NamedTuple):
     """Better coefficients, draws' states and excess over limits, and the information.
 
@@ -33,17 +49,8 @@ class SearchMethod(Protocol):
     TRIALS: int
     CHECKED: int
 
-    def search_programs(
-        self,
-        experiment: Experiment,
-        signal: AbstractCommandSignal,
-        goal: AbstractGoal,
-        limits: LimitBox,
-        informed: Float[Array, "D p"],
-        trials: Float[Array, "N p"],
-        held_out: Float[Array, "K p"],
-    ) -> SearchPrograms:
-        """The programs, for these draws in units of the belief."""
+    def search_programs(self, problem: SearchProblem) -> SearchPrograms:
+        """The programs that search and judge."""
 
     def sensitivity_at(
         self, experiment: Experiment, U: Float[Array, "T m"], periods: int

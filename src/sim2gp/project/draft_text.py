@@ -68,16 +68,8 @@ def draft_text(c: Contents) -> str:
     rows += ["", *(_log_lines(c) if c.files else _wanted(c.system))]
     if isinstance(c.system, MuJoCo) and c.system.servos:
         rows += ["", *_window(c.longest if c.files else math.inf)]
-    if not c.system.actions:
-        return "\n".join(rows) + "\n"
-    rows += ["", "# Inputs act late on most machines; delay = 0.0 takes that out."]
-    delay = f"delay = {{low = 0.0, high = {DELAY}}}"
-    if isinstance(c.system, MuJoCo) and len(c.system.actions) > 1:
-        rows.append("# One delay for all drives: without tie each has its own.")
-        rows += ['[actuators."*"]', delay, "tie = true"]
-        return "\n".join(rows) + "\n"
-    for channel in c.system.actions:
-        rows += [f"[actuators.{toml_key(channel.name)}]", delay]
+    if c.system.actions:
+        rows += ["", *_delays(c.system)]
     return "\n".join(rows) + "\n"
 
 
@@ -217,6 +209,18 @@ def _window(longest: float) -> list[str]:
         "[likelihood]",
         f"window = {window!r}",
     ]
+
+
+def _delays(system: AbstractSystem) -> list[str]:
+    """An open delay of each input; the drives of a model share theirs."""
+    rows = ["# Inputs act late on most machines; delay = 0.0 takes that out."]
+    delay = f"delay = {{low = 0.0, high = {DELAY}}}"
+    if isinstance(system, MuJoCo) and len(system.actions) > 1:
+        rows.append("# One delay for all drives: without tie each has its own.")
+        return [*rows, '[actuators."*"]', delay, "tie = true"]
+    for channel in system.actions:
+        rows += [f"[actuators.{toml_key(channel.name)}]", delay]
+    return rows
 
 
 def _column_text(column: Column) -> str:
