@@ -16,12 +16,20 @@ from sim2gp.inference.least_squares import factor, prior_rows
 from sim2gp.inference.levenberg_marquardt import multi_start
 from sim2gp.inference.likelihood import AbstractLikelihood
 from sim2gp.inference.prior import AbstractPrior
+from sim2gp.types import AnyArray
 
 
 class Standard(AbstractPrior):
     """A standard normal prior of parameters without bounds."""
 
     gaussian: Gaussian
+
+    @property
+    def linear(self) -> tuple[int, ...]:
+        return ()
+
+    def moved(self, z: Float[AnyArray, " p"], dz: Float[AnyArray, " p"]) -> AnyArray:
+        return z + dz
 
     def rows(self, z: Float[Array, " p"]) -> Float[Array, "q p1"]:
         return prior_rows(z)
@@ -116,10 +124,14 @@ class Found(eqx.Module):
 
 
 def descend(likelihood, starts, e, noise, update, prior=None, **options) -> Found:
-    """The best of several descents, and the noise by ``update``."""
+    """The best of several descents, and the noise by ``update``; the prior stays."""
     prior = standard(starts.shape[1]) if prior is None else prior
-    at, noise, steps, costs = multi_start(
-        likelihood, prior, starts, e, noise, update, **options
+
+    def both(at, noise, prior, damping):
+        return update(at, noise), prior
+
+    at, noise, _, steps, costs = multi_start(
+        likelihood, prior, starts, e, noise, both, **options
     )
     about = laplace(at, noise)
     return Found(about, noise, costs, about.convergence(steps))

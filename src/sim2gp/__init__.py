@@ -54,6 +54,7 @@ _CONTENTS = {
     "AbstractModel": "belief",
     "AbstractBelief": "belief",
     "Sim2GP": "models",
+    "MissingForces": "models",
     "NLM": "models",
     "Residual": "models",
     "FunctionSpace": "models",

@@ -177,6 +177,8 @@ def test_another_start_is_followed_where_it_is_better_and_elsewhere(
     noise = numpy_of(likelihood.first_noise())
     whitened = 0.1 * np.asarray(starts)[:, None]
     e = np.zeros((1, 0))
-    steps = list(search(likelihood, prior, whitened, e, noise, lambda _, n: n, SMALL))
+    steps = list(
+        search(likelihood, prior, whitened, e, noise, lambda _, *known: known, SMALL)
+    )
     assert sum(at.steps == 1 for at in steps) == descents
     assert abs(10.0 * float(steps[-1].at.z[0]) - where) < 0.1

@@ -14,7 +14,7 @@ from sim2gp.inference.arrowhead import Noise
 from sim2gp.inference.convergence import CONVERGED, NEAR, NOT_FINITE
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.laplace import expected_noise
-from sim2gp.inference.levenberg_marquardt import GRADIENT_TOLERANCE
+from sim2gp.inference.levenberg_marquardt import GRADIENT_TOLERANCE, Ends
 
 pytestmark = pytest.mark.usefixtures("float64")
 
@@ -106,7 +106,7 @@ def multi_start(
         update,
         rounds=rounds,
         needed=needed,
-        tolerance=tolerance,
+        ends=Ends(tolerance),
     )
 
 

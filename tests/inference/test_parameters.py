@@ -273,3 +273,43 @@ def test_slopes_of_the_maps_are_those_that_jax_finds(kind: str) -> None:
     np.testing.assert_allclose(bend, second / first, rtol=0.0, atol=1e-12)
     for mine, theirs in zip((slope, bend), in_jax, strict=True):
         np.testing.assert_allclose(theirs, mine, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("dz", [1e-3, 0.2])
+def test_a_step_keeps_products_of_powers(dz):
+    """Mass, force and damping by one factor: what a machine shows stays the same."""
+    table = Parameters(
+        (
+            Parameter("mass", "kg", "", "bounded", 0.5, 2.0),
+            Parameter("force", "N", "", "bounded", 1.0, 9.0),
+            Parameter("damping", "N s/m", "", "log_bounded", 1e-3, 1.0),
+            Parameter("offset", "m", "", "identity"),
+        )
+    )
+    tt = jnp.asarray([0.1, -0.4, 0.3, 0.2])
+    first, _ = table.slopes(tt)
+    theta = table.constrain(tt)
+    step = jnp.where(first > 0.0, dz * theta / first, 0.0).at[3].set(dz)
+    new = table.constrain(table.moved(tt, step))
+    np.testing.assert_allclose(new[:3] / theta[:3], np.exp(dz), rtol=1e-10)
+    assert float(new[3]) == pytest.approx(0.2 + dz)
+
+
+def test_a_step_begins_as_it_is_asked_for_and_stays_in_the_bounds():
+    table = Parameters(
+        (
+            Parameter("mass", "kg", "", "bounded", 0.5, 2.0),
+            Parameter("damping", "N s/m", "", "log_bounded", 1e-3, 1.0),
+            Parameter("any", "1", "", "bounded", -1.0, 1.0),
+            Parameter("level", "1", "", "log", 0.0),
+        )
+    )
+    tt = jnp.asarray([0.5, -1.0, 0.2, 0.7])
+    step = jnp.asarray([0.3, -0.2, 0.1, 0.4])
+    slope = jax.jvp(lambda t: table.moved(tt, t * step), (0.0,), (1.0,))[1]
+    np.testing.assert_allclose(slope, step, rtol=1e-9)
+    for far in (-30.0, -3.0, 3.0, 30.0):
+        new = table.moved(tt, far * step)
+        theta = table.constrain(new)
+        assert np.isfinite(new).all()
+        assert (theta >= jnp.asarray([0.5, 1e-3, -1.0, 0.0])).all()

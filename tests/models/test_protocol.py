@@ -51,6 +51,7 @@ PLAIN = {
     "Residual": lambda: sg.Residual(sim(), **TINY),
     "FunctionSpace": lambda: sg.FunctionSpace(sim(), pretrain=0, **TINY),
     "ResidualFunctionSpace": lambda: sg.ResidualFunctionSpace(sim(), **TINY),
+    "MissingForces": lambda: sg.MissingForces(sim()),
 }
 MODELS = {
     **PLAIN,

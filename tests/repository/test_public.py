@@ -9,7 +9,8 @@ import sim2gp as sg
 
 NAMES = """
 AbstractBelief AbstractModel AbstractPlanner AbstractSystem Auto Box Channel
-FunctionSpace Gaussian ICEM InputError Limits Log MPC MPPI Machine NLM Parameter
+FunctionSpace Gaussian ICEM InputError Limits Log MPC MPPI Machine MissingForces NLM
+Parameter
 Parameters PointEstimate PriorMean Progress Residual ResidualFunctionSpace SAC Sim2GP
 Sim2GPError Task Transitions Windows World __version__ apply bounded compare cut demo
 design diagnose episode evaluate example explain export fit_windows identify init

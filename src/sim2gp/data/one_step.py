@@ -74,6 +74,13 @@ class OneStepLikelihood(AbstractLikelihood):
         r, J = self.rows(tt, scale)
         return jax.vmap(factor, in_axes=1)(J, r)[None]
 
+    def thinned(self, count: int) -> "OneStepLikelihood":
+        """That of so many of the transitions, evenly spread; of fewer, of each."""
+        N = jnp.sum(self.data.mask)
+        places = jnp.arange(count) * jnp.maximum(N, count) // count
+        some = jax.tree.map(lambda x: x[places], self.data)
+        return OneStepLikelihood(self.system, some, self.dt)
+
     def first_noise(self) -> Noise:
         """The states' own change in a step."""
         d = self.floor.size

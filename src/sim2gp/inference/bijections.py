@@ -21,6 +21,8 @@ from sim2gp.inference.linalg import library
 from sim2gp.types import AnyArray
 
 MAPS = ("bounded", "log_bounded", "softplus", "log", "identity")
+SMALL_RATE = 0.3  # of a logarithm in a step: larger ones are not along powers
+ROOM = 1e-3  # of a box, at its ends: there steps are straight
 _EDGE = 1e-13  # closest approach to a bound when a physical value is mapped back
 
 
@@ -76,6 +78,24 @@ def unconstrain(kind: str, theta: Array, low: Any, high: Any) -> Array:
         x = theta - low
         return x + jnp.log(-jnp.expm1(-x))
     return jnp.log(theta) if kind == "log" else theta
+
+
+def along_powers(
+    theta: AnyArray, change: AnyArray, low: np.ndarray, high: np.ndarray
+) -> tuple[AnyArray, AnyArray]:
+    """Positive values after a ``change`` to first order, and where they are inside.
+
+    The logarithm keeps its rate: what data know of a mechanism are products of powers
+    (a force over a mass), and such steps leave these as they are. A value that changes
+    much is small beside others that it is added to (a damping beside a back-EMF): it
+    keeps its own rate.
+    """
+    xp, positive = library(theta), low > 0.0
+    rate = change / xp.where(positive, theta, 1.0)
+    small = xp.abs(rate) < SMALL_RATE
+    new = theta * xp.where(small, xp.exp(xp.where(small, rate, 0.0)), 1.0 + rate)
+    room = ROOM * np.where(np.isfinite(high), high - low, 0.0)
+    return new, positive & (new > low + room) & (new < high - room)
 
 
 def scatter(parts: list[AnyArray], groups: list[Any], like: AnyArray) -> AnyArray:

@@ -9,6 +9,7 @@ MAP with the log evidence (`sim2gp.inference.laplace`).
 import dataclasses
 from collections.abc import Callable
 from functools import partial
+from typing import TypeGuard
 
 import equinox as eqx
 import jax
@@ -23,6 +24,8 @@ from sim2gp.inference.host_descent import SMALL, Progress, search
 from sim2gp.inference.laplace import Laplace, expected_noise, laplace, log_normaliser
 from sim2gp.inference.least_squares import posterior
 from sim2gp.inference.levenberg_marquardt import (
+    EXACT,
+    Ends,
     Point,
     evaluate,
     multi_start,
@@ -31,9 +34,12 @@ from sim2gp.inference.likelihood import AbstractLikelihood
 from sim2gp.inference.linalg import library
 from sim2gp.inference.parameters import Parameters
 from sim2gp.inference.prior import AbstractPrior, ParameterPrior
+from sim2gp.inference.relevance import linear_of, relevant
 from sim2gp.types import AnyArray, AnyScalar, Key, Scalar, in_float64
 
 SPREAD = 0.7  # prior sd, of starts that are drawn
+#: How a descent ends after which scales change: roughly, for the next begins elsewhere.
+SCALED = Ends(tolerance=1e-2, most=6, until=SMALL)
 
 
 #: Called with each step that a fit on the host keeps, and a function for its posterior.
@@ -140,11 +146,13 @@ def _estimate_on_host(
     of_numpy = jax.tree.map(np.asarray, of_numpy)
     counts, floor, freedom, (starts, e, noise), of_prior = of_numpy
 
-    def update(found: Laplace, noise: Noise) -> Noise:
-        return expected_noise(noise, *found.squares(), counts, floor, freedom)
+    def update(
+        found: Laplace, noise: Noise, prior: AbstractPrior
+    ) -> tuple[Noise, AbstractPrior]:
+        return _learned(found, noise, prior, counts, floor, freedom)
 
     def about(found: Progress) -> Estimate:
-        args = found.noise, of_prior.gaussian, counts, found.steps, found.away
+        args = found.noise, found.prior, counts, found.steps, found.away
         known: Estimate = jax.device_put(_about(found.found, *args))
         return known
 
@@ -157,7 +165,7 @@ def _estimate_on_host(
 def _about(
     found: Laplace,
     noise: Noise,
-    prior: Gaussian,
+    prior: AbstractPrior,
     counts: Float[AnyArray, "W c"],
     steps: int | Int[AnyArray, ""],
     away: float | Scalar = jnp.inf,
@@ -166,14 +174,17 @@ def _about(
 
     ``away`` is how far the MAP may be, in posterior sd, where the descent knows.
     """
+    xp, about = library(found.at.z), prior.gaussian
+    each = prior.each() if _is_scaled(prior) else xp.ones(about.mean.size)
+    evidence = found.log_joint() + log_normaliser(noise, counts)
     return Estimate(
-        prior,
-        posterior(found.full, found.at.z, prior),
+        Gaussian(about.mean, about.scale * each[None]),
+        posterior(found.full, found.at.z, about),
         noise,
         found.at.e,
-        found.arrow.data[:-1, :-1],
-        found.at.scores,
-        found.log_joint() + log_normaliser(noise, counts),
+        found.arrow.data[:-1, :-1] * each[None],
+        found.at.scores * each[None],
+        evidence - xp.sum(xp.log(each)),
         found.convergence(steps, away),
     )
 
@@ -192,11 +203,13 @@ def _estimate(
     """The whole fit as one program, of simulators that JAX can compile."""
     counts, floor = likelihood.counts, likelihood.floor
 
-    def update(at: Point, noise: Noise) -> Noise:
-        squares, spread = laplace(at, noise).squares()
-        return expected_noise(noise, squares, spread, counts, floor, freedom)
+    def update(
+        at: Point, noise: Noise, prior: AbstractPrior, damping: Scalar
+    ) -> tuple[Noise, AbstractPrior]:
+        found = laplace(at, noise)
+        return _learned(found, noise, prior, counts, floor, freedom, damping)
 
-    at, noise, steps, _ = multi_start(
+    at, noise, prior, steps, _ = multi_start(
         likelihood,
         prior,
         starts,
@@ -205,8 +218,32 @@ def _estimate(
         update,
         rounds=rounds,
         needed=needed,
+        ends=SCALED if _is_scaled(prior) else EXACT,
     )
-    return _about(laplace(at, noise), noise, prior.gaussian, counts, steps)
+    return _about(laplace(at, noise), noise, prior, counts, steps)
+
+
+def _learned(
+    found: Laplace,
+    noise: Noise,
+    prior: AbstractPrior,
+    counts: Float[AnyArray, "W c"],
+    floor: Float[AnyArray, " c"],
+    freedom: AnyScalar,
+    damping: AnyScalar = 0.0,
+) -> tuple[Noise, AbstractPrior]:
+    """Noise and scales of the prior, where the data are linearised."""
+    expected = expected_noise(noise, *found.squares(), counts, floor, freedom)
+    if not _is_scaled(prior):
+        return expected, prior
+    linear = linear_of(found, expected.weights, counts, floor)
+    noise = Noise(noise.sd, expected.weights)
+    return relevant(linear, found.at.z, noise, prior, damping)
+
+
+def _is_scaled(prior: AbstractPrior) -> TypeGuard[ParameterPrior]:
+    """Whether data choose scales of the prior."""
+    return isinstance(prior, ParameterPrior) and len(prior.scales) > 0
 
 
 @eqx.filter_jit

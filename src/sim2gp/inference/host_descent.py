@@ -42,8 +42,9 @@ NOTHING = 1e-2
 MOST_STEPS, FIRST_STEPS = 100, 30
 NOISE_TURNS, NEARLY = 10, 0.05  # of EM at one point; of the first, in a last one
 
-#: Noise that the residuals about a MAP are expected to have, given the noise until now.
-Update = Callable[[Laplace, Noise], Noise]
+#: Noise that the residuals about a MAP are expected to have, and the scales of the
+#: prior, given those until now.
+Update = Callable[[Laplace, Noise, AbstractPrior], tuple[Noise, AbstractPrior]]
 
 
 class Progress(NamedTuple):
@@ -55,6 +56,7 @@ class Progress(NamedTuple):
 
     found: Laplace
     noise: Noise
+    prior: AbstractPrior
     steps: int
     step_sd: float
     damping: float
@@ -85,9 +87,9 @@ def descend(
     """
     change = 0.0
     if update is not None:
-        here, noise, change = _rested(update, here, noise)
+        here, noise, prior, change = _rested(update, here, noise, prior)
     sd, refused = float(here.newton_step_sd()), 0
-    yield Progress(here, noise, 1, sd, damping, sd)
+    yield Progress(here, noise, prior, 1, sd, damping, sd)
     for count in range(2, (most or MOST_STEPS) + 1):
         cost = float(here.at.cost)
         if not np.isfinite(cost) or damping >= MOST_DAMPING:
@@ -107,12 +109,12 @@ def descend(
             here = _linearised(prior, z, e, trial, noise)
         if keep or vain:
             if update is not None:
-                here, noise, change = _rested(update, here, noise)
+                here, noise, prior, change = _rested(update, here, noise, prior)
             sd = float(here.newton_step_sd())
             # Of a noise that is another now, the step says nothing: the first is large.
             vain = vain and change <= STILL
             away = min(sd, size) if vain else sd
-            yield Progress(here, noise, count, sd, damping, away)
+            yield Progress(here, noise, prior, count, sd, damping, away)
         if vain or (sd <= until and change <= STILL):
             return
 
@@ -129,20 +131,21 @@ def begin_at(
 
 
 def _rested(
-    update: Update, here: Laplace, noise: Noise
-) -> tuple[Laplace, Noise, float]:
+    update: Update, here: Laplace, noise: Noise, prior: AbstractPrior
+) -> tuple[Laplace, Noise, AbstractPrior, float]:
     """The noise where it rests at a point, which asks nothing of the simulator."""
     first, at, enough = noise, here.at, 0.1 * STILL
     for turn in range(NOISE_TURNS):
-        noise, before = update(here, noise), noise
-        again = point(at.z, at.e, at.blocks, at.prior, noise)
+        before = noise
+        noise, prior = update(here, noise, prior)
+        again = point(at.z, at.e, at.blocks, prior.rows(at.z), noise)
         here = laplace(again, noise)
         moved = _change(noise, before)
         if turn == 0:  # it follows the next step as well
             enough = max(enough, NEARLY * moved)
         if moved <= enough:
             break
-    return here, noise, _change(noise, first)
+    return here, noise, prior, _change(noise, first)
 
 
 def _change(new: Noise, old: Noise) -> float:

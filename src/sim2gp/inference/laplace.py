@@ -61,15 +61,18 @@ class Laplace(eqx.Module):
 
     def squares(self) -> tuple[Float[AnyArray, "W c"], Float[AnyArray, "W c"]]:
         """Squared residuals, and squares that the posterior's own spread adds."""
+        xp, (reduced, spread) = library(self.full), self.reduced()
+        more = xp.sum((reduced[..., :-1] @ self.scale()) ** 2, axis=(2, 3))
+        return xp.sum(reduced[..., -1] ** 2, axis=2), more + spread
+
+    def reduced(self) -> tuple[Float[AnyArray, "W c k p1"], Float[AnyArray, "W c"]]:
+        """Rows ``[J_z r]`` with the nuisances at their best, and what these spread."""
         xp, n = library(self.full), self.at.e.shape[1]
         own, rest = self.at.blocks[..., :n], self.at.blocks[..., n:]
-        # Rows of (z, r) with the nuisances at their best.
-        reduced = rest - own @ self.arrow.slope[:, None]
         eye = xp.eye(n)
         root = each_window(lambda R11: solve_triangular(R11, eye), self.arrow.R11)
-        spread = xp.sum((reduced[..., :-1] @ self.scale()) ** 2, axis=(2, 3))
-        spread = spread + xp.sum((own @ root[:, None]) ** 2, axis=(2, 3))
-        return xp.sum(reduced[..., -1] ** 2, axis=2), spread
+        spread = xp.sum((own @ root[:, None]) ** 2, axis=(2, 3))
+        return rest - own @ self.arrow.slope[:, None], spread
 
     def newton_step_sd(self) -> AnyScalar:
         """The largest entry of the undamped step, each in its own posterior sd."""

@@ -15,11 +15,12 @@ one loop that descends.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from sim2gp.inference.arrowhead import Blocks, Noise, eliminate
@@ -42,6 +43,8 @@ FIRST_DAMPING = 1.0  # the prior's own precision: trust one prior standard devia
 AGAIN_DAMPING = 1e-2  # of a descent that follows another
 LEAST_DAMPING = 1e-5  # below this the step is undamped
 MOST_DAMPING = 1e14
+STALE = 1e-2  # posterior sd, of what the linear parameters move without derivatives
+T = TypeVar("T")
 
 
 class Point(eqx.Module):
@@ -67,11 +70,31 @@ class Point(eqx.Module):
         return largest / (1.0 + self.cost)
 
 
+#: Noise and prior at a point, given those until now and the damping of the last step.
+Update = Callable[[Point, Noise, AbstractPrior, Scalar], tuple[Noise, AbstractPrior]]
+
+
+class Ends(NamedTuple):
+    """Where descents end: at a step that improves the cost by less, relative.
+
+    Between two updates after at most so many steps; and the last, which goes on to a
+    zero gradient, where Newton's step is shorter than ``until`` posterior sd.
+    """
+
+    tolerance: float = 1e-4
+    most: int = MAX_STEPS
+    until: float = 0.0
+
+
+EXACT = Ends()
+
+
 class Descent(NamedTuple):
-    """Where descents ended: the best point, the noise there, and the cost of each."""
+    """Where descents ended: the best point, noise and prior, and the cost of each."""
 
     at: Point
     noise: Noise
+    prior: AbstractPrior
     steps: Int[Array, ""]
     costs: Float[Array, " starts"]
 
@@ -82,56 +105,67 @@ def multi_start(
     starts: Float[Array, "starts p"],
     e: Float[Array, "W n"],
     noise: Noise,
-    update: Callable[[Point, Noise], Noise],
+    update: Update,
     *,
     rounds: int,
     needed: Int[Array, ""] | None = None,
-    tolerance: float = 1e-4,
+    ends: Ends = EXACT,
 ) -> Descent:
-    """The best of several descents; then ``rounds`` of noise update and descent.
+    """The best of several descents; then ``rounds`` of ``update`` and descent.
 
-    A descent ends where a step improves the cost by less than ``tolerance`` relative;
-    one more turn, the last, goes on to a zero gradient. Every descent is a turn of the
-    same scan, so that the likelihood is compiled once; a start that is no number, and
-    rounds beyond those ``needed``, are compiled and not taken.
+    An update is that of the noise, and of what else data choose: a prior's scales. One
+    more turn, the last, goes on to a zero gradient. Every descent is a turn of the same
+    scan, so that the likelihood is compiled once; a start that is no number, and rounds
+    beyond those ``needed``, are compiled and not taken.
     """
-    p, W = starts.shape[1], len(e)
-    first = prior.gaussian.at(starts[0])
-    blank = jax.eval_shape(likelihood.blocks, first, e, prior.gaussian.scale)
-    infinite = jnp.asarray(jnp.inf, starts.dtype)
-    # No number: where nothing finite is ever found, nothing must look like a fit.
-    unknown = jnp.full(blank.shape, jnp.nan, blank.dtype)
-    zero, rows = jnp.zeros(p), jax.eval_shape(prior.rows, starts[0])
-    rows = jnp.full(rows.shape, jnp.nan, rows.dtype)
-    none = jnp.zeros_like(e), jnp.zeros((W, p))
-    nowhere = Point(zero, e, unknown, rows, infinite, zero, *none)
+    nowhere = _nowhere(likelihood, prior, starts[0], e)
     count = len(starts)
     turns = jnp.arange(count + rounds + 1)
-    schedule = jnp.concatenate([starts, jnp.zeros((rounds + 1, p))])
+    schedule = jnp.concatenate([starts, jnp.zeros((rounds + 1, starts.shape[1]))])
 
     def turn(carry: tuple, x: tuple[Array, ...]) -> tuple[tuple, Array]:
-        best, noise, steps = carry
+        best, noise, prior, damping, steps = carry
         start, index = x
         searching, last = index < count, index == count + rounds
         taken = count + (rounds if needed is None else needed)
         idle = jnp.where(searching, jnp.isnan(start).any(), ~last & (index >= taken))
         # The last turn only finishes the one before it.
-        settled = update(best, noise)
         stay = searching | last | idle
-        noise = jax.tree.map(lambda new, old: jnp.where(stay, old, new), settled, noise)
-        again = point(best.z, best.e, best.blocks, best.prior, noise)
+        updated = update(best, noise, prior, damping)
+        noise, prior = _select(stay, (noise, prior), updated)
+        again = point(best.z, best.e, best.blocks, prior.rows(best.z), noise)
+        again = relaxed(prior, again, noise)
         here = _select(searching, nowhere, again)
         kind = searching, last, idle
         terms = likelihood, prior
-        found, more = _descend(terms, here, (start, e), kind, noise, tolerance)
+        found, last_damping, more = _descend(terms, here, (start, e), kind, noise, ends)
         # A cost that is not finite never wins; a comparison with NaN is false.
         better = jnp.where(searching, found.cost < best.cost, True)
         best = _select(better, found, best)
-        return (best, noise, jnp.where(last, more, steps + more)), found.cost
+        damping = jnp.where(better & ~idle, last_damping, damping)
+        steps = jnp.where(last, more, steps + more)
+        return (best, noise, prior, damping, steps), found.cost
 
-    carry = (nowhere, noise, jnp.zeros((), int))
-    (best, noise, steps), costs = jax.lax.scan(turn, carry, (schedule, turns))
-    return Descent(best, noise, steps, costs[:count])
+    known = noise, jax.tree.map(jnp.asarray, prior), jnp.zeros(())
+    carry = (nowhere, *known, jnp.zeros((), int))
+    carry, costs = jax.lax.scan(turn, carry, (schedule, turns))
+    best, noise, prior, _, steps = carry
+    return Descent(best, noise, prior, steps, costs[:count])
+
+
+def _nowhere(
+    likelihood: AbstractLikelihood,
+    prior: AbstractPrior,
+    z: Float[Array, " p"],
+    e: Float[Array, "W n"],
+) -> Point:
+    """No number: where nothing finite is ever found, nothing must look like a fit."""
+    args = prior.gaussian.at(z), e, prior.gaussian.scale
+    blocks = jax.eval_shape(likelihood.blocks, *args)
+    rows, zero = jax.eval_shape(prior.rows, z), jnp.zeros_like(z)
+    blocks, rows = (jnp.full(x.shape, jnp.nan, x.dtype) for x in (blocks, rows))
+    cost, scores = jnp.asarray(jnp.inf, z.dtype), jnp.zeros((len(e), z.size))
+    return Point(zero, e, blocks, rows, cost, zero, jnp.zeros_like(e), scores)
 
 
 def _descend(
@@ -140,49 +174,66 @@ def _descend(
     start: tuple[Float[Array, " p"], Float[Array, "W n"]],
     kind: tuple[Bool[Array, ""], ...],
     noise: Noise,
-    tolerance: float,
-) -> tuple[Point, Int[Array, ""]]:
+    ends: Ends,
+) -> tuple[Point, Scalar, Int[Array, ""]]:
     """Levenberg-Marquardt from ``start`` where that is fresh, else from ``here``.
 
-    A turn's ``kind``: fresh, to a zero gradient, none at all. The damping follows the
-    ratio of the actual to the predicted reduction of the cost (Nielsen 1999).
+    Its damping at the end comes back, and its steps. A turn's ``kind``: fresh, to a
+    zero gradient, none at all. The damping follows the ratio of the actual to the
+    predicted reduction of the cost (Nielsen 1999).
     """
 
     fresh, exact, idle = kind
 
     def improve(carry: tuple) -> tuple:
-        here, damping, count, _ = carry
-        dz, de, predicted_reduction = step(terms[1], here, noise, damping)
+        here, damping, count, _, stale, again = carry
+        dz, de, predicted = step(terms[1], here, noise, damping)
         first = fresh & (count == 0)
-        z = jnp.where(first, start[0], here.z + dz)
-        e = jnp.where(first, start[1], here.e + de)
-        there = evaluate(*terms, z, e, noise)
-        keep, next_damping = judged(here, there, predicted_reduction, damping)
+        z = jnp.where(again, here.z, terms[1].moved(here.z, dz))
+        z, e = jnp.where(first, start[0], z), jnp.where(again, here.e, here.e + de)
+        found = evaluate(*terms, z, jnp.where(first, start[1], e), noise)
+        there = relaxed(terms[1], found, noise)
+        keep, next_damping = judged(here, there, predicted, damping)
         gain = here.cost - there.cost
-        settled = keep & (gain <= tolerance * (1.0 + there.cost))
+        settled = keep & (gain <= ends.tolerance * (1.0 + there.cost))
         # Differences of a simulator on the host hide what such a step would gain.
         flat, short = JOINT_TOLERANCE
-        vain = predicted_reduction <= 0.5 * short**2
-        vain = ~keep & (damping < LEAST_DAMPING) & vain
-        settled = jnp.where(exact, vain & (here.gradient <= flat), settled)
-        # A start has nothing to be compared with.
-        damping = jnp.where(first, damping, next_damping)
-        return _select(keep, there, here), damping, count + 1, settled
+        undamped = damping < LEAST_DAMPING
+        vain = ~keep & undamped & (predicted <= 0.5 * short**2)
+        near = keep & undamped & (predicted < 0.5 * ends.until**2)
+        settled = jnp.where(exact, near | vain & (here.gradient <= flat), settled)
+        # A start has nothing to be compared with, nor has a place that is seen again.
+        damping = jnp.where(first | again, damping, next_damping)
+        keep = keep | again
+        stale = jnp.where(keep, _is_stale(found, there), stale)
+        here = _select(keep, there, here)
+        return here, damping, count + 1, settled & ~again, stale, stale & ~keep
 
     def unfinished(carry: tuple) -> Array:
-        here, damping, count, settled = carry
+        here, damping, count, settled, _, again = carry
         finite = jnp.isfinite(here.cost)
         small = finite & (here.gradient <= 0.1 * GRADIENT_TOLERANCE)
-        hopeless = ~finite | ~(damping < MOST_DAMPING) | (count > MAX_STEPS)
+        many = count > jnp.where(fresh | exact, MAX_STEPS, ends.most)
+        hopeless = ~finite | ~(damping < MOST_DAMPING) | many
         hopeless = (count > 0) & hopeless
         # Two steps at least: a gradient may be small next to a large cost.
         done = settled | jnp.where(exact, small & (count >= 2), small)
-        return ~done & ~hopeless & ~idle
+        return ~(done & ~again) & ~hopeless & ~idle
 
     damping = jnp.where(exact, 0.0, jnp.where(fresh, FIRST_DAMPING, AGAIN_DAMPING))
-    carry = (here, damping, jnp.zeros((), int), jnp.zeros((), bool))
-    here, _, count, _ = jax.lax.while_loop(unfinished, improve, carry)
-    return here, count
+    stale = ~fresh & bool(terms[1].linear)  # another prior has moved what is linear
+    no = jnp.zeros((), bool)
+    carry = (here, damping, jnp.zeros((), int), no, stale, no)
+    here, damping, count, *_ = jax.lax.while_loop(unfinished, improve, carry)
+    return here, damping, count
+
+
+def _is_stale(found: Point, there: Point) -> Bool[Array, ""]:
+    """Whether derivatives at one point are no longer those where linear ones moved to.
+
+    They are taken again where a step along them is refused.
+    """
+    return found.cost - there.cost > 0.5 * STALE**2
 
 
 def judged(
@@ -216,7 +267,9 @@ def step(
     xp = library(here.z)
     damping = xp.where(damping < LEAST_DAMPING, 0.0, damping)
     arrow = eliminate(here.blocks, here.e, noise, damping)
-    damped = xp.sqrt(damping) * xp.eye(here.z.size, here.z.size + 1)
+    # What the model is linear in needs no damping, and follows the others.
+    curved = np.delete(np.arange(here.z.size), np.asarray(prior.linear, int))
+    damped = xp.sqrt(damping) * xp.eye(here.z.size, here.z.size + 1)[curved]
     full = stack(arrow.data, here.prior, damped)
     # Whitened by R, the maps' curvature is a change of the identity. Only where it is
     # positive: it may shorten the QR's step; longer ones were measured to go astray.
@@ -261,6 +314,27 @@ def point(
     return Point(z, e, blocks, rows, cost, by_z, g[:, :n] + e, g[:, n:])
 
 
-def _select(yes: Bool[Array, ""], new: Point, old: Point) -> Point:
-    chosen: Point = jax.tree.map(lambda a, b: jnp.where(yes, a, b), new, old)
+def relaxed(prior: AbstractPrior, here: Point, noise: Noise) -> Point:
+    """The same with the parameters that the model is linear in at their best.
+
+    Variable projection (Golub and Pereyra 1973; Kaufman 1975): a valley that is curved
+    only because these follow the others is none then. It asks for no linearisation; the
+    derivatives by the others are those of the point before.
+    """
+    if not prior.linear:
+        return here
+    xp, w = library(here.z), np.asarray(prior.linear)
+    white, own = noise.scale(here.blocks), here.e.shape[1] + w
+    data = white[..., np.append(own, -1)].reshape(-1, len(w) + 1)
+    full = stack(data, here.prior[:, np.append(w, -1)])
+    dw = -solve_triangular(full[:-1, :-1], full[:-1, -1])
+    dz = xp.zeros(here.z.size).at[w].set(dw)
+    r = here.blocks[..., -1] + here.blocks[..., own] @ dw
+    blocks = here.blocks.at[..., -1].set(r)
+    rows = here.prior.at[:, -1].add(here.prior[:, w] @ dw)
+    return point(here.z + dz, here.e, blocks, rows, noise)
+
+
+def _select(yes: Bool[Array, ""], new: T, old: T) -> T:
+    chosen: T = jax.tree.map(lambda a, b: jnp.where(yes, a, b), new, old)
     return chosen

@@ -36,7 +36,8 @@ class Parameter:
     """One parameter: its name, unit, meaning, map, bounds, and virtual prior.
 
     ``mean`` and ``sd`` describe the virtual value; ``nominal`` is the published
-    physical value, where there is one.
+    physical value, where there is one. Those of one ``group`` are weights of one
+    function, whose prior sd the data scale (`sim2gp.inference.relevance`).
 
     Raises `InputError` E141 for an unknown map and for bounds that the map cannot have,
     E144 for a prior's mean or sd that cannot be, E148 for a nominal value that is not
@@ -52,6 +53,7 @@ class Parameter:
     mean: float = 0.0
     sd: float = BOX_SD
     nominal: float | None = None
+    group: str = ""
 
     def __post_init__(self) -> None:
         if self.map not in bijections.MAPS:
@@ -229,6 +231,18 @@ class Parameters(eqx.Module):
         """Units of the free parameters."""
         return tuple(p.unit for p in self.free)
 
+    @property
+    def groups(self) -> dict[str, np.ndarray]:
+        """Places of the parameters of each group."""
+        names = dict.fromkeys(p.group for p in self.free if p.group)
+        each = np.asarray([p.group for p in self.free])
+        return {name: np.flatnonzero(each == name) for name in names}
+
+    def ungrouped(self) -> "Parameters":
+        """The table without the weights of functions."""
+        free = tuple(p for p in self.free if not p.group)
+        return dataclasses.replace(self, free=free)
+
     def __getitem__(self, name: str) -> Parameter:
         return self.free[self.names.index(name)]
 
@@ -255,6 +269,21 @@ class Parameters(eqx.Module):
         first, second = ([x[k] for x in both] for k in (0, 1))
         place = bijections.scatter
         return place(first, groups, tt), place(second, groups, tt)
+
+    def moved(
+        self, tt: Float[AnyArray, " p"], step: Float[AnyArray, " p"]
+    ) -> Float[AnyArray, " p"]:
+        """The virtual values after a step that begins as ``step``.
+
+        Positive parameters step along products of powers (`bijections.along_powers`),
+        as long as they stay in their bounds; other steps are straight.
+        """
+        xp, theta, (first, _) = library(tt), self.constrain(tt), self.slopes(tt)
+        low = np.asarray([p.low for p in self.free])
+        high = np.asarray([p.high for p in self.free])
+        new, inside = bijections.along_powers(theta, first * step, low, high)
+        curved = self.unconstrain(xp.where(inside, new, theta))
+        return xp.where(inside, curved, tt + step)
 
     def curvature(
         self,

@@ -35,6 +35,15 @@ class AbstractPrior(eqx.Module):
 
     gaussian: AbstractVar[Gaussian]
 
+    @property
+    @abstractmethod
+    def linear(self) -> tuple[int, ...]:
+        """Places of the parameters that the model is linear in, as far as is known."""
+
+    @abstractmethod
+    def moved(self, z: Float[AnyArray, " p"], dz: Float[AnyArray, " p"]) -> AnyArray:
+        """Where a step leads that begins as ``dz``: along a curve that suits them."""
+
     @abstractmethod
     def rows(self, z: Float[AnyArray, " p"]) -> Float[AnyArray, "q p1"]:
         """Rows ``[K r]`` whose squares are the prior: ``[I z]``, and others."""
@@ -51,19 +60,66 @@ class AbstractPrior(eqx.Module):
 
 
 class ParameterPrior(AbstractPrior):
-    """The prior of a table of parameters, with what was measured of their sums."""
+    """The prior of a table of parameters, with what was measured of their sums.
+
+    ``scales`` multiply the sd of each group of parameters: the data choose them
+    (`sim2gp.inference.relevance`). The whitening stays that of ``gaussian``.
+    """
 
     gaussian: Gaussian
     table: Parameters
+    scales: Float[AnyArray, " g"]
+
+    def __init__(
+        self,
+        gaussian: Gaussian,
+        table: Parameters,
+        scales: Float[AnyArray, " g"] | None = None,
+    ) -> None:
+        self.gaussian, self.table = gaussian, table
+        self.scales = np.ones(len(table.groups)) if scales is None else scales
 
     def rows(self, z: Float[AnyArray, " p"]) -> Float[AnyArray, "q p1"]:
+        xp, rows = library(z), prior_rows(z)
+        if self.table.groups:
+            rows = rows / self.each()[:, None]
         if not self.table.measurements:
-            return prior_rows(z)
-        xp = library(z)
+            return rows
         # Of NumPy's, compiled: a fit of the host asks again and again.
         f = eqx.filter_jit(_measured) if xp is np else _measured
         measured = xp.asarray(f(self.table, self.gaussian, z))
-        return xp.concatenate([prior_rows(z), measured])
+        return xp.concatenate([rows, measured])
+
+    @property
+    def linear(self) -> tuple[int, ...]:
+        return tuple(np.flatnonzero(self.members.sum(axis=0)).tolist())
+
+    def moved(self, z: Float[AnyArray, " p"], dz: Float[AnyArray, " p"]) -> AnyArray:
+        about = self.gaussian
+        tt = self.table.moved(about.at(z), about.scale @ dz)
+        return library(z).linalg.solve(about.scale, tt - about.mean)
+
+    @property
+    def members(self) -> Float[np.ndarray, "g p"]:
+        """1 where a parameter is in a group."""
+        out = np.zeros((len(self.table.groups), len(self.table)))
+        for row, places in zip(out, self.table.groups.values(), strict=True):
+            row[places] = 1.0
+        return out
+
+    def each(self, scales: Float[AnyArray, " g"] | None = None) -> AnyArray:
+        """The scale of each parameter: 1 outside groups."""
+        members, scales = self.members, self.scales if scales is None else scales
+        return scales @ members + (1.0 - members.sum(axis=0))
+
+    def as_gaussian(self) -> Gaussian:
+        """The Gaussian with its scales, without measured sums."""
+        about, each = self.gaussian, library(self.scales).asarray(self.each())
+        return Gaussian(about.mean, about.scale * each[None])
+
+    def scaled(self, scales: Float[AnyArray, " g"]) -> "ParameterPrior":
+        """The same with other scales."""
+        return ParameterPrior(self.gaussian, self.table, scales)
 
     def curvature(
         self, z: Float[AnyArray, " p"], gradient: Float[AnyArray, " p"]

@@ -4,6 +4,7 @@ from sim2gp.models.auto import Auto as Auto
 from sim2gp.models.auto import AutoBelief as AutoBelief
 from sim2gp.models.function_space import FunctionSpace as FunctionSpace
 from sim2gp.models.hybrid import HybridBelief as HybridBelief
+from sim2gp.models.missing_forces import MissingForces as MissingForces
 from sim2gp.models.nlm import NLM as NLM
 from sim2gp.models.nlm import NLMBelief as NLMBelief
 from sim2gp.models.point_estimate import PointEstimate as PointEstimate

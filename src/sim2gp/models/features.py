@@ -36,6 +36,7 @@ class Encoding(eqx.Module):
     angle: tuple[bool, ...] = eqx.field(static=True)
     low: tuple[float, ...] = eqx.field(static=True)
     high: tuple[float, ...] = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)
     outputs: int = eqx.field(static=True)  # physical states
     history: int = eqx.field(static=True)  # past actions among the inputs
 
@@ -57,9 +58,10 @@ class Encoding(eqx.Module):
             given = channel.name in reach or not limited
             low.append(-half if given else channel.low)
             high.append(half if given else channel.high)
-        angles = tuple(channel.angle for channel in channels)
+        angles, names = ([getattr(c, x) for c in channels] for x in ("angle", "name"))
         outputs = len(system.physical_states)
-        return cls(angles, tuple(low), tuple(high), outputs, system.history)
+        box = tuple(low), tuple(high), tuple(names)
+        return cls(tuple(angles), *box, outputs, system.history)
 
     @property
     def size(self) -> int:
@@ -75,6 +77,11 @@ class Encoding(eqx.Module):
                 middle = 0.5 * (self.low[i] + self.high[i])
                 parts.append((x - middle) / (0.5 * (self.high[i] - self.low[i])))
         return jnp.stack(parts)
+
+    def box(self) -> dict[str, tuple[float, float]]:
+        """Each channel's range, by name."""
+        pairs = zip(self.low, self.high, strict=True)
+        return dict(zip(self.names, pairs, strict=True))
 
     def half_widths(self) -> Float[Array, " d"]:
         """Half the box of each physical state."""

@@ -12,6 +12,7 @@ linearised model's own Hessian is the Gauss-Newton one, which is also always pos
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sim2gp import checks
@@ -80,8 +81,12 @@ class Sim2GPBelief(AbstractBelief):
 
     @in_float64
     def parameters(self) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
-        """Virtual mean and sd; push them through the table for physical units."""
-        return self.posterior.mean, self.posterior.sd()
+        """Virtual mean and sd; push them through the table for physical units.
+
+        Weights of functions that may be missing (parameters in groups) are left out.
+        """
+        own = np.flatnonzero([not p.group for p in self.system.parameters.free])
+        return self.posterior.mean[own], self.posterior.sd()[own]
 
 
 class Sim2GP(AbstractModel):
@@ -152,14 +157,14 @@ class Sim2GP(AbstractModel):
         assert isinstance(belief, Sim2GPBelief)
         rows = jax.tree.map(jnp.asarray, data)
         if self.frozen:
-            return _belief(self, _noise_alone(self, rows), rows)
+            return belief_of(self, _noise_alone(self, rows), rows)
         away = belief.posterior.mean - self.prior.mean
         warm = jnp.linalg.solve(self.prior.scale, away)
         first = jnp.stack([warm, jnp.zeros_like(warm)])
         found = _fit(self, rows, drawn_starts(first, STARTS, key))
         names = self.system.parameters.names
         found.convergence.check(names, f"{data.count} transitions")
-        return _belief(self, found, rows)
+        return belief_of(self, found, rows)
 
     def update(
         self, belief: AbstractBelief, s: State, a: Action, s2: State
@@ -205,7 +210,7 @@ def _noise_alone(model: Sim2GP, data: Transitions) -> Estimate:
     return estimate_noise(likelihood, prior)
 
 
-def _belief(model: Sim2GP, found: Estimate, data: Transitions) -> Sim2GPBelief:
+def belief_of(model: Sim2GP, found: Estimate, data: Transitions) -> Sim2GPBelief:
     return Sim2GPBelief(
         model.system,
         found.prior,

@@ -186,6 +186,7 @@ def each_episode(sink: Sink, name: str = "") -> Callable[[Any], None]:
         found["failed_plans"] = float(flown.failed.sum())
         table = getattr(getattr(belief, "system", None), "parameters", ())
         if table:
+            table = table.ungrouped()
             at = in_float64(lambda: table.constrain(belief.parameters()[0]))()
             names = (f"constants/{name}" for name in table.names)
             found |= dict(zip(names, at.tolist(), strict=True))

@@ -19,7 +19,6 @@ from sim2gp.systems.base import (
     rk4,
 )
 from sim2gp.systems.effects.base import AbstractEffect
-from sim2gp.systems.effects.forces import BaseTilt, BaseTiltSide, Payload, RailTilt
 from sim2gp.systems.effects.friction import (
     Coulomb,
     Drag,
@@ -29,6 +28,7 @@ from sim2gp.systems.effects.friction import (
 )
 from sim2gp.systems.effects.geometry import PoleGeometry, RodInertia
 from sim2gp.systems.effects.inputs import DeadZone
+from sim2gp.systems.effects.loads import BaseTilt, BaseTiltSide, Payload, RailTilt
 from sim2gp.systems.effects.registry import Candidate, candidates
 from sim2gp.systems.effects.springs import Spring
 from sim2gp.systems.effects.strengths import STRENGTHS, catalogue, effect

@@ -38,10 +38,10 @@ def with_parts(
     machine, given = as_machine(system), dict(parameters or {})
     table, places = machine.parameters, {part.place for part in parts}
     for part in (p for p in parts if p.name == p.place):
-        value = given.get(part.name, part.magnitude)
-        if part.name not in names_of(table):
-            table = table.merge(Parameters((), ((part.name, part.magnitude),)))
-        table = table.replace(**{part.name: value})
+        new = {k: v for k, v in part.values.items() if k not in names_of(table)}
+        table = table.merge(Parameters((), tuple(new.items())))
+        own = {name: given.get(name, value) for name, value in part.values.items()}
+        table = table.replace(**own)
     every = [*(p for p in machine.parts if p.place not in places), *parts]
     return Machine(
         machine.plant,
@@ -62,7 +62,7 @@ def free_parts(
 ) -> AbstractSystem:
     """The machine with these parts as well, each with its own prior."""
     plant = plant_of(system)
-    priors = {part.name: part.parameter(plant) for part in parts}
+    priors = {p.name: p for part in parts for p in part.priors(plant)}
     return with_parts(system, parts, priors, period=period)
 
 

@@ -17,10 +17,14 @@ from jaxtyping import Array, Float
 from sim2gp.inference.linearized import value_and_jacobian
 from sim2gp.systems.base import AbstractPlant, AbstractSystem
 from sim2gp.systems.effects.base import AbstractJointEffect
+from sim2gp.systems.effects.forces import ForceField
 from sim2gp.systems.effects.kicks import kick
 from sim2gp.systems.machine import Machine, plant_of
 from sim2gp.systems.plants.external import AbstractSimulator
 from sim2gp.types import AnyArray
+
+#: What acts on joints: one effect, or all missing forces.
+Forcing = AbstractJointEffect | ForceField
 
 
 def simulator_of(system: AbstractSystem) -> AbstractSimulator | None:
@@ -33,8 +37,8 @@ def simulator_of(system: AbstractSystem) -> AbstractSimulator | None:
     engine = getattr(plant, "engine", None)
     if not isinstance(engine, AbstractSimulator) or getattr(plant, "mjx", None):
         return None
-    effects = system.joint_effects if isinstance(system, Machine) else ()
-    return WithForces(engine, plant, effects) if effects else engine
+    forcing = system.forcing if isinstance(system, Machine) else ()
+    return WithForces(engine, plant, forcing) if forcing else engine
 
 
 class OnHost(NamedTuple):
@@ -102,12 +106,12 @@ class WithForces(AbstractSimulator):
         self,
         engine: AbstractSimulator,
         plant: AbstractPlant,
-        effects: tuple[AbstractJointEffect, ...],
+        forcing: tuple[tuple[Forcing, tuple[str, ...]], ...],
     ) -> None:
         self.engine, self.differences = engine, engine.differences
-        self.names = (*engine.names, *(effect.name for effect in effects))
-        self._kicks = _Kicks(plant, effects), _Kicks(plant, effects[::-1])
-        self._count = len(effects)
+        self.names = (*engine.names, *(name for _, names in forcing for name in names))
+        self._kicks = tuple(_Kicks(plant, forcing, back) for back in (False, True))
+        self._count = len(self.names) - len(engine.names)
 
     def flow(
         self,
@@ -119,7 +123,7 @@ class WithForces(AbstractSimulator):
         of_plant, size = np.split(theta, [-self._count], axis=1)
         before, after = self._kicks
         s = before(size, s, 0.5 * h)
-        return after(size[:, ::-1], self.engine.flow(of_plant, s, a, h), 0.5 * h)
+        return after(size, self.engine.flow(of_plant, s, a, h), 0.5 * h)
 
     def slopes(
         self,
@@ -133,20 +137,21 @@ class WithForces(AbstractSimulator):
         before, after = self._kicks
         s, first = before.slopes(size, s, 0.5 * h)
         s, middle = self.engine.slopes(of_plant, s, a, h)
-        s, last = after.slopes(size[:, ::-1], s, 0.5 * h)
+        s, last = after.slopes(size, s, 0.5 * h)
         by_plant, by_s, by_a = np.split(middle, [p, p + n], axis=2)
         by_size = by_s @ first[..., :-n]
         whole = np.concatenate([by_plant, by_size, by_s @ first[..., -n:], by_a], 2)
         whole = last[..., -n:] @ whole
-        whole[..., p : p + self._count] += last[..., self._count - 1 :: -1]
+        whole[..., p : p + self._count] += last[..., : self._count]
         return s, whole
 
 
 class _Kicks(eqx.Module):
-    """Kicks of a batch of states by effects in their order, one compiled program."""
+    """Kicks of a batch of states, in order or in reverse, as one compiled program."""
 
     plant: AbstractPlant
-    effects: tuple[AbstractJointEffect, ...]
+    forcing: tuple[tuple[Forcing, tuple[str, ...]], ...]
+    backwards: bool
 
     def __call__(
         self,
@@ -184,5 +189,10 @@ def _kicked_slopes(kicks: _Kicks, size: AnyArray, s: AnyArray, t: AnyArray) -> A
 
 
 def _kick(kicks: _Kicks, x: Float[Array, " en"], t: Array) -> Float[Array, " n"]:
-    size, s = jnp.split(x, [len(kicks.effects)])
-    return kick(kicks.plant, list(zip(kicks.effects, size, strict=True)), s, t)
+    ends = np.cumsum([len(names) for _, names in kicks.forcing])
+    *sizes, s = jnp.split(x, ends)
+    acting = [
+        (effect, size if isinstance(effect, ForceField) else size[0])
+        for (effect, _), size in zip(kicks.forcing, sizes, strict=True)
+    ]
+    return kick(kicks.plant, acting[::-1] if kicks.backwards else acting, s, t)

@@ -46,13 +46,16 @@ from sim2gp.systems.effects.base import (
     AbstractJointEffect,
     check_effect,
 )
+from sim2gp.systems.effects.forces import ForceField, MissingForce
 from sim2gp.systems.effects.kicks import kicked
 from sim2gp.systems.function_checks import names_of
-from sim2gp.systems.mechanism import AbstractMechanism, Effects
+from sim2gp.systems.mechanism import AbstractMechanism, Acting, Effects
 from sim2gp.systems.parts import AbstractPart
 from sim2gp.systems.sensors import EncoderOffset
 from sim2gp.systems.variants import AT, Variant, joint_table
 from sim2gp.types import Action, Scalar, State
+
+Names = tuple[str, ...]
 
 
 class MachineParams(eqx.Module):
@@ -123,9 +126,11 @@ class Machine(AbstractSystem):
         for part in self.parts:
             if names.count(part.place) > 1:
                 raise error("two_parts_of_one_name", got=part.place)
-        own = {p.name: p.magnitude for p in self.parts if p.name == p.place}
+        own: dict[str, float] = {}
         for part in self.parts:
-            if part.name not in own:
+            own |= part.values if part.name == part.place else {}
+        for part in self.parts:
+            if not own.keys() & part.values.keys():
                 raise error(
                     "constant_to_share_missing",
                     got=part.name,
@@ -204,7 +209,7 @@ class Machine(AbstractSystem):
         return math.ceil(longest / self.period - 1e-9)
 
     def record(self, values: Mapping[str, Scalar]) -> MachineParams:
-        parts = {part.name: values[part.name] for part in self.parts}
+        parts = {name: values[name] for part in self.parts for name in part.values}
         return MachineParams(self.plant.record(values), parts)
 
     def flow(
@@ -231,7 +236,7 @@ class Machine(AbstractSystem):
         """Names of the parameters that alter inputs."""
         effects = (e for e in self.effects if isinstance(e, AbstractInputEffect))
         parts = (*self._of(Gain), *self._of(Offset), *effects)
-        return tuple(dict.fromkeys(part.name for part in parts))
+        return tuple(dict.fromkeys(name for part in parts for name in part.values))
 
     def _through(self, params: MachineParams, a: Action) -> Action:
         """The input behind the actuators' gains, offsets and effects."""
@@ -242,7 +247,7 @@ class Machine(AbstractSystem):
         for effect in self.effects:
             if isinstance(effect, AbstractInputEffect):
                 i = index_of(effect.where, self.actions)
-                a = a.at[i].set(effect.through(params.parts[effect.name], a[i]))
+                a = a.at[i].set(effect.through(effect.own(params.parts), a[i]))
         return a
 
     def _offset(self, params: MachineParams) -> Float[Array, " n"]:
@@ -279,9 +284,21 @@ class Machine(AbstractSystem):
                 means = means.at[:, i].set(lagged_means(held[:, i], dt, lag, count))
         return means
 
+    @property
+    def forcing(self) -> tuple[tuple[AbstractJointEffect | ForceField, Names], ...]:
+        """What acts on the joints, each with the names of its parameters."""
+        forces = tuple(e for e in self.effects if isinstance(e, MissingForce))
+        field = ((ForceField(forces), ForceField(forces).names),) if forces else ()
+        return *((e, tuple(e.values)) for e in self.joint_effects), *field
+
     def acting(self, params: MachineParams) -> Effects:
-        """Effects on the joints, with their magnitudes."""
-        return [(effect, params.parts[effect.name]) for effect in self.joint_effects]
+        """The same with their magnitudes, or weights."""
+        found: list[Acting] = []
+        for effect, names in self.forcing:
+            each = [params.parts[name] for name in names]
+            many = isinstance(effect, ForceField)
+            found.append((effect, jnp.stack(each) if many else each[0]))
+        return found
 
     def _moved(
         self, params: MachineParams, s: State, a: Action, h: float | Scalar

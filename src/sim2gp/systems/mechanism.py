@@ -15,15 +15,17 @@ from jaxtyping import Array, Float
 
 from sim2gp.systems.base import AbstractODE, index_of, rk4
 from sim2gp.systems.function_checks import check_mechanism
-from sim2gp.types import Action, Scalar, State
+from sim2gp.types import Action, AnyArray, Scalar, State
 
 if TYPE_CHECKING:
     from sim2gp.systems.effects.base import AbstractJointEffect
+    from sim2gp.systems.effects.forces import ForceField
 
 Inertia = tuple[Scalar, Scalar, Scalar]
 Pair = Float[Array, " 2"]
-#: Effects and their magnitudes.
-Effects = Sequence[tuple["AbstractJointEffect", Scalar]]
+#: An effect and its magnitude, or all missing forces and their weights.
+Acting = tuple["AbstractJointEffect | ForceField", AnyArray]
+Effects = Sequence[Acting]
 
 
 class AbstractMechanism(AbstractODE):

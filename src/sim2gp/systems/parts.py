@@ -1,11 +1,12 @@
-"""A part of a machine: one scalar more than its plant has, with its name and prior.
+"""A part of a machine: parameters that its plant does not have, with their priors.
 
 Effects, sensors and actuators are parts. A machine holds them in tuples
-(`sim2gp.systems.machine`); the parameter of each is named ``<where>.<what>``, except
-for actuators that share that of another input.
+(`sim2gp.systems.machine`). Nearly all have one parameter, named ``<where>.<what>``,
+except for actuators that share that of another input.
 """
 
 import abc
+from collections.abc import Mapping
 
 import equinox as eqx
 from equinox import AbstractClassVar, AbstractVar
@@ -13,6 +14,7 @@ from equinox import AbstractClassVar, AbstractVar
 from sim2gp import checks
 from sim2gp.inference.parameters import Parameter
 from sim2gp.systems.base import AbstractPlant
+from sim2gp.types import AnyArray, Scalar
 
 
 class AbstractPart(eqx.Module):
@@ -44,6 +46,15 @@ class AbstractPart(eqx.Module):
         """Name of the parameter, which is that of the place unless it is shared."""
         return self.place
 
+    @property
+    def values(self) -> dict[str, float]:
+        """Its parameters by name, at the values that they have unless freed."""
+        return {self.name: self.magnitude}
+
+    def own(self, values: Mapping[str, Scalar]) -> AnyArray:
+        """What its functions take, out of all values: the magnitude."""
+        return values[self.name]
+
     @abc.abstractmethod
     def unit(self, plant: AbstractPlant) -> str:
         """Unit of the parameter; E103 or E145 where the plant cannot have the part."""
@@ -51,6 +62,10 @@ class AbstractPart(eqx.Module):
     @abc.abstractmethod
     def parameter(self, plant: AbstractPlant) -> Parameter:
         """The parameter with its prior, to free it."""
+
+    def priors(self, plant: AbstractPlant) -> tuple[Parameter, ...]:
+        """All of its parameters with their priors."""
+        return (self.parameter(plant),)
 
 
 def around_nothing(part: AbstractPart, plant: AbstractPlant, sd: float) -> Parameter:

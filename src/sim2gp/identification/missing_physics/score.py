@@ -37,7 +37,7 @@ from sim2gp.inference.prior import AbstractPrior
 from sim2gp.systems.assemble import free_parts
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.effects.registry import Candidate
-from sim2gp.types import in_float64
+from sim2gp.types import AnyArray, in_float64
 
 ROUNDS = 5  # EM for the noise, of a linearised fit
 ALIAS = 1e-5  # sine of the angle to the others' span; less cannot be separated
@@ -167,6 +167,13 @@ class _LinearPrior(AbstractPrior):
     gaussian: Gaussian
     measured: Float[Array, "q p1"]
     z0: Float[Array, " p"]
+
+    @property
+    def linear(self) -> tuple[int, ...]:
+        return ()
+
+    def moved(self, z: Float[AnyArray, " p"], dz: Float[AnyArray, " p"]) -> AnyArray:
+        return z + dz
 
     def rows(self, z: Float[Array, " p"]) -> Float[Array, "q p1"]:
         change = self.measured[:, :-1] @ (z - self.z0)

@@ -20,7 +20,7 @@ from sim2gp.systems.effects.units import law_unit
 from sim2gp.systems.function_checks import check_returns
 from sim2gp.systems.mechanism import AbstractMechanism, Inertia, Pair
 from sim2gp.systems.parts import AbstractPart, around_nothing
-from sim2gp.types import Action, Scalar, State
+from sim2gp.types import Action, AnyArray, Scalar, State
 
 SUBSTEP = 0.005  # s; a true machine with effects is integrated twice as finely
 
@@ -59,7 +59,7 @@ class AbstractForce(AbstractJointEffect):
     def inertia(
         self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair
     ) -> Inertia:
-        none = jnp.zeros_like(x)
+        none = jnp.zeros_like(q[0])
         return none, none, none
 
 
@@ -113,8 +113,11 @@ def check_effect(plant: AbstractPlant, effect: AbstractEffect) -> None:
 
     Raises `InputError` E145 for an effect that needs the equations of a plant without.
     """
+    found: list[tuple[str, Any, int]] = []
     if isinstance(effect, AbstractInputEffect):
-        found: list[tuple[str, Any, int]] = [("through", _through, 1)]
+        found = [("through", _through, 1)]
+    elif not isinstance(effect, AbstractJointEffect):
+        pass  # a missing force is ours
     elif isinstance(plant, AbstractMechanism):
         found = [("inertia", _inertia, 3), ("force", _force, 2)]
     elif isinstance(effect, AbstractJointForce):
@@ -136,16 +139,16 @@ def _through(
     a: Action,
 ) -> Float[Array, " 1"]:
     """`AbstractInputEffect.through` as an array of one, at a magnitude of one."""
-    return jnp.asarray(effect.through(jnp.ones((), s.dtype), a[0]))[None]
+    return jnp.asarray(effect.through(_ones(effect, s), a[0]))[None]
 
 
 def _along(
     plant: AbstractPlant, effect: AbstractJointForce, params: Any, s: State, a: Action
 ) -> Float[Array, " 2"]:
     """`AbstractJointForce.along` and `accelerated`, likewise."""
-    one = jnp.ones((), s.dtype)
-    along = effect.along(one, s[0], s[0])
-    return jnp.stack([along, effect.accelerated(one, s[0], s[0], one)])
+    x, one = _ones(effect, s), jnp.ones((), s.dtype)
+    along = effect.along(x, s[0], s[0])
+    return jnp.stack([along, effect.accelerated(x, s[0], s[0], one)])
 
 
 def _inertia(
@@ -156,8 +159,7 @@ def _inertia(
     a: Action,
 ) -> Any:
     """`AbstractJointEffect.inertia`, likewise."""
-    one = jnp.ones((), s.dtype)
-    return jnp.stack(effect.inertia(system, params, one, s[:2]))
+    return jnp.stack(effect.inertia(system, params, _ones(effect, s), s[:2]))
 
 
 def _force(
@@ -168,5 +170,9 @@ def _force(
     a: Action,
 ) -> Any:
     """`AbstractJointEffect.force`, likewise."""
-    one = jnp.ones((), s.dtype)
-    return effect.force(system, params, one, s[:2], s[2:4])
+    return effect.force(system, params, _ones(effect, s), s[:2], s[2:4])
+
+
+def _ones(effect: AbstractEffect, s: State) -> AnyArray:
+    """What an effect's functions take where its parameters are one."""
+    return effect.own({name: jnp.ones((), s.dtype) for name in effect.values})

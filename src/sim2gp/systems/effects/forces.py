@@ -1,136 +1,321 @@
-"""The tilt of a machine, and what it carries: tilts and payloads."""
+"""Forces that a simulator lacks, as Gaussian processes inside its equations of motion.
+
+Along a joint or through an input, each a function of one variable ``z`` with a prior
+around nothing:
+
+    f(z) = sum_k w_k phi_k(z),        w_k ~ N(0, tau^2 magnitude^2 S_k)
+
+On an interval these are the reduced-rank features of a squared-exponential kernel
+(Solin and Sarkka 2020, Statistics and Computing 30), zero at its ends and beyond:
+
+    phi_k(z) = sin(k pi (z + L) / 2L),
+    S_k      = sqrt(2 pi) l / L exp(-1/2 (l k pi / 2L)^2)
+
+The weights are parameters of the machine like all others, and enter it linearly. Those
+of one function are one group, whose scale ``tau`` the data choose
+(`sim2gp.inference.relevance`).
+"""
 
 import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from equinox import AbstractClassVar
+import numpy as np
+from equinox import AbstractVar
+from jaxtyping import Float
 
-from sim2gp.systems.base import AbstractPlant
-from sim2gp.systems.effects.base import SUBSTEP, AbstractForce, AbstractJointEffect
-from sim2gp.systems.effects.units import gravity_of, only_on
+from sim2gp import checks
+from sim2gp.inference.parameters import Parameter
+from sim2gp.systems.base import AbstractPlant, index_of
+from sim2gp.systems.effects.base import AbstractEffect, AbstractInputEffect
+from sim2gp.systems.effects.friction_laws import dead_zone
+from sim2gp.systems.effects.units import force_unit, velocity_of
 from sim2gp.systems.mechanism import AbstractMechanism, Inertia, Pair
-from sim2gp.systems.plants.cartpole import CartPole
-from sim2gp.systems.plants.furuta import Furuta
-from sim2gp.types import Scalar
+from sim2gp.types import AnyArray, Scalar, State
+
+#: Of the interval and of the kernel's length, in half-widths of where a machine moves.
+REACH, LENGTH = 2.5, 1.0
+COUNT = 6  # of features
+SOFT = 0.05  # of a dead zone's width: how soon it ends
 
 
-class RailTilt(AbstractForce):
-    """A rail that rises by ``magnitude`` radians towards positive ``x``.
+@dataclass(frozen=True)
+class Sines:
+    """``sin(k w (z - start))``, ``k = 1..count``, on ``span``; constant beyond it.
 
-    The pole's angle stays relative to the rail's normal; with ``b`` the tilt, the force
-    is ``-g sin(b) (m_c + m_p)`` along the rail and
-    ``m_p l g [(1 - cos b) sin(theta) - sin b cos(theta)]`` on the pole.
+    With ``cosines`` those too, after the sines. ``sds`` are those of the weights of a
+    function whose own sd is one.
     """
 
-    where: str = eqx.field(static=True, default="x")
-    magnitude: float = eqx.field(static=True, default=math.radians(1.0))
-    what: ClassVar[str] = "tilt"
-    meaning: ClassVar[str] = "tilt of the rail"
-    max_substep: ClassVar[float] = SUBSTEP
+    frequency: float
+    sds: tuple[float, ...]
+    start: float = 0.0
+    span: float = math.inf
+    cosines: bool = False
 
-    def unit(self, plant: AbstractPlant) -> str:
-        only_on(self.name, plant, {CartPole: "x"})
-        return "rad"
+    def value(self, x: Float[AnyArray, " k"], z: Scalar) -> Scalar:
+        """The function with weights ``x``."""
+        angle, _ = self._angle(z)
+        sine, cosine = jnp.sin(angle), jnp.cos(angle)
+        if not self.cosines:
+            return sine * _clenshaw(x, cosine)[0]
+        half = len(self.sds) // 2
+        first, second = _clenshaw(x[half:], cosine)
+        return sine * _clenshaw(x[:half], cosine)[0] + cosine * first - second
 
-    def force(
-        self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
-    ) -> Pair:
-        p, g = params, gravity_of(system)
-        up, lost = jnp.sin(x), 2.0 * jnp.sin(0.5 * x) ** 2
-        lever = lost * jnp.sin(q[1]) - up * jnp.cos(q[1])
-        return g * jnp.stack(
-            [
-                -up * (p.cart_mass + p.pole_mass),
-                p.pole_mass * p.pole_half_length * lever,
-            ]
+    def slope(self, x: Float[AnyArray, " k"], z: Scalar) -> Scalar:
+        """Its derivative."""
+        angle, rate = self._angle(z)
+        sine, cosine = jnp.sin(angle), jnp.cos(angle)
+        half = len(self.sds) // 2 if self.cosines else len(self.sds)
+        k = np.arange(1, half + 1)
+        first, second = _clenshaw(x[:half] * k.astype(x.dtype), cosine)
+        slope = cosine * first - second
+        if self.cosines:
+            slope = slope - sine * _clenshaw(x[half:] * k.astype(x.dtype), cosine)[0]
+        return rate * slope
+
+    def _angle(self, z: Scalar) -> tuple[Scalar, Scalar]:
+        """``w (z - start)``, and its derivative."""
+        w, end = jnp.asarray(self.frequency, z.dtype), self.start + self.span
+        if not math.isfinite(end):
+            return w * (z - self.start), w
+        inside = (z > self.start) & (z < end)
+        angle = w * (jnp.clip(z, self.start, end) - self.start)
+        return angle, jnp.where(inside, w, 0.0)
+
+
+def _clenshaw(x: Float[AnyArray, " k"], cosine: Scalar) -> tuple[Scalar, Scalar]:
+    """``b_1`` and ``b_2`` of Clenshaw's recurrence.
+
+    ``sum x_k sin(k a) = b_1 sin(a)`` and ``sum x_k cos(k a) = b_1 cos(a) - b_2``: one
+    sine and one cosine, and nothing that must be kept.
+    """
+    first, second = x[-1] + 0.0 * cosine, 0.0 * cosine
+    for k in range(len(x) - 2, -1, -1):
+        first, second = x[k] + 2.0 * cosine * first - second, first
+    return first, second
+
+
+def smooth(
+    low: float,
+    high: float,
+    *,
+    count: int = COUNT,
+    reach: float = REACH,
+    length: float = LENGTH,
+) -> Sines:
+    """Smooth functions where a machine moves, ``low`` to ``high``, and beyond.
+
+    There is room on both sides: functions fall to zero where the data end, not before.
+    ``reach`` and ``length`` (of the kernel) are in half-widths.
+    """
+    half = 0.5 * (high - low)
+    L, l = reach * half, length * half
+    w, top = 0.5 * math.pi / L, math.sqrt(2.0 * math.pi) * l / L
+    variances = [math.exp(-0.5 * (l * k * w) ** 2) for k in range(1, count + 1)]
+    sds = tuple(math.sqrt(top * v) for v in variances)
+    return Sines(w, sds, 0.5 * (low + high) - L, 2.0 * L)
+
+
+def periodic(count: int) -> Sines:
+    """Harmonics of an angle that may turn round."""
+    sds = tuple(1.0 / k for k in range(1, count + 1))
+    return Sines(1.0, sds + sds, cosines=True)
+
+
+@dataclass(frozen=True)
+class Sign:
+    """Dry friction: against a velocity, smoothed over ``width``."""
+
+    width: float
+    sds: ClassVar[tuple[float, ...]] = (1.0,)
+
+    def value(self, x: Float[AnyArray, " 1"], z: Scalar) -> Scalar:
+        """The force of the level ``x``."""
+        return -x[0] * jnp.tanh(z / self.width)
+
+    def slope(self, x: Float[AnyArray, " 1"], z: Scalar) -> Scalar:
+        """Its derivative."""
+        return x[0] * (jnp.tanh(z / self.width) ** 2 - 1.0) / self.width
+
+
+@dataclass(frozen=True)
+class DeadZones:
+    """What dead zones of these widths take away from an input, over their width."""
+
+    widths: tuple[float, ...]
+
+    @property
+    def sds(self) -> tuple[float, ...]:
+        return (1.0,) * len(self.widths)
+
+    def value(self, x: Float[AnyArray, " k"], z: Scalar) -> Scalar:
+        """What they change, each ``x`` times."""
+        found = jnp.zeros_like(z)
+        for k, w in enumerate(self.widths):
+            left = dead_zone(z, jnp.asarray(w, z.dtype), SOFT * w)
+            found = found + x[k] * (left - z) / w
+        return found
+
+
+Basis = Sines | Sign | DeadZones
+#: Functions, the states that they are of, and those that they push.
+Places = tuple[tuple[Basis, int, int], ...]
+
+
+class AbstractUnknownFunction(AbstractEffect):
+    """A function of one variable with a basis; its weights are one group.
+
+    ``magnitude`` is its prior sd, in its own unit.
+    """
+
+    basis: AbstractVar[Basis]
+    weights: AbstractVar[tuple[float, ...]]
+
+    def __check_init__(self) -> None:
+        size = len(self.basis.sds)
+        if self.weights:
+            checks.same_shape(type(self).__name__, (size,), weights=self.weights)
+
+    @property
+    def values(self) -> dict[str, float]:
+        weights = self.weights or (0.0,) * len(self.basis.sds)
+        return {f"{self.name}[{k}]": w for k, w in enumerate(weights, start=1)}
+
+    def own(self, values: Mapping[str, Scalar]) -> Float[AnyArray, " k"]:
+        return jnp.stack([values[name] for name in self.values])
+
+    def priors(self, plant: AbstractPlant) -> tuple[Parameter, ...]:
+        unit = self.unit(plant)
+        meaning = f"weight in the {self.meaning}"
+        return tuple(
+            Parameter(
+                name, unit, meaning, "identity", sd=self.magnitude * sd, group=self.name
+            )
+            for name, sd in zip(self.values, self.basis.sds, strict=True)
         )
 
 
-class AbstractBaseTilt(AbstractForce):
-    """A Furuta's base that is tilted by ``magnitude`` radians.
-
-    The side that the arm points to at ``towards`` radians rises; with ``b`` the tilt
-    and ``r`` the horizontal place of the pendulum's centre along that direction, the
-    potential gains ``m g [sin(b) r - (1 - cos(b)) z]``. The arm is balanced about its
-    axis, as ``Jr = Mr Lr^2 / 12`` says.
-    """
-
-    towards: AbstractClassVar[float]
-    max_substep: ClassVar[float] = SUBSTEP
-
-    def unit(self, plant: AbstractPlant) -> str:
-        only_on(self.name, plant, {Furuta: "theta"})
-        return "rad"
-
-    def force(
-        self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
-    ) -> Pair:
-        # Weight of a tilted machine's pendulum less that of an upright one's, N m.
-        p, turned = params, q[0] - self.towards
-        weight = p.pendulum_mass * gravity_of(system)
-        l = 0.5 * p.pendulum_length
-        sin, cos = jnp.sin(q[1]), jnp.cos(q[1])
-        up, lost = weight * jnp.sin(x), weight * 2.0 * jnp.sin(0.5 * x) ** 2
-        arm = p.arm_length * jnp.sin(turned) + l * sin * jnp.cos(turned)
-        return jnp.stack([up * arm, l * (up * cos * jnp.sin(turned) + lost * sin)])
-
-
-class BaseTilt(AbstractBaseTilt):
-    """The side that the arm points to at zero rises."""
-
-    where: str = eqx.field(static=True, default="theta")
-    magnitude: float = eqx.field(static=True, default=0.0175)
-    what: ClassVar[str] = "base_tilt"
-    meaning: ClassVar[str] = "tilt of the base towards the arm's zero"
-    towards: ClassVar[float] = 0.0
-
-
-class BaseTiltSide(AbstractBaseTilt):
-    """The side that the arm points to at a quarter turn rises."""
-
-    where: str = eqx.field(static=True, default="theta")
-    magnitude: float = eqx.field(static=True, default=0.0175)
-    what: ClassVar[str] = "base_tilt_side"
-    meaning: ClassVar[str] = "tilt of the base across the arm's zero"
-    towards: ClassVar[float] = 0.5 * math.pi
-
-
-class Payload(AbstractJointEffect):
-    """A point of ``magnitude`` kilograms at the pole's free end, at ``2 l``."""
+class MissingForce(AbstractUnknownFunction):
+    """A force along one joint, by its position or by its velocity."""
 
     where: str = eqx.field(static=True)
     magnitude: float = eqx.field(static=True)
-    what: ClassVar[str] = "payload"
-    meaning: ClassVar[str] = "mass at the pole's end"
-    max_substep: ClassVar[float] = SUBSTEP
+    basis: Sines | Sign = eqx.field(static=True)
+    of_velocity: bool = eqx.field(static=True, default=False)
+    what: str = eqx.field(static=True, default="position_force")
+    weights: tuple[float, ...] = eqx.field(static=True, default=())
+    meaning: ClassVar[str] = "force that is missing"
+    max_substep: ClassVar[float] = math.inf
 
     def unit(self, plant: AbstractPlant) -> str:
-        only_on(self.name, plant, {Furuta: "alpha", CartPole: "theta"})
-        return "kg"
+        return force_unit(plant, self.where)
+
+
+class MissingInput(AbstractInputEffect, AbstractUnknownFunction):
+    """What arrives of an input beside itself, as a function of it."""
+
+    where: str = eqx.field(static=True)
+    magnitude: float = eqx.field(static=True)
+    basis: Basis = eqx.field(static=True)
+    what: str = eqx.field(static=True, default="input_force")
+    weights: tuple[float, ...] = eqx.field(static=True, default=())
+    meaning: ClassVar[str] = "input that is missing"
+    max_substep: ClassVar[float] = math.inf
+
+    def through(self, x: Float[AnyArray, " k"], u: Scalar) -> Scalar:
+        return u + self.basis.value(x, u)
+
+
+class ForceField(eqx.Module):
+    """All missing forces of a machine at once, for the weights of all."""
+
+    forces: tuple[MissingForce, ...] = eqx.field(static=True)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the weights."""
+        return tuple(name for force in self.forces for name in force.values)
+
+    def along(
+        self,
+        x: Float[AnyArray, " k"],
+        q: Mapping[str, Scalar],
+        v: Mapping[str, Scalar],
+    ) -> dict[str, Scalar]:
+        """The force on each joint that has one, at positions and velocities by name."""
+        own = dict(zip(self.forces, _split(self.forces, x), strict=True))
+        found = {}
+        for name in dict.fromkeys(f.where for f in self.forces):
+            mine = tuple(f for f in self.forces if f.where == name)
+            weights = jnp.concatenate([own[f] for f in mine])
+            found[name] = _force(mine, weights, q[name], v[name])
+        return found
 
     def inertia(
-        self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair
+        self, system: AbstractMechanism, params: Any, x: AnyArray, q: Pair
     ) -> Inertia:
-        cos, sin = jnp.cos(q[1]), jnp.sin(q[1])
-        if isinstance(system, Furuta):
-            r, end = params.arm_length, params.pendulum_length
-            return x * (r**2 + end**2 * sin**2), x * end * r * cos, x * end**2
-        end = 2.0 * params.pole_half_length
-        return x, x * end * cos, x * end**2
+        """None is added."""
+        none = jnp.zeros_like(q[0])
+        return none, none, none
 
     def force(
-        self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
+        self, system: AbstractMechanism, params: Any, x: AnyArray, q: Pair, v: Pair
     ) -> Pair:
-        cos, sin = jnp.cos(q[1]), jnp.sin(q[1])
-        if isinstance(system, Furuta):
-            r, end = params.arm_length, params.pendulum_length
-            slope = 2.0 * x * end**2 * sin * cos
-            first = -slope * v[0] * v[1] + x * end * r * sin * v[1] ** 2
-            second = 0.5 * slope * v[0] ** 2
-        else:
-            end = 2.0 * params.pole_half_length
-            first, second = x * end * sin * v[1] ** 2, jnp.zeros_like(x)
-        weight = x * end * gravity_of(system) * sin
-        return jnp.stack([first, second - weight])
+        """As `AbstractJointEffect.force`, for all weights."""
+        names, none = [c.name for c in system.states[:2]], jnp.zeros_like(q[0])
+        at, moving = (dict(zip(names, y, strict=True)) for y in (q, v))
+        found = self.along(x.astype(q.dtype), at, moving)
+        return jnp.stack([found.get(name, none) for name in names])
+
+    def kicked(
+        self, plant: AbstractPlant, x: Float[AnyArray, " k"], s: State, t: Scalar
+    ) -> State:
+        """The state after ``t`` seconds of the forces alone, by the midpoint rule."""
+        names = [f.where for f in self.forces]
+        j = {name: velocity_of(plant, name) for name in names}
+        q = {name: s[index_of(name, plant.physical_states)] for name in names}
+        v = {name: s[j[name]] for name in names}
+        x = x.astype(s.dtype)
+        first = self.along(x, q, v)
+        middle = {name: v[name] + 0.5 * t * first[name] for name in names}
+        for name, a in self.along(x, q, middle).items():
+            s = s.at[j[name]].add(t * a)
+        return s
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _force(
+    forces: tuple[MissingForce, ...], x: Float[AnyArray, " k"], q: Scalar, v: Scalar
+) -> Scalar:
+    """The force on one joint. Its derivatives by the state are the same for every
+    parameter: they are computed once."""
+    parts = zip(forces, _split(forces, x), strict=True)
+    each = [f.basis.value(w, v if f.of_velocity else q) for f, w in parts]
+    return sum(each[1:], each[0])
+
+
+@_force.defjvp
+def _force_jvp(
+    forces: tuple[MissingForce, ...], primals: tuple, tangents: tuple
+) -> tuple[Scalar, Scalar]:
+    (x, q, v), (dx, dq, dv) = primals, tangents
+    by = {False: jnp.zeros_like(q), True: jnp.zeros_like(q)}
+    for f, w in zip(forces, _split(forces, x), strict=True):
+        slope = f.basis.slope(w, v if f.of_velocity else q)
+        by[f.of_velocity] = by[f.of_velocity] + slope
+    by_q, by_v = jax.lax.optimization_barrier((by[False], by[True]))
+    return _force(forces, x, q, v), _force(forces, dx, q, v) + by_q * dq + by_v * dv
+
+
+def _split(
+    forces: tuple[MissingForce, ...], x: Float[AnyArray, " k"]
+) -> list[Float[AnyArray, " _"]]:
+    """The weights of each."""
+    return jnp.split(x, np.cumsum([len(f.basis.sds) for f in forces])[:-1])

@@ -4,7 +4,7 @@ Such a plant takes a force as the acceleration that it makes. In one substep the
 flows between two half kicks of its joints' velocities, the second in reverse order
 (Strang 1968), so that the error of a step is of third order in its length. A kick is
 the effect's own closed form (`AbstractJointForce.accelerated`): friction may be as
-steep as it likes.
+steep as it likes. Missing forces are smooth, and take the midpoint rule.
 """
 
 from collections.abc import Iterable
@@ -13,9 +13,10 @@ from typing import Any
 import jax.numpy as jnp
 
 from sim2gp.systems.base import AbstractPlant, index_of
-from sim2gp.systems.effects.base import AbstractJointEffect, AbstractJointForce
+from sim2gp.systems.effects.base import AbstractJointForce
+from sim2gp.systems.effects.forces import ForceField
 from sim2gp.systems.effects.units import velocity_of
-from sim2gp.systems.mechanism import Effects
+from sim2gp.systems.mechanism import Acting, Effects
 from sim2gp.types import Action, Scalar, State
 
 
@@ -36,12 +37,15 @@ def kicked(
 
 def kick(
     plant: AbstractPlant,
-    effects: Iterable[tuple[AbstractJointEffect, Scalar]],
+    effects: Iterable[Acting],
     s: State,
     t: Scalar,
 ) -> State:
     """State whose joints' velocities the effects have changed for ``t`` seconds."""
     for effect, x in effects:
+        if isinstance(effect, ForceField):
+            s = effect.kicked(plant, x, s, t)
+            continue
         assert isinstance(effect, AbstractJointForce)  # as `check_effect` asks
         i = index_of(effect.where, plant.physical_states)
         j = velocity_of(plant, effect.where)

@@ -17,13 +17,11 @@ import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
-import numpy as np
 
 from sim2gp.errors import InputError
 from sim2gp.systems.actuators import AbstractActuator, Delay, Gain, Lag, Offset
-from sim2gp.systems.base import LONGEST_MEAN, AbstractPlant, AbstractSystem
+from sim2gp.systems.base import AbstractPlant, AbstractSystem
 from sim2gp.systems.effects.base import (
     AbstractEffect,
     AbstractInputEffect,
@@ -31,7 +29,6 @@ from sim2gp.systems.effects.base import (
     AbstractJointForce,
     check_effect,
 )
-from sim2gp.systems.effects.forces import BaseTilt, BaseTiltSide, Payload, RailTilt
 from sim2gp.systems.effects.friction import (
     Coulomb,
     Drag,
@@ -41,8 +38,10 @@ from sim2gp.systems.effects.friction import (
 )
 from sim2gp.systems.effects.geometry import PoleGeometry, RodInertia
 from sim2gp.systems.effects.inputs import DeadZone
+from sim2gp.systems.effects.loads import BaseTilt, BaseTiltSide, Payload, RailTilt
+from sim2gp.systems.effects.scales import drives
 from sim2gp.systems.effects.springs import Spring
-from sim2gp.systems.effects.units import joint_of, joints_of, velocity_of
+from sim2gp.systems.effects.units import joint_of
 from sim2gp.systems.machine import Machine, plant_of
 from sim2gp.systems.mechanism import AbstractMechanism
 from sim2gp.systems.parts import AbstractPart
@@ -50,7 +49,6 @@ from sim2gp.systems.plants.cartpole import CartPole
 from sim2gp.systems.plants.furuta import Furuta
 from sim2gp.systems.plants.two_link import TwoLink, UniformRodArm
 from sim2gp.systems.sensors import EncoderOffset
-from sim2gp.types import in_float64
 
 #: On every joint. Each of these is a candidate too: `_force` gives it a prior.
 _FORCES: tuple[type[AbstractJointForce], ...] = (
@@ -305,31 +303,7 @@ def _arm(plant: TwoLink | UniformRodArm) -> list[Candidate]:
 def _of_any(plant: AbstractPlant) -> list[Candidate]:
     """Of each joint whose velocity is a state, as large as what moves it."""
     found: list[Candidate] = []
-    names, most = [c.name for c in plant.physical_states], _accelerations(plant)
-    for joint in joints_of(plant):
-        if f"{joint.name}.velocity" not in names:
-            continue
-        made = _slide if joint.unit == "m" else _Joint
-        found += _of_joint(made(joint.name, most[velocity_of(plant, joint.name)]))
+    for name, drive in drives(plant).items():
+        made = _slide if joint_of(plant, name).unit == "m" else _Joint
+        found += _of_joint(made(name, drive.force))
     return found
-
-
-@in_float64
-def _accelerations(plant: AbstractPlant) -> list[float]:
-    """The largest slope of each state that inputs and weight give at rest, per second.
-
-    With nominal parameters; 1 for a state that does not move.
-    """
-    params, joints = plant.nominal(), joints_of(plant)
-    away = np.asarray([0.5 * (c in joints) for c in plant.physical_states])
-    high = [c.high if math.isfinite(c.high) else 1.0 for c in plant.actions]
-    low = [c.low if math.isfinite(c.low) else -1.0 for c in plant.actions]
-    inputs = [np.zeros(len(high)), *np.diag(high), *np.diag(low)]
-    flow = jax.jit(lambda s, a: plant.flow(params, s, a, LONGEST_MEAN) - s)
-    moved = [
-        np.abs(flow(jnp.asarray(s), jnp.asarray(a))) / LONGEST_MEAN
-        for s in (0.0 * away, away)
-        for a in inputs
-    ]
-    most = np.max(moved, axis=0)
-    return [float(x) if 0.0 < x < math.inf else 1.0 for x in most]

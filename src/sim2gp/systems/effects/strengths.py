@@ -7,10 +7,10 @@ from typing import Any
 
 from sim2gp.errors import error, nearest
 from sim2gp.systems.actuators import Delay
-from sim2gp.systems.effects.forces import RailTilt
 from sim2gp.systems.effects.friction import Coulomb, Drag, RailFriction
 from sim2gp.systems.effects.geometry import PoleGeometry, RodInertia
 from sim2gp.systems.effects.inputs import DeadZone
+from sim2gp.systems.effects.loads import RailTilt
 from sim2gp.systems.effects.springs import Spring
 from sim2gp.systems.parts import AbstractPart
 

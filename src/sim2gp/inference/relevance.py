@@ -1,0 +1,107 @@
+"""Which groups of parameters the data need: the scale of each group's prior.
+
+The weights of one function share a scale ``tau`` of their prior. It maximises the
+evidence of the linearised model, together with the noise (type-II maximum likelihood;
+automatic relevance determination: MacKay 1992, Neural Computation 4; Tipping 2001, JMLR
+1). A group that the data do not need goes to zero. With ``x`` the mean and ``S`` the
+covariance of the whitened parameters, and ``i`` those of a group,
+
+    tau^2 = mean_i (x_i^2 + S_ii)                       (EM)
+    tau^2 = sum_i x_i^2 / sum_i (1 - S_ii / tau^2)      (MacKay's fixed point)
+
+The second is faster and prunes what is needed where the first rounds take it: EM comes
+first. Only scales and noise are taken from here, never a posterior, so that normal
+equations do: a round costs a Cholesky factor of the parameters' number.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.scipy.linalg import cho_factor, cho_solve
+from jaxtyping import Array, Float
+
+from sim2gp.inference.arrowhead import Noise
+from sim2gp.inference.laplace import Laplace
+from sim2gp.inference.prior import ParameterPrior
+from sim2gp.types import AnyScalar
+
+EM_ROUNDS, ROUNDS = 100, 200
+#: A scale falls by no more in one update: the linear model is not true far away.
+FALL = 5.0
+#: Of a group that is off, and of one that is as strong as it may be, in prior sd.
+OFF, MOST = 1e-4, 20.0
+
+
+class Linear(NamedTuple):
+    """The linearised data of each channel: Gram matrices of their rows ``[J r]``.
+
+    ``spread`` are the squares that the nuisances' own uncertainty adds.
+    """
+
+    grams: Float[Array, "c k k"]
+    spread: Float[Array, " c"]
+    counts: Float[Array, " c"]
+    floor: Float[Array, " c"]
+
+
+def relevant(
+    linear: Linear,
+    z: Float[Array, " p"],
+    noise: Noise,
+    prior: ParameterPrior,
+    damping: AnyScalar = 0.0,
+) -> tuple[Noise, ParameterPrior]:
+    """Noise and scales of highest evidence on data that are linearised at ``z``."""
+    members = prior.members
+    trust = damping * jnp.asarray(1.0 - members.sum(axis=0))
+
+    def turn(i: Array, carry: tuple) -> tuple:
+        variance, tau2 = carry
+        x, S = _posterior(linear, z, variance, prior.each(jnp.sqrt(tau2)), trust)
+        rows = jnp.append(x - z, 1.0)
+        squares = jnp.einsum("i,cij,j->c", rows, linear.grams, rows)
+        spread = jnp.einsum("cij,ji->c", linear.grams[:, :-1, :-1], S)
+        expected = squares + spread + linear.spread
+        variance = (2.0 * linear.floor**2 + expected) / (2.0 + linear.counts)
+        own = jnp.diag(S)
+        em = members @ (x**2 + own) / jnp.sum(members, axis=1)
+        determined = jnp.sum(members, axis=1) - members @ own / tau2
+        fixed_point = members @ x**2 / jnp.maximum(determined, 1e-6)
+        new = jnp.where(i < EM_ROUNDS, em, jnp.minimum(em, fixed_point))
+        return variance, jnp.clip(new, OFF**2, MOST**2)
+
+    start = noise.sd**2, prior.scales**2
+    variance, tau2 = jax.lax.fori_loop(0, ROUNDS, turn, start)
+    scales = jnp.maximum(jnp.sqrt(tau2), prior.scales / FALL)
+    return Noise(jnp.sqrt(variance), noise.weights), prior.scaled(scales)
+
+
+def _posterior(
+    linear: Linear,
+    z: Float[Array, " p"],
+    variance: Float[Array, " c"],
+    each: Float[Array, " p"],
+    trust: Float[Array, " p"],
+) -> tuple[Float[Array, " p"], Float[Array, "p p"]]:
+    """Mean and covariance of the whitened parameters."""
+    total = jnp.sum(linear.grams / variance[:, None, None], axis=0)
+    known = 1.0 / each**2
+    # In units of the prior's sd the matrix has eigenvalues of one or more.
+    A = each[:, None] * (total[:-1, :-1] * each[None]) + jnp.diag(1.0 + trust * each**2)
+    slope = each * (total[:-1, -1] + known * z)
+    root = cho_factor(A)
+    inverse = cho_solve(root, jnp.eye(z.size))
+    return z - each * (inverse @ slope), each[:, None] * inverse * each[None]
+
+
+def linear_of(
+    found: Laplace,
+    weights: Float[Array, " W"],
+    counts: Float[Array, "W c"],
+    floor: Float[Array, " c"],
+) -> Linear:
+    """The data about a point, with nuisances at what the noise there makes them."""
+    reduced, spread = found.reduced()
+    grams = jnp.einsum("w,wcij,wcik->cjk", weights, reduced, reduced)
+    return Linear(grams, weights @ spread, jnp.sum(counts, axis=0), floor)

@@ -1,0 +1,63 @@
+"""What any machine may lack: forces on each joint, and changes of each input."""
+
+import math
+from collections.abc import Mapping
+
+from sim2gp.systems.base import LONGEST_MEAN, AbstractSystem
+from sim2gp.systems.effects.base import AbstractEffect
+from sim2gp.systems.effects.forces import (
+    DeadZones,
+    MissingForce,
+    MissingInput,
+    Sign,
+    periodic,
+    smooth,
+)
+from sim2gp.systems.effects.scales import drives
+from sim2gp.systems.effects.units import joint_of
+from sim2gp.systems.machine import plant_of
+
+HARMONICS = 2  # of a joint that may turn round
+#: Of dry friction's width: the change of velocity by the drive in a substep.
+WIDTH = 0.2
+DRY, CHANGE, GAP = 0.1, 0.1, 0.2  # prior sd, shares of the drive and of an input
+GAPS = (0.1, 0.14, 0.2, 0.28)  # widths of dead zones, shares of an input
+INPUT_REACH, INPUT_LENGTH = 1.2, 0.3  # half-widths of an input
+
+
+def missing_forces(
+    system: AbstractSystem, box: Mapping[str, tuple[float, float]]
+) -> list[AbstractEffect]:
+    """Of each joint a force by position, by velocity and of dry friction; of each input
+    a smooth change and dead zones.
+
+    ``box`` is where the machine moves, by channel.
+    """
+    plant = plant_of(system)
+    step = min(plant.max_substep, LONGEST_MEAN)
+    found: list[AbstractEffect] = []
+    for name, drive in drives(plant).items():
+        joint = joint_of(plant, name)
+        turns = joint.angle and not math.isfinite(joint.low + joint.high)
+        at = periodic(HARMONICS) if turns else smooth(*box[name])
+        by_speed = smooth(*box[f"{name}.velocity"])
+        sign = Sign(WIDTH * drive.acceleration * step)
+        found += [
+            MissingForce(name, drive.force, at),
+            MissingForce(
+                name, drive.force, by_speed, of_velocity=True, what="velocity_force"
+            ),
+            MissingForce(
+                name, DRY * drive.force, sign, of_velocity=True, what="dry_friction"
+            ),
+        ]
+    for channel in plant.actions:
+        low, high = box[channel.name]
+        half, name = 0.5 * (high - low), channel.name
+        change = smooth(low, high, reach=INPUT_REACH, length=INPUT_LENGTH)
+        gaps = DeadZones(tuple(share * half for share in GAPS))
+        found += [
+            MissingInput(name, CHANGE * half, change),
+            MissingInput(name, GAP * half, gaps, what="dead_zones"),
+        ]
+    return found

@@ -1,0 +1,62 @@
+"""What moves the joints of a machine: the scale of what it may lack."""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sim2gp.systems.base import LONGEST_MEAN, AbstractPlant
+from sim2gp.systems.effects.units import joints_of, velocity_of
+from sim2gp.systems.mechanism import AbstractMechanism
+from sim2gp.types import in_float64
+
+AWAY = 0.5  # rad or m from zero, where a joint's weight is felt
+
+
+class Drive(NamedTuple):
+    """The largest force that inputs and weight give a joint at rest, and what it does.
+
+    ``force`` is in N or N m, or an acceleration where a plant has no mass matrix;
+    ``acceleration`` is in the joint's unit per s^2.
+    """
+
+    force: float
+    acceleration: float
+
+
+@in_float64
+def drives(plant: AbstractPlant) -> dict[str, Drive]:
+    """Of each joint whose velocity is a state; 1 where nothing moves it.
+
+    With nominal parameters, each input at either end of its range, the joints at zero
+    and away from it.
+    """
+    names = [c.name for c in plant.physical_states]
+    joints = [c for c in joints_of(plant) if f"{c.name}.velocity" in names]
+    params = plant.nominal()
+    rest = np.zeros(len(names))
+    away = np.asarray([AWAY * (c in joints) for c in plant.physical_states])
+    high = [c.high if math.isfinite(c.high) else 1.0 for c in plant.actions]
+    low = [c.low if math.isfinite(c.low) else -1.0 for c in plant.actions]
+    inputs = [np.zeros(len(high)), *np.diag(high), *np.diag(low)]
+
+    def each(s: np.ndarray, a: np.ndarray) -> list[float]:
+        if isinstance(plant, AbstractMechanism):
+            at = jnp.asarray(s[:2]), jnp.zeros(2), jnp.asarray(a)
+            return [float(f) for f in plant.forces(params, *at)]
+        moved = flow(jnp.asarray(s), jnp.asarray(a))
+        return [float(moved[velocity_of(plant, c.name)]) for c in joints]
+
+    h = LONGEST_MEAN
+    flow = jax.jit(lambda s, a: (plant.flow(params, s, a, h) - s) / h)
+    found = np.abs([each(s, a) for s in (rest, away) for a in inputs])
+    most = [float(x) if 0.0 < x < math.inf else 1.0 for x in np.max(found, axis=0)]
+    inertia = [1.0] * len(joints)
+    if isinstance(plant, AbstractMechanism):
+        first, _, second = plant.inertia(params, jnp.zeros(2))
+        inertia = [float(first), float(second)]
+    return {
+        c.name: Drive(f, f / m) for c, f, m in zip(joints, most, inertia, strict=True)
+    }

@@ -1,0 +1,125 @@
+"""A simulator that finds the force it lacks, and none where nothing is missing."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import sim2gp as sg
+from sim2gp.data.transitions import Transitions
+from sim2gp.inference.relevance import OFF
+from sim2gp.systems import Furuta, Machine, Spring
+
+KEY = jax.random.key(0)
+DT, ROWS, STIFFNESS = 0.02, 200, 0.02
+NOISE = np.asarray([1e-3, 1e-3, 0.02, 0.02])
+REACH = {"theta": 2.0, "theta.velocity": 15.0, "alpha.velocity": 25.0}
+MODEL = sg.MissingForces(sg.Sim2GP(Furuta()), reach=REACH)
+
+
+def recorded(parts, seed=0) -> Transitions:
+    """Steps of a machine from states all over, under random inputs."""
+    rng = np.random.default_rng(seed)
+    machine = Machine(Furuta(), effects=parts)
+    s = rng.uniform(-1.0, 1.0, (ROWS, 4)) * [1.5, 3.0, 8.0, 12.0]
+    a = rng.uniform(-5.0, 5.0, (ROWS, 1))
+    with jax.enable_x64(True):
+        # Twice as finely as the model is, as a true machine with effects.
+        half = machine.bind(machine.nominal(), 0.5 * DT)
+        step = jax.jit(jax.vmap(lambda s, a: half(half(s, a), a)))
+        s2 = np.asarray(step(jnp.asarray(s), jnp.asarray(a)))
+    return Transitions.of(s, a, s2 + NOISE * rng.normal(size=s.shape))
+
+
+def scales(belief) -> dict[str, float]:
+    """The scale of each group that a fit has chosen."""
+    table = MODEL.system.parameters
+    sd = np.diag(np.asarray(belief.prior.scale))
+    return {g: float(sd[i[0]] / table.free[i[0]].sd) for g, i in table.groups.items()}
+
+
+@pytest.fixture(scope="module")
+def with_spring():
+    data = recorded([Spring("theta", STIFFNESS)])
+    return MODEL.fit(MODEL.init(KEY), data, key=KEY), data
+
+
+def test_before_data_it_is_the_simulator():
+    plain = sg.Sim2GP(Furuta())
+    s, a = jnp.asarray([0.3, 1.0, 2.0, -3.0]), jnp.asarray([2.0])
+    ours, theirs = (m.init(KEY).predict(s, a) for m in (MODEL, plain))
+    np.testing.assert_allclose(ours.mean, theirs.mean, atol=1e-9)
+    with jax.enable_x64(True):
+        np.testing.assert_allclose(ours.sd(), theirs.sd(), rtol=1e-5)
+    assert list(scales(MODEL.init(KEY)).values()) == pytest.approx([OFF] * 8)
+
+
+def test_a_spring_is_found_as_a_force_of_the_arms_position(with_spring):
+    """By that group alone, with the noise that there is, and as the right curve."""
+    belief, _ = with_spring
+    found = scales(belief)
+    assert found["theta.position_force"] > 0.1
+    others = [v for name, v in found.items() if name != "theta.position_force"]
+    assert max(others) < 0.03
+    np.testing.assert_allclose(belief.noise, NOISE, rtol=0.25)
+
+    table = MODEL.system.parameters
+    at = table.groups["theta.position_force"]
+    (force,) = (f for f in MODEL.system.effects if f.name == "theta.position_force")
+    # Torques and masses are known up to one factor: what it does is comparable.
+    with jax.enable_x64(True):
+        values = table.values(belief.posterior.mean)
+        M = Furuta().mass_matrix(Furuta().record(values), jnp.zeros(2))
+        true = Furuta().mass_matrix(Furuta().nominal(), jnp.zeros(2))
+        ratio = float(M[0, 0] / true[0, 0])
+        for angle in (-1.2, -0.5, 0.6, 1.3):
+            w = belief.posterior.mean[at]
+            got = force.basis.value(w, jnp.asarray(angle)) / ratio
+            features = force.basis.slope(jnp.zeros_like(w), jnp.asarray(angle))
+            assert float(features) == 0.0
+            assert float(got) == pytest.approx(-STIFFNESS * angle, abs=1.5e-3)
+
+
+def test_it_predicts_what_the_simulator_alone_cannot(with_spring):
+    """Steps that it has not seen: the simulator alone calls the spring noise."""
+    belief, data = with_spring
+    plain = sg.Sim2GP(Furuta())
+    alone = plain.fit(plain.init(KEY), data, key=KEY)
+    new = recorded([Spring("theta", STIFFNESS)], seed=1)
+    s, a = jnp.asarray(new.state[:20]), jnp.asarray(new.action[:20])
+
+    def error(b):
+        with jax.enable_x64(True):
+            got = jax.vmap(lambda s, a: b.predict(s, a).mean)(s, a)
+        return np.sqrt(np.mean((np.asarray(got) - new.next_state[:20])[:, 2] ** 2))
+
+    assert error(belief) < 1.3 * NOISE[2]
+    assert error(alone) > 3.0 * error(belief)
+    assert float(belief.log_evidence) > float(alone.log_evidence) + 100.0
+
+
+def test_where_nothing_is_missing_all_forces_go_off():
+    """And the simulator's own fit is what is left."""
+    data = recorded([])
+    belief = MODEL.fit(MODEL.init(KEY), data, key=KEY)
+    assert max(scales(belief).values()) < 0.02
+    plain = sg.Sim2GP(Furuta())
+    alone = plain.fit(plain.init(KEY), data, key=KEY)
+    assert float(belief.log_evidence) == pytest.approx(
+        float(alone.log_evidence), abs=1.0
+    )
+    (mean, sd), (theirs, _) = belief.parameters(), alone.parameters()
+    assert mean.shape == theirs.shape == (8,)
+    np.testing.assert_allclose((mean - theirs) / sd, 0.0, atol=0.3)
+
+
+def test_an_update_narrows_the_forces_that_are_on(with_spring):
+    """Transition by transition, as the linearised model says."""
+    belief, _ = with_spring
+    s, a = jnp.asarray([1.0, 0.2, 1.0, -2.0]), jnp.asarray([1.0])
+    with jax.enable_x64(True):
+        s, a = jnp.asarray(s, float), jnp.asarray(a, float)
+        updated = MODEL.update(belief, s, a, belief.predict(s, a).mean)
+        before, after = belief.latent(s, a).sd(), updated.latent(s, a).sd()
+    assert (after < before).all()
+    assert int(updated.count) == int(belief.count) + 1
