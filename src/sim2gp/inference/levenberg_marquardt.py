@@ -215,7 +215,7 @@ def _descend(
         small = finite & (here.gradient <= 0.1 * GRADIENT_TOLERANCE)
         many = count > jnp.where(fresh | exact, MAX_STEPS, ends.most)
         hopeless = ~finite | ~(damping < MOST_DAMPING) | many
-        hopeless = (count > 0) & hopeless
+        hopeless = (~fresh | (count > 0)) & hopeless  # a fresh start has no cost yet
         # Two steps at least: a gradient may be small next to a large cost.
         done = settled | jnp.where(exact, small & (count >= 2), small)
         return ~(done & ~again) & ~hopeless & ~idle

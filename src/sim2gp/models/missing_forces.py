@@ -13,6 +13,7 @@ the noise that is left there.
 """
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -41,6 +42,7 @@ from sim2gp.types import Action, Key, State, in_float64
 DRAWS, ROWS = 128, 64
 BROAD = 3.0  # scale of every force in a first descent
 ROUNDS = 7  # of relevance and descent
+SAME = 1.2  # times the last noise: the last fit still explains the data
 
 
 class MissingForces(AbstractModel):
@@ -87,14 +89,14 @@ class MissingForces(AbstractModel):
         Raises `NotConverged`, `NotFinite` or `DeadParameters`.
         """
         assert isinstance(belief, Sim2GPBelief)
-        rows = jax.tree.map(jnp.asarray, data)
-        last = jnp.linalg.solve(
-            self.sim.prior.scale, belief.posterior.mean - self.sim.prior.mean
-        )
-        found = _fit(self, rows, last, belief.noise, belief.count > 0, key)
-        found.convergence.check(
-            self.system.parameters.names, f"{data.count} transitions"
-        )
+        rows, about = jax.tree.map(jnp.asarray, data), self.sim.prior
+        z = jnp.linalg.solve(about.scale, belief.posterior.mean - about.mean)
+        first = np.asarray([at[0] for at in self.system.parameters.groups.values()])
+        scales = (jnp.diag(belief.prior.scale) / jnp.diag(about.scale))[first]
+        last = _Start(z, belief.noise, scales, belief.count > 0)
+        found = _fit(self, rows, last, key)
+        names = self.system.parameters.names
+        found.convergence.check(names, f"{data.count} transitions")
         return belief_of(self.sim, found, rows)
 
     def update(
@@ -110,35 +112,51 @@ class MissingForces(AbstractModel):
         return ParameterPrior(self.sim.prior, table, scales)
 
 
+class _Start(NamedTuple):
+    """Where a descent begins: whitened parameters, noise, scales of the forces.
+
+    ``enough`` asks for no other start where it leaves no more noise than it began with.
+    """
+
+    z: Float[Array, "*s p"]
+    noise: Float[Array, "*s d"]
+    scales: Float[Array, "*s g"]
+    enough: Bool[Array, "*s"]
+
+
 @eqx.filter_jit
-def _fit(
-    model: MissingForces,
-    data: Transitions,
-    last: Float[Array, " p"],
-    last_noise: Float[Array, " d"],
-    fitted: Bool[Array, ""],
-    key: Key,
-) -> Estimate:
-    """The fit of highest evidence: from projected parameters, from the last fit, and
-    from where it was with all forces off."""
+def _fit(model: MissingForces, data: Transitions, last: _Start, key: Key) -> Estimate:
+    """From the last fit; where that no longer explains the data, the fit of highest
+    evidence from projected parameters, and from the simulator with all forces off."""
     likelihood = OneStepLikelihood(model.system, data, model.sim.dt)
     prior = model.prior(BROAD)
-    first = likelihood.first_noise().sd
-    some = likelihood.thinned(ROWS)
-    starts, noises = projected(some, prior, DRAWS, 1, key)
-    plain = jnp.where(jnp.asarray(prior.members.sum(axis=0) > 0), 0.0, last)
-    starts = jnp.stack([starts[0], jnp.where(fitted, last, jnp.nan), plain])
-    noises = jnp.stack([noises[0], last_noise, first])
-    scales = jnp.stack([prior.scales, prior.scales, OFF / BROAD * prior.scales])
+    some, no = likelihood.thinned(ROWS), jnp.zeros((), bool)
+    (z, *_), (noise, *_) = projected(some, prior, DRAWS, 1, key)
+    off = jnp.where(jnp.asarray(prior.members.sum(axis=0) > 0), 0.0, last.z)
+    fitted = last._replace(z=jnp.where(last.enough, last.z, jnp.nan))
+    plain = _Start(off, likelihood.first_noise().sd, OFF / BROAD * prior.scales, no)
+    each = fitted, _Start(z, noise, prior.scales, no), plain
 
-    def one(start: tuple[Array, Array, Array]) -> Estimate:
-        z, sd, scales = start
-        about, noise = prior.scaled(scales), Noise(sd, jnp.ones(1))
-        return estimate(likelihood, about, starts=z[None], rounds=ROUNDS, noise=noise)
+    def descend(start: _Start) -> Estimate:
+        noise, about = Noise(start.noise, jnp.ones(1)), prior.scaled(start.scales)
+        starts = start.z[None]
+        return estimate(likelihood, about, starts=starts, rounds=ROUNDS, noise=noise)
 
-    each = jax.lax.map(one, (starts, noises, scales))
-    there = each.convergence.status == CONVERGED
-    there = there & jnp.isfinite(each.log_evidence)
-    ranked = jnp.where(there, each.log_evidence, -jnp.inf)
-    best: Estimate = jax.tree.map(lambda x: x[jnp.argmax(ranked)], each)
+    def skip(start: _Start) -> Estimate:
+        shapes = jax.eval_shape(descend, start)
+        none: Estimate = jax.tree.map(lambda x: jnp.full(x.shape, -1, x.dtype), shapes)
+        return none
+
+    def turn(done: Array, start: _Start) -> tuple[Array, Estimate]:
+        found = jax.lax.cond(done, skip, descend, start)
+        same = jnp.all(found.noise.sd <= SAME * start.noise)
+        ended = found.convergence.status == CONVERGED
+        return done | (start.enough & same & ended), found
+
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *each)
+    _, found = jax.lax.scan(turn, no, stacked)
+    there = found.convergence.status == CONVERGED
+    there = there & jnp.isfinite(found.log_evidence)
+    ranked = jnp.where(there, found.log_evidence, -jnp.inf)
+    best: Estimate = jax.tree.map(lambda x: x[jnp.argmax(ranked)], found)
     return best
