@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.stats
 
 import sim2gp as sg
 from frozen import episodes
@@ -29,13 +30,17 @@ def test_a_recording_is_identified_as_before(
 
 
 def test_learners_act_as_before() -> None:
-    """The median of ten seeds lies in the recorded one's bootstrap interval."""
-    before = json.loads(episodes.RECORD.read_text())
-    rng, moved = np.random.default_rng(0), []
+    """Ten seeds before and ten now could be of one distribution (Mann and Whitney).
+
+    Rounding alone changes the episodes of a learner that is chaotic: both samples are
+    random. At 5 % for all learners together.
+    """
+    before, moved = json.loads(episodes.RECORD.read_text()), []
     for name, found in episodes.rows(lambda name: name in before):
-        was, now = (np.asarray([row[-1] for row in x]) for x in (before[name], found))
-        draws = np.median(rng.choice(was, (2000, len(was))), axis=1)
-        low, high = np.quantile(draws, (0.025, 0.975))
-        if not low <= np.median(now) <= high:
-            moved.append(f"{name}: {np.median(now):g} beyond {low:g} to {high:g}")
+        was, now = ([row[-1] for row in x] for x in (before[name], found))
+        p = scipy.stats.mannwhitneyu(was, now).pvalue
+        if p < 0.05 / len(before):
+            moved.append(
+                f"{name}: {np.median(was):g} then, {np.median(now):g}, p {p:g}"
+            )
     assert not moved, "\n".join(moved)
