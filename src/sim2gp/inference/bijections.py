@@ -87,8 +87,8 @@ def along_powers(
 
     The logarithm keeps its rate: what data know of a mechanism are products of powers
     (a force over a mass), and such steps leave these as they are. A value that changes
-    much is small beside others that it is added to (a damping beside a back-EMF): it
-    keeps its own rate.
+    much is small next to others that it is added to (a damping next to a back-EMF):
+    it keeps its own rate.
     """
     xp, positive = library(theta), low > 0.0
     rate = change / xp.where(positive, theta, 1.0)

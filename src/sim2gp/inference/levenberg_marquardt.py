@@ -323,16 +323,16 @@ def relaxed(prior: AbstractPrior, here: Point, noise: Noise) -> Point:
     """
     if not prior.linear:
         return here
-    xp, w = library(here.z), np.asarray(prior.linear)
+    w = np.asarray(prior.linear)
     white, own = noise.scale(here.blocks), here.e.shape[1] + w
     data = white[..., np.append(own, -1)].reshape(-1, len(w) + 1)
     full = stack(data, here.prior[:, np.append(w, -1)])
     dw = -solve_triangular(full[:-1, :-1], full[:-1, -1])
-    dz = xp.zeros(here.z.size).at[w].set(dw)
+    z = here.z.at[w].add(dw)
     r = here.blocks[..., -1] + here.blocks[..., own] @ dw
     blocks = here.blocks.at[..., -1].set(r)
     rows = here.prior.at[:, -1].add(here.prior[:, w] @ dw)
-    return point(here.z + dz, here.e, blocks, rows, noise)
+    return point(z, here.e, blocks, rows, noise)
 
 
 def _select(yes: Bool[Array, ""], new: T, old: T) -> T:

@@ -31,11 +31,9 @@ def projected(
 
     Linear are the parameters of groups. The first draw is the prior's mean.
     """
-    linear = prior.members.sum(axis=0) > 0
-    places = np.flatnonzero(linear)
-    about = prior.gaussian
-    z = jax.random.normal(key, (draws, linear.size))
-    z = jnp.where(linear, 0.0, z).at[0].set(0.0)
+    places, about = np.asarray(prior.linear), prior.gaussian
+    z = jax.random.normal(key, (draws, about.mean.size))
+    z = z.at[:, places].set(0.0).at[0].set(0.0)
     counts, first = likelihood.counts, likelihood.first_noise()
     N, e = jnp.sum(counts, axis=0), jnp.zeros((len(counts), likelihood.n_nuisances))
     n = likelihood.n_nuisances

@@ -115,13 +115,15 @@ class MissingForces(AbstractModel):
 class _Start(NamedTuple):
     """Where a descent begins: whitened parameters, noise, scales of the forces.
 
-    ``enough`` asks for no other start where it leaves no more noise than it began with.
+    ``enough`` asks for no other start where it leaves no more noise than it began with;
+    ``project`` for projected parameters and their noise in place of these.
     """
 
     z: Float[Array, "*s p"]
     noise: Float[Array, "*s d"]
     scales: Float[Array, "*s g"]
     enough: Bool[Array, "*s"]
+    project: bool | Bool[Array, "*s"] = False
 
 
 @eqx.filter_jit
@@ -130,16 +132,22 @@ def _fit(model: MissingForces, data: Transitions, last: _Start, key: Key) -> Est
     evidence from projected parameters, and from the simulator with all forces off."""
     likelihood = OneStepLikelihood(model.system, data, model.sim.dt)
     prior = model.prior(BROAD)
-    some, no = likelihood.thinned(ROWS), jnp.zeros((), bool)
-    (z, *_), (noise, *_) = projected(some, prior, DRAWS, 1, key)
-    off = jnp.where(jnp.asarray(prior.members.sum(axis=0) > 0), 0.0, last.z)
+    first, no = likelihood.first_noise().sd, jnp.zeros((), bool)
+    off = last.z.at[np.asarray(prior.linear)].set(0.0)
     fitted = last._replace(z=jnp.where(last.enough, last.z, jnp.nan))
-    plain = _Start(off, likelihood.first_noise().sd, OFF / BROAD * prior.scales, no)
-    each = fitted, _Start(z, noise, prior.scales, no), plain
+    plain = _Start(off, first, OFF / BROAD * prior.scales, no)
+    each = fitted, _Start(off, first, prior.scales, no, True), plain
+
+    def best_draw(_: _Start) -> tuple[Array, Array]:
+        some = likelihood.thinned(ROWS)
+        (z,), (sd,) = projected(some, prior, DRAWS, 1, key)
+        return z, sd
 
     def descend(start: _Start) -> Estimate:
-        noise, about = Noise(start.noise, jnp.ones(1)), prior.scaled(start.scales)
-        starts = start.z[None]
+        given = lambda start: (start.z, start.noise)  # noqa: E731
+        z, sd = jax.lax.cond(start.project, best_draw, given, start)
+        noise, about = Noise(sd, jnp.ones(1)), prior.scaled(start.scales)
+        starts = z[None]
         return estimate(likelihood, about, starts=starts, rounds=ROUNDS, noise=noise)
 
     def skip(start: _Start) -> Estimate:

@@ -211,6 +211,7 @@ def _noise_alone(model: Sim2GP, data: Transitions) -> Estimate:
 
 
 def belief_of(model: Sim2GP, found: Estimate, data: Transitions) -> Sim2GPBelief:
+    """What a fit of these data has found, as a belief."""
     return Sim2GPBelief(
         model.system,
         found.prior,

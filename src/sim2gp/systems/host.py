@@ -16,15 +16,11 @@ from jaxtyping import Array, Float
 
 from sim2gp.inference.linearized import value_and_jacobian
 from sim2gp.systems.base import AbstractPlant, AbstractSystem
-from sim2gp.systems.effects.base import AbstractJointEffect
-from sim2gp.systems.effects.forces import ForceField
+from sim2gp.systems.effects.forces import Forcing
 from sim2gp.systems.effects.kicks import kick
 from sim2gp.systems.machine import Machine, plant_of
 from sim2gp.systems.plants.external import AbstractSimulator
 from sim2gp.types import AnyArray
-
-#: What acts on joints: one effect, or all missing forces.
-Forcing = AbstractJointEffect | ForceField
 
 
 def simulator_of(system: AbstractSystem) -> AbstractSimulator | None:
@@ -106,12 +102,12 @@ class WithForces(AbstractSimulator):
         self,
         engine: AbstractSimulator,
         plant: AbstractPlant,
-        forcing: tuple[tuple[Forcing, tuple[str, ...]], ...],
+        forcing: tuple[Forcing, ...],
     ) -> None:
         self.engine, self.differences = engine, engine.differences
-        self.names = (*engine.names, *(name for _, names in forcing for name in names))
         self._kicks = tuple(_Kicks(plant, forcing, back) for back in (False, True))
-        self._count = len(self.names) - len(engine.names)
+        own = self._kicks[0].names
+        self.names, self._count = (*engine.names, *own), len(own)
 
     def flow(
         self,
@@ -150,8 +146,13 @@ class _Kicks(eqx.Module):
     """Kicks of a batch of states, in order or in reverse, as one compiled program."""
 
     plant: AbstractPlant
-    forcing: tuple[tuple[Forcing, tuple[str, ...]], ...]
+    forcing: tuple[Forcing, ...]
     backwards: bool
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the magnitudes and weights."""
+        return tuple(name for effect in self.forcing for name in effect.values)
 
     def __call__(
         self,
@@ -189,10 +190,7 @@ def _kicked_slopes(kicks: _Kicks, size: AnyArray, s: AnyArray, t: AnyArray) -> A
 
 
 def _kick(kicks: _Kicks, x: Float[Array, " en"], t: Array) -> Float[Array, " n"]:
-    ends = np.cumsum([len(names) for _, names in kicks.forcing])
-    *sizes, s = jnp.split(x, ends)
-    acting = [
-        (effect, size if isinstance(effect, ForceField) else size[0])
-        for (effect, _), size in zip(kicks.forcing, sizes, strict=True)
-    ]
+    size, s = jnp.split(x, [len(kicks.names)])
+    values = dict(zip(kicks.names, size, strict=True))
+    acting = [(effect, effect.own(values)) for effect in kicks.forcing]
     return kick(kicks.plant, acting[::-1] if kicks.backwards else acting, s, t)

@@ -46,16 +46,14 @@ from sim2gp.systems.effects.base import (
     AbstractJointEffect,
     check_effect,
 )
-from sim2gp.systems.effects.forces import ForceField, MissingForce
+from sim2gp.systems.effects.forces import ForceField, Forcing, MissingForce
 from sim2gp.systems.effects.kicks import kicked
 from sim2gp.systems.function_checks import names_of
-from sim2gp.systems.mechanism import AbstractMechanism, Acting, Effects
+from sim2gp.systems.mechanism import AbstractMechanism, Effects
 from sim2gp.systems.parts import AbstractPart
 from sim2gp.systems.sensors import EncoderOffset
 from sim2gp.systems.variants import AT, Variant, joint_table
 from sim2gp.types import Action, Scalar, State
-
-Names = tuple[str, ...]
 
 
 class MachineParams(eqx.Module):
@@ -285,20 +283,14 @@ class Machine(AbstractSystem):
         return means
 
     @property
-    def forcing(self) -> tuple[tuple[AbstractJointEffect | ForceField, Names], ...]:
-        """What acts on the joints, each with the names of its parameters."""
+    def forcing(self) -> tuple[Forcing, ...]:
+        """What acts on the joints: effects, and all missing forces as one."""
         forces = tuple(e for e in self.effects if isinstance(e, MissingForce))
-        field = ((ForceField(forces), ForceField(forces).names),) if forces else ()
-        return *((e, tuple(e.values)) for e in self.joint_effects), *field
+        return *self.joint_effects, *((ForceField(forces),) if forces else ())
 
     def acting(self, params: MachineParams) -> Effects:
         """The same with their magnitudes, or weights."""
-        found: list[Acting] = []
-        for effect, names in self.forcing:
-            each = [params.parts[name] for name in names]
-            many = isinstance(effect, ForceField)
-            found.append((effect, jnp.stack(each) if many else each[0]))
-        return found
+        return [(effect, effect.own(params.parts)) for effect in self.forcing]
 
     def _moved(
         self, params: MachineParams, s: State, a: Action, h: float | Scalar

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from sim2gp.errors import error
 from sim2gp.inference.parameters import Parameter
 from sim2gp.systems.base import AbstractPlant, index_of
-from sim2gp.systems.effects.units import law_unit
+from sim2gp.systems.effects.units import law_unit, velocity_of
 from sim2gp.systems.function_checks import check_returns
 from sim2gp.systems.mechanism import AbstractMechanism, Inertia, Pair
 from sim2gp.systems.parts import AbstractPart, around_nothing
@@ -83,6 +83,12 @@ class AbstractJointForce(AbstractForce):
     @abc.abstractmethod
     def accelerated(self, x: Scalar, q: Scalar, v: Scalar, t: Scalar) -> Scalar:
         """Velocity after ``t`` seconds of ``dv/dt = along(x, q, v)``, ``q`` held."""
+
+    def kicked(self, plant: AbstractPlant, x: Scalar, s: State, t: Scalar) -> State:
+        """The state after ``t`` seconds of this force alone (`effects.kicks`)."""
+        i = index_of(self.where, plant.physical_states)
+        j = velocity_of(plant, self.where)
+        return s.at[j].set(self.accelerated(x, s[i], s[j], t))
 
     def force(
         self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair

@@ -32,7 +32,11 @@ from jaxtyping import Float
 from sim2gp import checks
 from sim2gp.inference.parameters import Parameter
 from sim2gp.systems.base import AbstractPlant, index_of
-from sim2gp.systems.effects.base import AbstractEffect, AbstractInputEffect
+from sim2gp.systems.effects.base import (
+    AbstractEffect,
+    AbstractInputEffect,
+    AbstractJointEffect,
+)
 from sim2gp.systems.effects.friction_laws import dead_zone
 from sim2gp.systems.effects.units import force_unit, velocity_of
 from sim2gp.systems.mechanism import AbstractMechanism, Inertia, Pair
@@ -219,7 +223,7 @@ class MissingForce(AbstractUnknownFunction):
 
 
 class MissingInput(AbstractInputEffect, AbstractUnknownFunction):
-    """What arrives of an input beside itself, as a function of it."""
+    """What is added to an input before it arrives, as a function of it."""
 
     where: str = eqx.field(static=True)
     magnitude: float = eqx.field(static=True)
@@ -234,14 +238,21 @@ class MissingInput(AbstractInputEffect, AbstractUnknownFunction):
 
 
 class ForceField(eqx.Module):
-    """All missing forces of a machine at once, for the weights of all."""
+    """All missing forces of a machine at once, for the weights of all.
+
+    It acts on a machine as `AbstractJointForce` does, on all of its joints.
+    """
 
     forces: tuple[MissingForce, ...] = eqx.field(static=True)
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the weights."""
-        return tuple(name for force in self.forces for name in force.values)
+    def values(self) -> dict[str, float]:
+        """Its weights by name, as those of a part."""
+        return {k: w for force in self.forces for k, w in force.values.items()}
+
+    def own(self, values: Mapping[str, Scalar]) -> Float[AnyArray, " k"]:
+        """What its functions take, out of all values: all weights."""
+        return jnp.concatenate([force.own(values) for force in self.forces])
 
     def along(
         self,
@@ -282,7 +293,6 @@ class ForceField(eqx.Module):
         j = {name: velocity_of(plant, name) for name in names}
         q = {name: s[index_of(name, plant.physical_states)] for name in names}
         v = {name: s[j[name]] for name in names}
-        x = x.astype(s.dtype)
         first = self.along(x, q, v)
         middle = {name: v[name] + 0.5 * t * first[name] for name in names}
         for name, a in self.along(x, q, middle).items():
@@ -319,3 +329,7 @@ def _split(
 ) -> list[Float[AnyArray, " _"]]:
     """The weights of each."""
     return jnp.split(x, np.cumsum([len(f.basis.sds) for f in forces])[:-1])
+
+
+#: What acts on joints: one effect, or all missing forces.
+Forcing = AbstractJointEffect | ForceField

@@ -12,10 +12,9 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from sim2gp.systems.base import AbstractPlant, index_of
+from sim2gp.systems.base import AbstractPlant
 from sim2gp.systems.effects.base import AbstractJointForce
 from sim2gp.systems.effects.forces import ForceField
-from sim2gp.systems.effects.units import velocity_of
 from sim2gp.systems.mechanism import Acting, Effects
 from sim2gp.types import Action, Scalar, State
 
@@ -43,12 +42,6 @@ def kick(
 ) -> State:
     """State whose joints' velocities the effects have changed for ``t`` seconds."""
     for effect, x in effects:
-        if isinstance(effect, ForceField):
-            s = effect.kicked(plant, x, s, t)
-            continue
-        assert isinstance(effect, AbstractJointForce)  # as `check_effect` asks
-        i = index_of(effect.where, plant.physical_states)
-        j = velocity_of(plant, effect.where)
-        v = effect.accelerated(x.astype(s.dtype), s[i], s[j], t)
-        s = s.at[j].set(v)
+        assert isinstance(effect, AbstractJointForce | ForceField)  # `check_effect`
+        s = effect.kicked(plant, x.astype(s.dtype), s, t)
     return s
