@@ -10,7 +10,7 @@ import pytest
 from rail_mass import DT, rail_mass
 from sim2gp.systems import Furuta, free_parts
 from sim2gp.systems.effects.forces import (
-    DeadZones,
+    Gap,
     MissingForce,
     MissingInput,
     Sign,
@@ -104,7 +104,7 @@ def test_forces_stand_in_the_equations_of_motion():
     got = (machine.flow(params, s, a, h) - machine.flow(params, s, a, -h)) / (2.0 * h)
     u, force = a[0], np.zeros(2)
     for part in parts:
-        w = jnp.asarray(part.weights)
+        w = part.own({k: jnp.asarray(x) for k, x in part.values.items()})
         if isinstance(part, MissingInput):
             u = u + part.basis.value(w, u)
             continue
@@ -184,12 +184,15 @@ def test_weights_are_groups_of_one_function_each():
     groups = machine.parameters.groups
     assert len(groups) == 8  # three a joint, two an input
     every = np.concatenate(list(groups.values()))
-    assert sorted(every) == list(range(8, len(machine.parameters)))
+    width = machine.parameters.names.index("voltage.dead_zone.width")
+    assert sorted([*every, width]) == list(range(8, len(machine.parameters)))
     assert len(machine.parameters.ungrouped()) == 8
 
 
-def test_dead_zones_take_the_input_away_below_their_width():
-    zones = DeadZones((0.5, 1.0))
-    x = jnp.asarray([0.0, 1.0])
-    assert float(zones.value(x, jnp.asarray(0.4))) == pytest.approx(-0.4, rel=1e-4)
-    assert float(zones.value(x, jnp.asarray(2.0))) == pytest.approx(0.0, abs=1e-6)
+def test_a_gap_takes_the_input_away_below_its_width():
+    gap, w = Gap(0.5), 0.8
+    for share in (1.0, 0.5):
+        x = jnp.asarray([share * w, w])
+        for u, there in ((0.4, 1.0), (-0.6, 1.0), (1.2, 0.0)):
+            found = float(gap.value(x, jnp.asarray(u)))
+            assert found == pytest.approx(-share * u * there, abs=6e-3)

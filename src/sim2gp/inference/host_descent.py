@@ -102,8 +102,7 @@ def descend(
         # More than all is worth no more, and what is refused has no ratio: neither may
         # be divided by a step that promises nothing.
         ratio = gain / predicted if keep and gain < predicted else 1.0
-        damping = float(next_damping(damping, keep, ratio))
-        damping *= 4.0 ** max(0, refused - 1)  # each refusal raises it by more
+        damping = float(next_damping(damping, float(refused), ratio))
         vain = size <= NEAR and gain <= NOTHING
         if keep:
             here = _linearised(prior, z, e, trial, noise)

@@ -43,6 +43,7 @@ FIRST_DAMPING = 1.0  # the prior's own precision: trust one prior standard devia
 AGAIN_DAMPING = 1e-2  # of a descent that follows another
 LEAST_DAMPING = 1e-5  # below this the step is undamped
 MOST_DAMPING = 1e14
+RAISE = 4.0  # of the damping, where a step is refused; twice in turn, by its square
 STALE = 1e-2  # posterior sd, of what the linear parameters move without derivatives
 T = TypeVar("T")
 
@@ -186,31 +187,27 @@ def _descend(
     fresh, exact, idle = kind
 
     def improve(carry: tuple) -> tuple:
-        here, damping, count, _, stale, again = carry
+        here, tried, count, _, stale, again = carry
+        damping, _ = tried
         dz, de, predicted = step(terms[1], here, noise, damping)
         first = fresh & (count == 0)
         z = jnp.where(again, here.z, terms[1].moved(here.z, dz))
         z, e = jnp.where(first, start[0], z), jnp.where(again, here.e, here.e + de)
         found = evaluate(*terms, z, jnp.where(first, start[1], e), noise)
         there = relaxed(terms[1], found, noise)
-        keep, next_damping = judged(here, there, predicted, damping)
-        gain = here.cost - there.cost
-        settled = keep & (gain <= ends.tolerance * (1.0 + there.cost))
-        # Differences of a simulator on the host hide what such a step would gain.
-        flat, short = JOINT_TOLERANCE
-        undamped = damping < LEAST_DAMPING
-        vain = ~keep & undamped & (predicted <= 0.5 * short**2)
-        near = keep & undamped & (predicted < 0.5 * ends.until**2)
-        settled = jnp.where(exact, near | vain & (here.gradient <= flat), settled)
+        keep, next_damping = judged(here, there, predicted, *tried)
+        gained = here.cost - there.cost > ends.tolerance * (1.0 + there.cost)
+        last = _is_last(here, keep, predicted, damping, ends)
+        settled = jnp.where(exact, last, keep & ~gained)
         # A start has nothing to be compared with, nor has a place that is seen again.
-        damping = jnp.where(first | again, damping, next_damping)
+        tried = _select(first | again, tried, next_damping)
         keep = keep | again
         stale = jnp.where(keep, _is_stale(found, there), stale)
         here = _select(keep, there, here)
-        return here, damping, count + 1, settled & ~again, stale, stale & ~keep
+        return here, tried, count + 1, settled & ~again, stale, stale & ~keep
 
     def unfinished(carry: tuple) -> Array:
-        here, damping, count, settled, _, again = carry
+        here, (damping, _), count, settled, _, again = carry
         finite = jnp.isfinite(here.cost)
         small = finite & (here.gradient <= 0.1 * GRADIENT_TOLERANCE)
         many = count > jnp.where(fresh | exact, MAX_STEPS, ends.most)
@@ -223,9 +220,26 @@ def _descend(
     damping = jnp.where(exact, 0.0, jnp.where(fresh, FIRST_DAMPING, AGAIN_DAMPING))
     stale = ~fresh & bool(terms[1].linear)  # another prior has moved what is linear
     no = jnp.zeros((), bool)
-    carry = (here, damping, jnp.zeros((), int), no, stale, no)
-    here, damping, count, *_ = jax.lax.while_loop(unfinished, improve, carry)
+    tried = damping, jnp.zeros(())  # no step is refused yet
+    carry = (here, tried, jnp.zeros((), int), no, stale, no)
+    here, (damping, _), count, *_ = jax.lax.while_loop(unfinished, improve, carry)
     return here, damping, count
+
+
+def _is_last(
+    here: Point,
+    keep: Bool[Array, ""],
+    predicted: Scalar,
+    damping: Scalar,
+    ends: Ends,
+) -> Bool[Array, ""]:
+    """Whether a step ends a descent to a zero gradient."""
+    flat, short = JOINT_TOLERANCE
+    undamped = damping < LEAST_DAMPING
+    near = keep & (predicted < 0.5 * ends.until**2)
+    # Differences of a simulator on the host hide what such a step would gain.
+    vain = ~keep & (predicted <= 0.5 * short**2) & (here.gradient <= flat)
+    return undamped & (near | vain)
 
 
 def _is_stale(found: Point, there: Point) -> Bool[Array, ""]:
@@ -237,9 +251,13 @@ def _is_stale(found: Point, there: Point) -> Bool[Array, ""]:
 
 
 def judged(
-    here: Point, there: Point, predicted_reduction: AnyScalar, damping: Scalar
-) -> tuple[Bool[Array, ""], Scalar]:
-    """Whether a step is kept, and the damping of the next one (Nielsen 1999)."""
+    here: Point,
+    there: Point,
+    predicted_reduction: AnyScalar,
+    damping: Scalar,
+    refused: Scalar,
+) -> tuple[Bool[Array, ""], tuple[Scalar, Scalar]]:
+    """Whether a step is kept, the next one's damping, and how many were refused."""
     actual_reduction = here.cost - there.cost
     # Rounding in the cost must not refuse the last, gradient-only digits.
     slack = 1e-12 * (1.0 + there.cost)
@@ -248,16 +266,20 @@ def judged(
     keep = (actual_reduction > slack) | lost_in_rounding
     ratio = actual_reduction / predicted_reduction
     ratio = jnp.where(lost_in_rounding, 1.0, ratio)  # rounding has none
-    return keep, next_damping(damping, keep, ratio)
+    refused = jnp.where(keep, 0.0, refused + 1.0)
+    return keep, (next_damping(damping, refused, ratio), refused)
 
 
-def next_damping(
-    damping: AnyScalar, keep: bool | Bool[Array, ""], ratio: AnyScalar
-) -> Any:
-    """The damping after a step that saved ``ratio`` times what it should."""
+def next_damping(damping: AnyScalar, refused: AnyScalar, ratio: AnyScalar) -> Any:
+    """The damping after a step that saved ``ratio`` times what it should.
+
+    Each step that is refused in turn, ``refused`` until now, raises it by more (Nielsen
+    1999).
+    """
     xp = library(ratio)
     lowered = damping * xp.clip(1.0 - (2.0 * ratio - 1.0) ** 3, 0.1, 2.0)
-    return xp.where(keep, lowered, 4.0 * xp.maximum(damping, LEAST_DAMPING))
+    raised = RAISE**refused * xp.maximum(damping, LEAST_DAMPING)
+    return xp.where(refused == 0, lowered, raised)
 
 
 def step(

@@ -37,7 +37,8 @@ class Parameter:
 
     ``mean`` and ``sd`` describe the virtual value; ``nominal`` is the published
     physical value, where there is one. Those of one ``group`` are weights of one
-    function, whose prior sd the data scale (`sim2gp.inference.relevance`).
+    function, whose prior sd the data scale (`sim2gp.inference.relevance`); but for its
+    ``shape``, in which it is not linear, and which no scale turns off.
 
     Raises `InputError` E141 for an unknown map and for bounds that the map cannot have,
     E144 for a prior's mean or sd that cannot be, E148 for a nominal value that is not
@@ -54,6 +55,7 @@ class Parameter:
     sd: float = BOX_SD
     nominal: float | None = None
     group: str = ""
+    shape: bool = False
 
     def __post_init__(self) -> None:
         if self.map not in bijections.MAPS:
@@ -233,13 +235,13 @@ class Parameters(eqx.Module):
 
     @property
     def groups(self) -> dict[str, np.ndarray]:
-        """Places of the parameters of each group."""
+        """Places of the weights of each group."""
         names = dict.fromkeys(p.group for p in self.free if p.group)
-        each = np.asarray([p.group for p in self.free])
+        each = np.asarray(["" if p.shape else p.group for p in self.free])
         return {name: np.flatnonzero(each == name) for name in names}
 
     def ungrouped(self) -> "Parameters":
-        """The table without the weights of functions."""
+        """The table without the parameters of functions."""
         free = tuple(p for p in self.free if not p.group)
         return dataclasses.replace(self, free=free)
 

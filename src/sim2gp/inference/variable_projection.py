@@ -29,7 +29,7 @@ def projected(
 ) -> tuple[Float[Array, "best p"], Float[Array, "best c"]]:
     """The best of so many draws: whitened starts, and the noise sd at each.
 
-    Linear are the parameters of groups. The first draw is the prior's mean.
+    Linear are the weights of groups. The first draw is the prior's mean.
     """
     places, about = np.asarray(prior.linear), prior.gaussian
     z = jax.random.normal(key, (draws, about.mean.size))

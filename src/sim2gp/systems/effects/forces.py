@@ -46,6 +46,7 @@ from sim2gp.types import AnyArray, Scalar, State
 REACH, LENGTH = 2.5, 1.0
 COUNT = 6  # of features
 SOFT = 0.05  # of a dead zone's width: how soon it ends
+WIDTH_SD = 0.6  # of the logarithm of a dead zone's width
 
 
 @dataclass(frozen=True)
@@ -150,25 +151,25 @@ class Sign:
 
 
 @dataclass(frozen=True)
-class DeadZones:
-    """What dead zones of these widths take away from an input, over their width."""
+class Gap:
+    """A dead zone of an unknown width: of all bases only this has a shape to learn.
 
-    widths: tuple[float, ...]
+    ``width`` is the width's median; its logarithm has the sd `WIDTH_SD`.
+    """
 
-    @property
-    def sds(self) -> tuple[float, ...]:
-        return (1.0,) * len(self.widths)
+    width: float
+    sds: ClassVar[tuple[float, ...]] = (1.0,)
 
-    def value(self, x: Float[AnyArray, " k"], z: Scalar) -> Scalar:
-        """What they change, each ``x`` times."""
-        found = jnp.zeros_like(z)
-        for k, w in enumerate(self.widths):
-            left = dead_zone(z, jnp.asarray(w, z.dtype), SOFT * w)
-            found = found + x[k] * (left - z) / w
-        return found
+    def value(self, x: Float[AnyArray, " 2"], z: Scalar) -> Scalar:
+        """What it takes away: ``x[0]`` at the edge, where ``z`` is the width ``x[1]``.
+
+        A true dead zone takes all of the input, ``x[0] = x[1]``.
+        """
+        w = x[1]
+        return (dead_zone(z, w, SOFT * w) - z) * (x[0] / w)
 
 
-Basis = Sines | Sign | DeadZones
+Basis = Sines | Sign | Gap
 #: Functions, the states that they are of, and those that they push.
 Places = tuple[tuple[Basis, int, int], ...]
 
@@ -190,20 +191,27 @@ class AbstractUnknownFunction(AbstractEffect):
     @property
     def values(self) -> dict[str, float]:
         weights = self.weights or (0.0,) * len(self.basis.sds)
-        return {f"{self.name}[{k}]": w for k, w in enumerate(weights, start=1)}
+        found = {f"{self.name}[{k}]": w for k, w in enumerate(weights, start=1)}
+        if isinstance(self.basis, Gap):
+            found[f"{self.name}.width"] = self.basis.width
+        return found
 
     def own(self, values: Mapping[str, Scalar]) -> Float[AnyArray, " k"]:
         return jnp.stack([values[name] for name in self.values])
 
     def priors(self, plant: AbstractPlant) -> tuple[Parameter, ...]:
-        unit = self.unit(plant)
-        meaning = f"weight in the {self.meaning}"
-        return tuple(
-            Parameter(
-                name, unit, meaning, "identity", sd=self.magnitude * sd, group=self.name
-            )
-            for name, sd in zip(self.values, self.basis.sds, strict=True)
-        )
+        unit, names = self.unit(plant), tuple(self.values)
+        what = f"weight in the {self.meaning}", "identity"
+        found = [
+            Parameter(name, unit, *what, sd=self.magnitude * sd, group=self.name)
+            for name, sd in zip(names, self.basis.sds, strict=False)
+        ]
+        if isinstance(self.basis, Gap):
+            about = names[-1], unit, "width of the dead zone", "log", 0.0, math.inf
+            mean, sd = math.log(self.basis.width), WIDTH_SD
+            width = Parameter(*about, mean, sd, group=self.name, shape=True)
+            found.append(width)
+        return tuple(found)
 
 
 class MissingForce(AbstractUnknownFunction):

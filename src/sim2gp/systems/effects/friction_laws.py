@@ -36,7 +36,7 @@ def coulomb_arctangent(v: Scalar, level: Scalar, width: float) -> Scalar:
     return level * (2.0 / jnp.pi) * jnp.arctan(v / width)
 
 
-def dead_zone(u: Scalar, width: Scalar, smoothing: float) -> Scalar:
+def dead_zone(u: Scalar, width: Scalar, smoothing: float | Scalar) -> Scalar:
     """An input without effect below ``width``: ``u sigmoid((|u| - width) / eps)``."""
     z = jnp.clip((jnp.abs(u) - width) / smoothing, -40.0, 40.0)
     return u / (1.0 + jnp.exp(-z))

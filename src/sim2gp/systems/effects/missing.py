@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from sim2gp.systems.base import LONGEST_MEAN, AbstractSystem
 from sim2gp.systems.effects.base import AbstractEffect
 from sim2gp.systems.effects.forces import (
-    DeadZones,
+    Gap,
     MissingForce,
     MissingInput,
     Sign,
@@ -21,7 +21,7 @@ HARMONICS = 2  # of a joint that may turn round
 #: Of dry friction's width: the change of velocity by the drive in a substep.
 WIDTH = 0.2
 DRY, CHANGE, GAP = 0.1, 0.1, 0.2  # prior sd, shares of the drive and of an input
-GAPS = (0.1, 0.14, 0.2, 0.28)  # widths of dead zones, shares of an input
+GAP_WIDTH = 0.12  # median of a dead zone's width, share of an input
 INPUT_REACH, INPUT_LENGTH = 1.2, 0.3  # half-widths of an input
 
 
@@ -29,7 +29,7 @@ def missing_forces(
     system: AbstractSystem, box: Mapping[str, tuple[float, float]]
 ) -> list[AbstractEffect]:
     """Of each joint a force by position, by velocity and of dry friction; of each input
-    a smooth change and dead zones.
+    a smooth change and a dead zone.
 
     ``box`` is where the machine moves, by channel.
     """
@@ -55,9 +55,8 @@ def missing_forces(
         low, high = box[channel.name]
         half, name = 0.5 * (high - low), channel.name
         change = smooth(low, high, reach=INPUT_REACH, length=INPUT_LENGTH)
-        gaps = DeadZones(tuple(share * half for share in GAPS))
         found += [
             MissingInput(name, CHANGE * half, change),
-            MissingInput(name, GAP * half, gaps, what="dead_zones"),
+            MissingInput(name, GAP * half, Gap(GAP_WIDTH * half), what="dead_zone"),
         ]
     return found
