@@ -13,7 +13,7 @@ from sim2gp.inference.least_squares import factor
 from sim2gp.inference.linear_likelihood import LinearLikelihood
 from sim2gp.inference.parameters import Parameter, Parameters
 from sim2gp.inference.prior import ParameterPrior
-from sim2gp.inference.relevance import OFF, Linear, relevant
+from sim2gp.inference.relevance import EARNED, OFF, Linear, relevant
 
 pytestmark = pytest.mark.usefixtures("float64")
 N, SIZES = 60, (1, 4, 4)  # rows, and parameters: one alone, two groups
@@ -71,6 +71,33 @@ def test_scales_and_noise_have_the_highest_evidence(about: float):
     best = scipy.optimize.minimize(lost, [0.0, 0.0, -1.0], tol=1e-12)
     found = np.log([*np.asarray(prior.scales), float(noise.sd[0])])
     np.testing.assert_allclose(found, best.x, atol=2e-4)
+
+
+def test_a_group_stays_on_where_it_earns_its_place():
+    """At the threshold its gain is the closed form's."""
+    prior = ParameterPrior(table().prior(), table())
+    kept = {}
+    for strength in np.geomspace(0.01, 0.3, 12).tolist():
+        J, y = problem((2.0, strength))
+        noise, p = Noise(jnp.ones(1), jnp.ones(1)), prior
+        for _ in range(12):
+            linear = linear_at(J, y, p, np.zeros(sum(SIZES)))
+            noise, p = relevant(linear, jnp.zeros(sum(SIZES)), noise, p)
+        a, b, s = *np.asarray(p.scales), float(noise.sd[0])
+
+        def lost(t, data=(J, y, a, s)):
+            J, y, a, s = data
+            return -log_evidence(J, y, [a, np.exp(t)], s)
+
+        best = scipy.optimize.minimize_scalar(
+            lost, bounds=(-9.0, 2.0), method="bounded"
+        )
+        kept[lost(-20.0) - best.fun] = b > 2.0 * OFF
+    gains = np.asarray(sorted(kept))
+    on = np.asarray([kept[g] for g in gains])
+    assert on[gains > EARNED + 0.5].all()
+    assert not on[gains < EARNED - 0.5].any()
+    assert 0 < on.sum() < on.size
 
 
 def test_a_group_that_is_not_needed_goes_off():
