@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib.util
+import itertools
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -17,24 +18,26 @@ from sim2gp.data.split_log import cut
 from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.intervals import scatter as intervals
-from sim2gp.identification.intervals.discrepancy import (
-    _with_effects_at_zero,
-    corrected_windows,
-)
-from sim2gp.identification.intervals.pulls import Pulls
-from sim2gp.identification.intervals.scatter import (
+from sim2gp.identification.intervals.averaging import (
+    NONE,
     NOTHING,
     SHARES,
-    CorrectedFit,
-    correct_posterior,
+    averaged,
 )
-from sim2gp.identification.intervals.words import interval_entry, missing_physics_table
+from sim2gp.identification.intervals.discrepancy import (
+    _apart,
+    _with_forces_at_zero,
+    corrected_windows,
+    forces_of,
+)
+from sim2gp.identification.intervals.pulls import Pulls
+from sim2gp.identification.intervals.scatter import CorrectedFit, correct_posterior
+from sim2gp.identification.intervals.words import interval_entry, missing_forces_table
 from sim2gp.inference.arrowhead import Noise
 from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.parameters import Parameter
 from sim2gp.systems import Delay, UniformRodArm, with_parts
-from sim2gp.systems.effects.registry import smooth_effects
 from sim2gp.types import in_float64
 from tests.identification.test_intervals import (
     HIGH,
@@ -47,8 +50,10 @@ from tests.identification.test_intervals import (
 )
 
 ROOT = Path(__file__).resolve().parents[2]
+BOX = ("q1", "q2", "torque1", "torque2")
 OWN, ALL = 3, 5
 EFFECTS = np.arange(ALL) >= OWN
+GROUPS = {"force": np.flatnonzero(EFFECTS)}
 
 
 def sensitivities(rng: np.random.Generator) -> np.ndarray:
@@ -58,32 +63,71 @@ def sensitivities(rng: np.random.Generator) -> np.ndarray:
     return np.concatenate([J, like + 0.3 * smooth(rng, 2.0)[..., : ALL - OWN]], axis=-1)
 
 
-def test_the_average_over_shares_is_bayes() -> None:
-    """Beside the marginal of the data under each share, in covariances, by scipy."""
+@pytest.mark.parametrize(
+    "groups", [{"a": [3, 4]}, {"a": [3], "b": [4]}], ids=["one group", "two"]
+)
+def test_the_average_over_groups_is_bayes(groups: dict[str, list[int]]) -> None:
+    """Against the marginal of the data under each choice, in covariances, by scipy."""
     rng = np.random.default_rng(0)
     root = rng.standard_normal((7, ALL)) * [3.0, 1.0, 2.0, 4.0, 0.5]
     data = root @ [0.5, -1.0, 0.2, 0.15, -0.1] + rng.standard_normal(7)
-    mean, scale, missing = intervals._averaged(root, data, EFFECTS)
-    shares = np.array([0.0, *SHARES])
-    odds = np.array([NOTHING, *[(1.0 - NOTHING) / len(SHARES)] * len(SHARES)])
-    means, covs = [], []
-    for k, share in enumerate(shares):
-        prior = np.diag(np.where(EFFECTS, share, 1.0) ** 2)
+    places = {name: np.asarray(at) for name, at in groups.items()}
+    mean, scale, each = averaged(root, data, places)
+
+    def choice(scales: dict[str, float]) -> tuple[float, np.ndarray, np.ndarray]:
+        sd = np.where(EFFECTS, 0.0, 1.0)
+        for name, share in scales.items():
+            sd[groups[name]] = share
+        prior = np.diag(sd**2)
         S = root @ prior @ root.T + np.eye(7)
-        odds[k] *= scipy.stats.multivariate_normal(np.zeros(7), S).pdf(data)
+        odds = scipy.stats.multivariate_normal(np.zeros(7), S).pdf(data)
+        sizes = [1.0, 0.5][: len(groups)]  # a second group is half as likely
+        if scales:
+            alike = len(list(itertools.combinations(groups, len(scales))))
+            share = sizes[len(scales) - 1] / sum(sizes) / alike
+            odds *= (1.0 - NOTHING) * share / len(SHARES) ** len(scales)
+        else:
+            odds *= NOTHING
         gain = prior @ root.T @ np.linalg.inv(S)
-        means.append(gain @ data)
-        covs.append(prior - gain @ root @ prior)
+        return odds, gain @ data, prior - gain @ root @ prior
+
+    tried: list[dict[str, float]] = [{}]
+    tried += [{name: s} for name in groups for s in SHARES]
+    best = max(tried, key=lambda s: choice(s)[0])
+    if len(groups) > 1 and best:
+        tried += [{**best, n: s} for n in groups if n not in best for s in SHARES]
+    found = [choice(scales) for scales in tried]
+    odds = np.asarray([f[0] for f in found])
     odds /= odds.sum()
     assert 0.05 < odds[0] < 0.95
-    assert missing == pytest.approx(1.0 - odds[0], rel=1e-9)
-    want = odds @ np.array(means)
+    assert each[NONE] == pytest.approx(odds[0], rel=1e-9)
+    for name in groups:
+        on = [name in scales for scales in tried]
+        assert each[name] == pytest.approx(float(odds @ np.asarray(on, float)))
+    means = np.asarray([f[1] for f in found])
+    want = odds @ means
     np.testing.assert_allclose(mean, want, rtol=1e-9)
-    away = np.array(means) - want
-    cov = np.einsum(
-        "k,kij->ij", odds, np.array(covs) + away[:, :, None] * away[:, None]
-    )
+    away = means - want
+    covs = np.asarray([f[2] for f in found]) + away[:, :, None] * away[:, None]
+    cov = np.einsum("k,kij->ij", odds, covs)
     np.testing.assert_allclose(scale @ scale.T, cov, rtol=1e-8, atol=1e-12)
+
+
+def test_what_acts_as_a_parameter_is_no_force() -> None:
+    """Of a group all directions but the one that is a sum of parameters' columns."""
+    rng = np.random.default_rng(4)
+    own, free = rng.standard_normal((30, 2)), rng.standard_normal((30, 3))
+    like = own @ [0.3, -0.7]
+    turn = np.linalg.qr(rng.standard_normal((4, 4)))[0]
+    G = np.concatenate([free, like[:, None]], axis=1) @ turn
+    kept = _apart(G, np.linalg.qr(own)[0])
+    assert kept.shape == (4, 3)
+    np.testing.assert_allclose(kept.T @ kept, np.eye(3), atol=1e-12)
+    # What is left acts apart: with no direction is all in the parameters' span.
+    rest = G @ kept - own @ np.linalg.lstsq(own, G @ kept)[0]
+    lengths = np.linalg.svd(rest)[1] / np.linalg.norm(G @ kept, 2)
+    assert lengths.min() > 0.1
+    assert _apart(np.zeros((30, 2)), np.linalg.qr(own)[0]).shape == (2, 0)
 
 
 def told(model: Linear, y: np.ndarray, allowed: bool) -> CorrectedFit:
@@ -94,10 +138,11 @@ def told(model: Linear, y: np.ndarray, allowed: bool) -> CorrectedFit:
     scores = np.einsum("wlp,wl->wp", model.J, model.J @ z - y)
     pulls = Pulls(model.J, scores, model.group)
     if allowed:
-        return correct_posterior(model.prior, gaussian(z, np.eye(ALL)), pulls, EFFECTS)
-    first = np.arange(OWN)
+        return correct_posterior(model.prior, gaussian(z, np.eye(ALL)), pulls, GROUPS)
     prior = gaussian(np.zeros(OWN), np.eye(OWN))
-    return correct_posterior(prior, gaussian(z[:OWN], np.eye(OWN)), pulls.of(first))
+    return correct_posterior(
+        prior, gaussian(z[:OWN], np.eye(OWN)), pulls.onto(np.eye(ALL)[:, :OWN])
+    )
 
 
 def covered(lacks: float, rho: float, allowed: bool) -> tuple[float, float, float]:
@@ -142,7 +187,7 @@ def test_it_does_not_matter_where_a_linear_machine_is_linearised() -> None:
     scores = np.einsum("wlp,wl->wp", model.J, model.J @ z - y)
     there = gaussian(z, np.eye(ALL))
     again = correct_posterior(
-        model.prior, there, Pulls(model.J, scores, model.group), EFFECTS
+        model.prior, there, Pulls(model.J, scores, model.group), GROUPS
     )
     one, other = Plain(again.posterior), Plain(found.posterior)
     np.testing.assert_allclose(one.mean, other.mean, atol=1e-9)
@@ -193,23 +238,26 @@ def test_friction_that_the_simulator_lacks_is_in_the_intervals(
     one = np.zeros(len(likelihood.windows), int)
     assert away(truth, belief.posterior).max() > 12.0
     alone = corrected_windows(likelihood, belief, one, ())
-    assert alone.effects == ()
+    assert alone.forces == ()
     assert away(truth, alone.posterior).max() > 7.0
     found = corrected_windows(likelihood, belief, one)
     assert found.missing > 0.99
-    assert {"q1.coulomb", "q2.coulomb"} <= set(found.effects)
-    assert not any("viscous" in name for name in found.effects)  # a damping, again
+    assert found.each["dry_friction"] > 0.99
     assert found.posterior.scale.shape == (4, 4)
-    assert away(truth, found.posterior).max() < 2.0
-    about = interval_entry(UniformRodArm(), found, {}, 50)
-    for q in "q1", "q2":
-        friction = about["allowed_for"][f"{q}.coulomb"]
-        assert abs(friction["mean"] - 0.02) < 3.0 * friction["sd"]
-        assert friction["unit"] == "N m"
+    assert away(truth, found.posterior).max() < 2.5
+    about = interval_entry(found, {}, 50)
     assert about["missing"] == found.missing
-    (table,) = missing_physics_table(about)
-    assert [row[0] for row in table["rows"][:1]] in (["q1.coulomb"], ["q2.coulomb"])
-    assert len(table["rows"]) == len(found.effects)
+    curves = {curve.name: curve for curve in found.found}
+    assert set(curves) == {"q1 by q1.velocity", "q2 by q2.velocity"}
+    for q in "q1", "q2":
+        curve = curves[f"{q} by {q}.velocity"]
+        assert (curve.unit, curve.of_unit) == ("N m", "rad/s")
+        true = -0.02 * np.tanh(curve.at / arms.WIDTH)
+        inner = np.abs(curve.at) < 0.7 * curve.at.max()
+        outside = np.abs(curve.mean - true) > 2.0 * curve.sd
+        assert np.mean(outside[inner]) < 0.1
+    (table,) = missing_forces_table(about)
+    assert {row[0] for row in table["rows"]} == {"q1", "q2"}
     # Where a fit without effects stands is of no account.
     with jax.enable_x64(True):
         at = belief.posterior.mean + jnp.asarray([0.2, -0.3, 0.2, 0.5])
@@ -227,15 +275,15 @@ def test_a_sound_simulator_is_believed(arms: ModuleType) -> None:
     found = corrected_windows(likelihood, belief, one)
     alone = corrected_windows(likelihood, belief, one, ())
     assert found.missing < 0.3
-    assert missing_physics_table(interval_entry(UniformRodArm(), found, {}, 50)) == []
-    assert interval_entry(UniformRodArm(), alone, {}, 50)["missing"] is None
-    assert interval_entry(UniformRodArm(), alone, {}, 50)["allowed_for"] == {}
+    assert missing_forces_table(interval_entry(found, {}, 50)) == []
+    assert interval_entry(alone, {}, 50)["missing"] is None
+    assert interval_entry(alone, {}, 50)["allowed_for"] == {}
     assert np.max(Plain(found.posterior).sd / Plain(alone.posterior).sd) < 1.3
     assert away(truth, found.posterior).max() < 3.0
 
 
 @in_float64
-def test_a_belief_keeps_its_constants_among_effects() -> None:
+def test_a_belief_keeps_its_parameters_among_forces() -> None:
     """Actuators, whose constants stand elsewhere in the table, and a dense prior."""
     delay = Parameter("torque1.delay", "s", "delay", "bounded", 0.0, 0.02)
     parts = {"torque1.delay": delay}
@@ -246,31 +294,36 @@ def test_a_belief_keeps_its_constants_among_effects() -> None:
     posterior = Gaussian(jnp.linspace(-1.0, -2.0, p), scale)
     none = jnp.zeros(1)
     belief = estimate_of(prior, posterior, Noise(none, none), none[None])
-    wider, whole, own = _with_effects_at_zero(system, belief, smooth_effects(system))
+    box = dict.fromkeys([*BOX, *(f"{q}.velocity" for q in BOX)], (-1.0, 1.0))
+    forces = forces_of(system, box)
+    wider, whole, own = _with_forces_at_zero(system, belief, forces)
     names = wider.parameters.names
     assert len(names) > p + 6
     assert tuple(names[k] for k in own) == system.parameters.names
     np.testing.assert_array_equal(whole.posterior.mean[own], posterior.mean)
     np.testing.assert_array_equal(whole.prior.mean[own], prior.mean)
     np.testing.assert_array_equal(whole.prior.scale[np.ix_(own, own)], scale)
-    effects = np.setdiff1d(np.arange(len(names)), own)
-    np.testing.assert_array_equal(whole.posterior.mean[effects], 0.0)
-    assert not np.any(np.asarray(whole.prior.scale)[np.ix_(own, effects)])
+    others = np.setdiff1d(np.arange(len(names)), own)
+    mean = wider.parameters.prior().mean
+    np.testing.assert_array_equal(whole.posterior.mean[others], mean[others])
+    assert not np.any(np.asarray(whole.prior.scale)[np.ix_(own, others)])
 
 
 def test_the_words_say_whether_physics_is_missing() -> None:
     posterior = gaussian(np.zeros(1), np.eye(1))
-    found = CorrectedFit(posterior, 1.0, 1, 30.0, True, 0.97, ("q1.coulomb", "q1.drag"))
+    found = CorrectedFit(posterior, 1.0, 1, 30.0, True, {NONE: 0.03, "ripple": 0.97})
     text = intervals.describe_intervals(found, [1.0, 4.0], 40)
     assert text.startswith("Intervals are 1 to 4 times as wide as if every sample were")
     assert "coloured" not in text
-    assert "lacks physics with a probability of 97 %: intervals allow for 2" in text
+    assert "lacks physics with a probability of 97 %: intervals allow for" in text
     assert "sim2gp explain" in text
-    sound = CorrectedFit(posterior, 9.0, 1, 30.0, True, 0.04, ("q1.coulomb",))
+    sound = CorrectedFit(posterior, 9.0, 1, 30.0, True, {NONE: 0.96, "ripple": 0.04})
     text = intervals.describe_intervals(sound, [3.0], 40)
     assert "coloured and pull the parameters 3 times" in text
     assert "missing, which has a probability of 4 %" in text
-    unlikely = CorrectedFit(posterior, 9.0, 1, 30.0, True, 1e-4, ("q1.coulomb",))
+    unlikely = CorrectedFit(
+        posterior, 9.0, 1, 30.0, True, {NONE: 0.9999, "ripple": 1e-4}
+    )
     text = intervals.describe_intervals(unlikely, [3.0], 40)
     assert "which has a probability of less than 1 %" in text
     none = CorrectedFit(posterior, 9.0, 1, 30.0, True)
@@ -293,7 +346,7 @@ def test_a_wide_interval_says_why_in_one_sentence() -> None:
     assert "12 to 41 times" in text
     assert "9 times as far" in text
     assert "physics" not in text
-    missing = CorrectedFit(flat, 1.0, 1, 40.0, True, 0.93, ("spring",), flat)
+    missing = CorrectedFit(flat, 1.0, 1, 40.0, True, {NONE: 0.07, "ripple": 0.93})
     text = intervals.explain_widening(missing, [1.0, 5.0], 340)
     assert text is not None
     assert "93 %" in text

@@ -33,7 +33,11 @@ from sim2gp.identification.intervals.discrepancy import (
     corrected_windows,
 )
 from sim2gp.identification.intervals.scatter import CorrectedFit
-from sim2gp.identification.intervals.words import interval_entry, missing_physics_table
+from sim2gp.identification.intervals.words import (
+    force_arrays,
+    interval_entry,
+    missing_forces_table,
+)
 from sim2gp.identification.misfit.residuals import misfit_of_windows
 from sim2gp.identification.words import bound_warnings
 from sim2gp.inference.estimate import Estimate
@@ -68,6 +72,7 @@ def identification_results(
         project, logs, likelihood, known, honest, band, seed
     )
     arrays = _stored(table, known, honest.posterior, band, seed)
+    arrays |= force_arrays(honest)
     other = (
         forecast_unseen(project, logs, windows, places, grid, known)
         if held_out
@@ -141,9 +146,9 @@ def _identification_summary(
     noise = dict(zip(names, np.asarray(fitted.noise.sd).tolist(), strict=True))
     rows = sum(len(log) for log in logs)
     actions = [channel.name for channel in system.actions]
-    about = interval_entry(system, honest, found["parameters"], len(windows))
+    about = interval_entry(honest, found["parameters"], len(windows))
     listed = configuration_entries(system, logs, found["parameters"])
-    listed["tables"] = [*missing_physics_table(about), *listed.get("tables", ())]
+    listed["tables"] = [*missing_forces_table(about), *listed.get("tables", ())]
     return {
         "command": "identify",
         "title": f"{project.name}: what {_count_of_logs(logs)}",

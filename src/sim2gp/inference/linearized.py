@@ -17,6 +17,8 @@ from jaxtyping import Array, Float
 
 from sim2gp.inference.gaussian import Gaussian
 
+TOGETHER = 16  # columns
+
 
 def value_and_jacobian(
     f: Callable[[Array], Any], tt: Float[Array, " p"]
@@ -40,15 +42,18 @@ def jacobian_by_columns(
     """Jacobian of the first output of ``f`` at ``x``, and all of its values there.
 
     One column after the other: the code of a single one takes a third of the time to
-    compile. For what runs at few points.
+    compile. For what runs at few points. Of many columns `TOGETHER` at once.
     """
 
     def column(v: Array) -> tuple[Array, tuple[Array, ...]]:
         values, slopes = jax.jvp(f, (x,), (v,))
         return slopes[0], values
 
-    columns = jnp.eye(x.size, dtype=x.dtype)
-    J, values = jax.lax.map(column, columns)
+    together = TOGETHER if x.size > TOGETHER else 1
+    count = -(-x.size // together) * together  # a rest would be another program
+    columns = jnp.eye(count, x.size, dtype=x.dtype)
+    J, values = jax.lax.map(column, columns, batch_size=together)
+    J = J[: x.size]
     return jnp.moveaxis(J, 0, -1), jax.tree.map(lambda a: a[0], values)
 
 

@@ -60,8 +60,8 @@ def relevant(
     damping: AnyScalar = 0.0,
 ) -> tuple[Noise, ParameterPrior]:
     """Noise and scales of highest evidence on data that are linearised at ``z``."""
-    members = prior.members
-    trust = damping * jnp.asarray(1.0 - members.sum(axis=0))
+    members = jnp.asarray(prior.members)
+    trust = damping * (1.0 - jnp.sum(members, axis=0))
 
     def turn(i: Array, carry: tuple) -> tuple:
         variance, tau2 = carry

@@ -11,6 +11,7 @@ from sim2gp.identification.words import bound_warnings
 from sim2gp.reports import data, parameters
 from sim2gp.reports.animation import player
 from sim2gp.reports.experiment import experiment
+from sim2gp.reports.forces import missing_forces
 from sim2gp.reports.glance import glance, unique
 from sim2gp.reports.numbers import format_duration, format_number, is_number
 from sim2gp.reports.parameters import Arrays, Section, Summary
@@ -183,6 +184,7 @@ def _sections(summary: Summary, arrays: Arrays) -> list[dict[str, Any]]:
         ("parameters", "Parameters", parameters.parameter_section(summary)),
         ("directions", "Combinations", parameters.directions_section(summary)),
         ("misfit", "Noise and misfit", data.noise_and_misfit(summary)),
+        ("forces", "Forces that are missing", missing_forces(summary, arrays)),
         (
             "heldout",
             "Prediction of held-out data",

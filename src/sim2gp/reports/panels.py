@@ -21,6 +21,7 @@ LINES = {
     "FS literal": ("#e69f00", "-"),
     "FS": ("#d55e00", "--"),
     "RES-FS": ("#cc79a7", "--"),
+    "MissingForces": ("#b30059", "-"),
     "Auto": ("#8a5a00", "-."),
     "SIM2GP with the term": ("#1b1f24", ":"),
     "off-policy oracle": ("#1b1f24", "-"),

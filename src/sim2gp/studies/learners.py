@@ -12,6 +12,7 @@ from sim2gp.models import (
     NLM,
     Auto,
     FunctionSpace,
+    MissingForces,
     PointEstimate,
     Residual,
     ResidualFunctionSpace,
@@ -64,9 +65,16 @@ def _with_term(
 def _auto(
     system: AbstractPlant, missing: AbstractPart, options: Options
 ) -> AbstractModel:
+    sim, forces = Sim2GP(system), _missing_forces(system, missing, options)
+    residuals = Residual(sim, **options), ResidualFunctionSpace(sim, **options)
+    return Auto([forces, *residuals])
+
+
+def _missing_forces(
+    system: AbstractPlant, missing: AbstractPart, options: Options
+) -> AbstractModel:
     del missing
-    sim = Sim2GP(system)
-    return Auto([sim, Residual(sim, **options), ResidualFunctionSpace(sim, **options)])
+    return MissingForces(Sim2GP(system), reach=options["reach"])
 
 
 #: Each learner, made of the simulator, the physics that it lacks, and its options.
@@ -82,6 +90,7 @@ METHODS: dict[str, Callable[[AbstractPlant, AbstractPart, Options], AbstractMode
     "RES-FS": lambda system, _, options: ResidualFunctionSpace(
         Sim2GP(system), **options
     ),
+    "MissingForces": _missing_forces,
     "Auto": _auto,
     WITH_TERM: _with_term,
 }

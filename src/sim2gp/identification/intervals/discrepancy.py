@@ -1,22 +1,25 @@
 """The corrected intervals of a fit: of its windows, and of what its simulator may lack.
 
-Every effect of the machine's library becomes one more unknown, unless a parameter of
-the machine acts alike. It is zero at the fit. The windows are linearised there,
-`sim2gp.identification.intervals.scatter` gives the posterior of all unknowns, and they
-are linearised there again, until the centre stays: physics that is missing may have
-taken the fit far from it. The noise stays the fit's, which has the misfit in it: that
-makes intervals rather too wide than too narrow.
+Forces that the machine may lack (`sim2gp.systems.effects.forces`) are more unknowns, as
+far as no parameter of the machine acts alike. They are zero at the fit. The windows are
+linearised there, `sim2gp.identification.intervals.scatter` gives the posterior of all
+unknowns, and they are linearised there again, until the centre stays: physics that is
+missing may have taken the fit far from it. The noise stays the fit's, which has the
+misfit in it: that makes intervals rather too wide than too narrow.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.linalg import eigh
 
 from sim2gp.data.windows import Windows
 from sim2gp.data.windows_likelihood import WindowsLikelihood, compile_linearise
+from sim2gp.identification.intervals.averaging import Groups
 from sim2gp.identification.intervals.pulls import (
     Pulls,
     cost_of_rows,
@@ -27,18 +30,22 @@ from sim2gp.identification.intervals.scatter import (
     CorrectedFit,
     correct_posterior,
 )
-from sim2gp.identification.missing_physics.score import sine_to
+from sim2gp.identification.missing_physics.curves import curves_of
+from sim2gp.identification.missing_physics.reach import box_of
 from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.systems.assemble import free_parts
 from sim2gp.systems.base import AbstractSystem
-from sim2gp.systems.effects.registry import smooth_effects
+from sim2gp.systems.effects.forces import AbstractUnknownFunction
+from sim2gp.systems.effects.missing import missing_forces
+from sim2gp.systems.machine import plant_of
+from sim2gp.systems.mechanism import AbstractMechanism
 from sim2gp.systems.parts import AbstractPart
 from sim2gp.types import in_float64
 
-#: Sine of the angle to the parameters' span below which an effect is one of them in
-#: another shape, such as dry friction with another width.
-DISGUISE = 0.02
+#: Sine of the angle to the parameters' span below which a force is one of them in
+#: another shape; and of what has no effect at all, next to the largest of its group.
+DISGUISE, NO_EFFECT = 0.1, 1e-6
 TRUSTED = 1.0  # nats that a centre may cost beyond what the linear misfit says
 GAIN = 0.5  # of a gain that the linear misfit predicts: what may fail to come
 HALVINGS = 6
@@ -52,9 +59,9 @@ def compile_corrected(system: AbstractSystem, cut: Windows) -> None:
     The machine's own linearisation, which others ask, too, comes first.
     """
     compile_linearise(system, cut)
-    effects = smooth_effects(system)
-    if effects:
-        compile_linearise(free_parts(system, effects), cut)
+    forces = forces_of(system, box_of(system, cut))
+    if forces:
+        compile_linearise(free_parts(system, forces), cut)
 
 
 @in_float64
@@ -62,58 +69,82 @@ def corrected_windows(
     likelihood: WindowsLikelihood,
     fitted: Estimate,
     group: Int[np.ndarray, " W"],
-    effects: Sequence[AbstractPart] | None = None,
+    forces: Sequence[AbstractUnknownFunction] | None = None,
 ) -> CorrectedFit:
     """The corrected posterior of a fit's parameters, checked with the simulator itself.
 
-    ``effects`` are what it may lack, with their prior sd: None is its library, which a
-    model of the user's own does not have. Raises `NotFinite` E203.
+    ``forces`` are what it may lack, with their prior sd: None is those of `forces_of`.
+    Raises `NotFinite` E203.
     """
-    p, cut = fitted.prior.mean.size, likelihood.windows
-    system = likelihood.system
-    given = smooth_effects(system) if effects is None else tuple(effects)
-    system, whole, own = _with_effects_at_zero(system, fitted, given)
-    wider = WindowsLikelihood(system, cut)
-    at = np.asarray(whole.posterior.mean)
-    rows = rows_of(wider, whole, whole.posterior.mean)
+    cut, system = likelihood.windows, likelihood.system
+    box = box_of(system, cut)
+    given = forces_of(system, box) if forces is None else tuple(forces)
+    system, whole, own = _with_forces_at_zero(system, fitted, given)
+    wider, p = WindowsLikelihood(system, cut), len(own)
+    mean, scale = (np.asarray(x) for x in (whole.prior.mean, whole.prior.scale))
+    here = np.asarray(whole.posterior.mean)
+    rows = rows_of(wider, whole, jnp.asarray(here))
     pulls = pulls_of_rows(rows, cut, group)
-    order = np.concatenate([own, _identifiable_effects(pulls, own)])
-    lacking = np.arange(len(order)) >= p
-    mean, scale = np.asarray(whole.prior.mean), np.asarray(whole.prior.scale)
-    prior = Gaussian(*map(jnp.asarray, (mean[order], scale[np.ix_(order, order)])))
+    T, groups = _identifiable(pulls, own, system.parameters.groups)
+    k = T.shape[1]
+    prior = Gaussian(jnp.zeros(k), jnp.eye(k))
+    at = np.zeros(k)
+    at[:p] = np.linalg.solve(scale, here - mean)[own]
+    onto = _Onto(mean, scale @ T)
     for _ in range(ROUNDS):
-        here = Gaussian(jnp.asarray(at[order]), prior.scale)
-        found = correct_posterior(prior, here, pulls.of(order), lacking)
+        now = Gaussian(jnp.asarray(at), prior.scale)
+        found = correct_posterior(prior, now, pulls.onto(T), groups)
         if not found.enough:
             return replace(found, posterior=fitted.posterior)
-        to = at.copy()
-        to[order] = np.asarray(found.posterior.mean)
-        to, rows = _trusted(wider, whole, rows, pulls, at, to, found.inflation)
-        moved = np.abs(to - at)[order] / np.asarray(found.posterior.sd())
+        to = np.asarray(found.posterior.mean)
+        inflation = found.inflation
+        to, rows = _trusted(wider, whole, rows, pulls.onto(T), onto, at, to, inflation)
+        moved = np.abs(to - at) / np.asarray(found.posterior.sd())
         at = to
-        if len(order) == p or np.max(moved) <= SETTLED:
+        if not groups or np.max(moved) <= SETTLED:
             break
         pulls = pulls_of_rows(rows, cut, group)
-    both = Gaussian(jnp.asarray(at[order]), found.posterior.scale)
-    if len(order) == p:
-        return replace(found, posterior=both)
-    mine = Gaussian(both.mean[:p], both.scale[:p]).triangular()
-    names = system.parameters.names
+    both = Gaussian(
+        jnp.asarray(onto(at)), jnp.asarray(onto.scale) @ found.posterior.scale
+    )
+    mine = Gaussian(both.mean[own], both.scale[own])
     return replace(
         found,
-        posterior=Gaussian(both.mean[:p], mine),
-        effects=tuple(names[j] for j in order[p:]),
-        lacking=Gaussian(both.mean[p:], both.scale[p:]),
+        posterior=Gaussian(mine.mean, mine.triangular()),
+        curves=curves_of(system, given, box, both),
     )
 
 
-def _with_effects_at_zero(
-    machine: AbstractSystem, fitted: Estimate, effects: Sequence[AbstractPart]
+def forces_of(
+    system: AbstractSystem, box: Mapping[str, tuple[float, float]]
+) -> tuple[AbstractUnknownFunction, ...]:
+    """What a machine may lack where its recordings have been.
+
+    Nothing of a plant without a mass matrix, whose intervals rest on the scatter of its
+    windows alone.
+    """
+    if not isinstance(plant_of(system), AbstractMechanism):
+        return ()
+    return tuple(missing_forces(system, box, fine=True))
+
+
+class _Onto(NamedTuple):
+    """Virtual values of reduced coordinates."""
+
+    mean: Float[np.ndarray, " p"]
+    scale: Float[np.ndarray, "p k"]
+
+    def __call__(self, c: Float[np.ndarray, " k"]) -> Float[np.ndarray, " p"]:
+        return self.mean + self.scale @ c
+
+
+def _with_forces_at_zero(
+    machine: AbstractSystem, fitted: Estimate, forces: Sequence[AbstractPart]
 ) -> tuple[AbstractSystem, Estimate, Int[np.ndarray, " p"]]:
-    """The machine with effects, its estimate with all at nothing; its own columns."""
-    if not effects:
+    """The machine with forces, its estimate with all at nothing; its own columns."""
+    if not forces:
         return machine, fitted, np.arange(fitted.prior.mean.size)
-    system = free_parts(machine, effects)
+    system = free_parts(machine, forces)
     names, prior = system.parameters.names, system.parameters.prior()
     own = np.asarray([names.index(name) for name in machine.parameters.names])
     scale = prior.scale.at[np.ix_(own, own)].set(fitted.prior.scale)
@@ -127,25 +158,58 @@ def _with_effects_at_zero(
     return system, whole, own
 
 
-def _identifiable_effects(
-    pulls: Pulls, own: Int[np.ndarray, " p"]
-) -> Int[np.ndarray, " k"]:
-    """The other columns with an effect that no parameters of the machine mimic."""
+def _identifiable(
+    pulls: Pulls, own: Int[np.ndarray, " o"], groups: Groups
+) -> tuple[Float[np.ndarray, "p k"], Groups]:
+    """Coordinates of parameters and forces, without what parameters do as well.
+
+    A smooth force of the velocity may be a damping: what acts so is called damping. Of
+    each group the directions remain that no parameters mimic, with the prior that it
+    has given that there are no others. Groups of a kind are on together: a joint alone
+    may show too little of its friction to tell it from damping.
+    """
     A = np.asarray(np.linalg.qr(np.concatenate(list(pulls.factors)), mode="r"))
-    others = np.setdiff1d(np.arange(A.shape[1]), own)
-    kept = [j for j in others if sine_to(A[:, own], A[:, j])[0] > DISGUISE]
-    return np.asarray(kept, int)
+    Q, R = np.linalg.qr(A[:, own])
+    Q = Q[:, np.abs(np.diag(R)) > 1e-12 * np.abs(R).max(initial=0.0)]
+    parts, kinds = [np.eye(A.shape[1])[:, own]], []
+    for name, places in groups.items():
+        kept = _apart(A[:, places], Q)
+        W = np.zeros((A.shape[1], kept.shape[1]))
+        W[places] = kept
+        parts.append(W)
+        kinds += [name.rsplit(".", 1)[-1]] * kept.shape[1]
+    of = np.asarray([""] * len(own) + kinds)
+    found = {kind: np.flatnonzero(of == kind) for kind in dict.fromkeys(kinds)}
+    return np.concatenate(parts, axis=1), found
+
+
+def _apart(
+    G: Float[np.ndarray, "k g"], Q: Float[np.ndarray, "k p"]
+) -> Float[np.ndarray, "g d"]:
+    """Orthonormal directions of a group whose effect is not in the span of ``Q``.
+
+    They solve ``rest^T rest w = sine^2 G^T G w``. What does nothing at all has no angle
+    and stays; a group that does nothing is left out.
+    """
+    size = np.linalg.norm(G)
+    if size == 0.0:
+        return np.zeros((G.shape[1], 0))
+    slack = (NO_EFFECT * size) ** 2 * np.eye(G.shape[1])
+    rest = G - Q @ (Q.T @ G)
+    sine2, kept = eigh(rest.T @ rest + slack, G.T @ G + slack)
+    return np.asarray(np.linalg.qr(kept[:, sine2 > DISGUISE**2])[0])
 
 
 def _trusted(
     likelihood: WindowsLikelihood,
     fitted: Estimate,
-    rows: Float[np.ndarray, "W k npr"],
+    rows: Float[np.ndarray, "W r npr"],
     pulls: Pulls,
-    at: Float[np.ndarray, " p"],
-    to: Float[np.ndarray, " p"],
+    onto: _Onto,
+    at: Float[np.ndarray, " k"],
+    to: Float[np.ndarray, " k"],
     inflation: float,
-) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "W k npr"]]:
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "W r npr"]]:
     """As far towards ``to`` as the linear misfit may be believed, and the rows there.
 
     Near a bound the machine is not linear in ``z``, and a centre far from the MAP is
@@ -154,12 +218,12 @@ def _trusted(
     should, or half of what is gained.
     """
     cut = likelihood.windows
-    dz = np.linalg.solve(np.asarray(fitted.prior.scale), to - at)
+    dz = to - at
     score, F = pulls.scores.sum(axis=0), pulls.fisher.sum(axis=0)
     before = cost_of_rows(rows, cut)
     for share in 0.5 ** np.arange(HALVINGS):
         there = at + share * (to - at)
-        found = rows_of(likelihood, fitted, jnp.asarray(there))
+        found = rows_of(likelihood, fitted, jnp.asarray(onto(there)))
         linear = share * dz @ (score + 0.5 * share * F @ dz)
         slack = TRUSTED * max(inflation, 1.0) + GAIN * max(-linear, 0.0)
         if cost_of_rows(found, cut) - before - linear <= slack:

@@ -36,9 +36,9 @@ class Pulls:
         """``F_w``."""
         return np.swapaxes(self.factors, 1, 2) @ self.factors
 
-    def of(self, which: Int[np.ndarray, " q"]) -> "Pulls":
-        """Those of some parameters, the others held."""
-        return Pulls(self.factors[..., which], self.scores[:, which], self.group)
+    def onto(self, T: Float[np.ndarray, "p k"]) -> "Pulls":
+        """Those of ``c`` where ``z = T c``."""
+        return Pulls(self.factors @ T, self.scores @ T, self.group)
 
     def at(self, dz: Float[np.ndarray, " p"]) -> "Pulls":
         """The pulls where the parameters are ``dz`` further, for a linear machine."""

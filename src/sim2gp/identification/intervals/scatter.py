@@ -34,28 +34,30 @@ Huber 1967, White 1982; F G^-1 F: Godambe 1960; in a posterior: Ribatet, Cooley 
 Davison 2012, arXiv 0911.5357; (I - P)^-1/2: Bell and McCaffrey 2002.)
 
 A bias that is the same in all windows does not show in their scatter. So some entries
-of ``z`` may be magnitudes ``x`` of effects that the simulator may lack, and which are
-nothing to all who use it: a discrepancy (Kennedy and O'Hagan 2001) of physical shape.
-Their sd is ``tau`` times that of the library, one ``tau`` for all, which is zero with
-probability `NOTHING` and each of `SHARES` alike with the rest. In the data's form above
-each ``tau`` has a Gaussian posterior and an evidence,
+of ``z`` may be weights of forces that the simulator may lack, in groups: a discrepancy
+(Kennedy and O'Hagan 2001) of physical shape. A group is on, with its own scale, or off.
+In the data's form above scales ``tau`` have a Gaussian posterior and an evidence,
 
     log p(tau) = 1/2 |Q_1^T d|^2 - log |T|,    [F_c^1/2 D; I] = Q T,  D = diag(1, tau),
 
-and the parameters are reported with their mixture's mean and covariance: what the data
-leave open of the effects widens the intervals, what they say of them moves the centre.
+and the parameters are reported with the mean and the covariance of a mixture over which
+groups are on and at which scale. It has all that a search visits which turns on one
+more as long as that pays (`averaging`): what the data leave open of the forces widens
+the intervals, what they say of them moves the centre.
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
+from sim2gp.identification.intervals.averaging import NONE, Groups, averaged
 from sim2gp.identification.intervals.pulls import Pulls
 from sim2gp.identification.misfit.tests import must_be_finite
+from sim2gp.identification.missing_physics.curves import Curve
 from sim2gp.identification.words import digits
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.least_squares import RANK_TOLERANCE
@@ -65,9 +67,7 @@ from sim2gp.types import in_float64
 FEWEST = 4.0
 #: Of Bartlett's weights: ``1.5 W / b`` degrees of freedom (Priestley 1981).
 BARTLETT = 1.5
-#: Probability that the simulator lacks nothing, before the data; sd of the effects that
-#: it may lack otherwise, in those of the library.
-NOTHING, SHARES = 0.5, tuple(2.0**-k for k in range(6))
+NOTHING = 0.5  # probability of more than which something is said to be missing
 LIKE_WHITE = 1.3  # times as wide: small samples alone make so much of white noise
 MUCH = 3.0  # times as wide: a summary says why, wherever it names the interval
 
@@ -78,8 +78,8 @@ class CorrectedFit:
 
     ``inflation`` is ``kappa^2``, the samples that count as one; ``lag`` the ``b``
     successive windows taken together; ``freedom`` the degrees of freedom ``nu``;
-    ``missing`` the probability that the simulator lacks something, ``lacking`` the
-    magnitudes of those of its ``effects``.
+    ``each`` the probability that the simulator lacks a kind of force, by its name, and
+    that it lacks nothing (`NONE`); ``curves`` are these forces.
     """
 
     posterior: Gaussian
@@ -87,9 +87,24 @@ class CorrectedFit:
     lag: int
     freedom: float
     enough: bool
-    missing: float = 0.0
-    effects: tuple[str, ...] = ()
-    lacking: Gaussian | None = None
+    each: Mapping[str, float] = field(default_factory=dict)
+    curves: tuple[Curve, ...] = ()
+
+    @property
+    def missing(self) -> float:
+        """The probability that the simulator lacks something."""
+        return 1.0 - self.each.get(NONE, 1.0)
+
+    @property
+    def found(self) -> tuple[Curve, ...]:
+        """Forces that are rather there than not."""
+        likely = {kind for kind, p in self.each.items() if kind and p > NOTHING}
+        return tuple(c for c in self.curves if likely & set(c.kinds))
+
+    @property
+    def forces(self) -> tuple[str, ...]:
+        """What it may lack."""
+        return tuple(name for name in self.each if name != NONE)
 
 
 @in_float64
@@ -97,13 +112,13 @@ def correct_posterior(
     prior: Gaussian,
     plain: Gaussian,
     pulls: Pulls,
-    effects: Bool[np.ndarray, " p"] | None = None,
+    groups: Groups | None = None,
 ) -> CorrectedFit:
     """The posterior as wide as the windows' pulls scatter, about the data's centre.
 
     ``plain`` has the point where the pulls were linearised. It is returned where
-    windows are too few; ``effects`` marks what the simulator may lack, believed with
-    the library's own sd. Raises `NotFinite` E203 for a pull that is not a number.
+    windows are too few; ``groups`` are places of what the simulator may lack. Raises
+    `NotFinite` E203 for a pull that is not a number.
     """
     for what in (pulls.factors, pulls.scores):
         must_be_finite("pulls of windows", what, "the intervals")
@@ -131,44 +146,10 @@ def correct_posterior(
     # F z_data = (F + I) z at the MAP, where the scores add up to -z.
     data = s * (Vt @ z) - (Vt @ pulls.scores.sum(axis=0)) / s
     weight = U / spread[:, None]
-    free = np.zeros(p, bool) if effects is None else np.asarray(effects)
-    centre, scale, missing = _averaged(weight @ (s[:, None] * Vt), weight @ data, free)
+    root, rest = weight @ (s[:, None] * Vt), weight @ data
+    centre, scale, each = averaged(root, rest, groups or {})
     found = Gaussian(jnp.asarray(mu0 + L0 @ centre), jnp.asarray(L0 @ scale))
-    return CorrectedFit(found, kappa2, b, nu, True, missing)
-
-
-def _averaged(
-    root: Float[np.ndarray, "q p"],
-    data: Float[np.ndarray, " q"],
-    effects: Bool[np.ndarray, " p"],
-) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p p"], float]:
-    """Mean and scale of ``z`` given ``|root z - data|^2 / 2``, and P(something).
-
-    Prior N(0, 1), of the effects N(0, tau^2).
-    """
-    p, q = len(effects), len(data)
-    shares = (0.0, *SHARES) if effects.any() else (0.0,)
-    logs, means, scales = [], [], []
-    for share in shares:
-        D = np.where(effects, share, 1.0)
-        Q, T = np.linalg.qr(np.concatenate([root * D, np.eye(p)]))
-        onto = Q[:q].T @ data
-        means.append(D * np.linalg.solve(T, onto))
-        scales.append(np.linalg.solve(T.T, np.diag(D)).T)
-        log_det = float(np.sum(np.log(np.abs(np.diag(T)))))
-        logs.append(0.5 * float(onto @ onto) - log_det)
-    if len(shares) == 1:
-        return means[0], scales[0], 0.0
-    prior = [NOTHING, *([(1.0 - NOTHING) / len(SHARES)] * len(SHARES))]
-    weights = np.asarray(prior) * np.exp(np.asarray(logs) - max(logs))
-    weights = weights / weights.sum()
-    mean = weights @ np.asarray(means)
-    rows = [
-        math.sqrt(w) * np.concatenate([C.T, [m - mean]])
-        for w, m, C in zip(weights, means, scales, strict=True)
-    ]
-    scale = np.asarray(np.linalg.qr(np.concatenate(rows), mode="r")).T
-    return mean, scale, 1.0 - float(weights[0])
+    return CorrectedFit(found, kappa2, b, nu, True, each)
 
 
 def describe_intervals(
@@ -242,7 +223,7 @@ def _missing_percent(found: CorrectedFit) -> str:
 
 def _missing_physics_remark(found: CorrectedFit) -> str:
     """Whether physics that is missing is in the intervals."""
-    if not found.effects:
+    if not found.forces:
         return (
             "This covers errors that come and go, not physics that the model lacks "
             "(sim2gp explain)."
@@ -250,14 +231,11 @@ def _missing_physics_remark(found: CorrectedFit) -> str:
     if found.missing > NOTHING:
         return (
             f"The model lacks physics with a probability of {_missing_percent(found)}: "
-            f"intervals allow for {len(found.effects)} effects of its library "
-            "(friction, springs, drag and the like), and parameters lie where they "
-            "would with them. sim2gp explain tries the effects one by one."
+            "intervals allow for forces on its joints and changes of its inputs, and "
+            "parameters lie where they would with them. sim2gp explain names them."
         )
-    count = len(found.effects)
-    effects = "an effect" if count == 1 else f"{count} effects"
     return (
-        f"Intervals allow for {effects} that the model may be missing, which has a "
+        "Intervals allow for forces that the model may be missing, which has a "
         f"probability of {_missing_percent(found)}; they do not allow for other "
         "physics."
     )

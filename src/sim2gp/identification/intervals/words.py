@@ -1,4 +1,4 @@
-"""Which intervals the parameters of a run have, and which effects they allow for."""
+"""Which intervals the parameters of a run have, and what forces they allow for."""
 
 import math
 from collections.abc import Mapping
@@ -8,16 +8,13 @@ import numpy as np
 
 from sim2gp.identification.intervals import scatter as intervals
 from sim2gp.identification.intervals.scatter import NOTHING, CorrectedFit
+from sim2gp.identification.missing_physics.curves import Curve
 from sim2gp.identification.words import digits
-from sim2gp.systems.assemble import free_parts
-from sim2gp.systems.base import AbstractSystem
-from sim2gp.systems.effects.registry import smooth_effects
 from sim2gp.types import in_float64
 
 
 @in_float64
 def interval_entry(
-    system: AbstractSystem,
     honest: CorrectedFit,
     parameters: Mapping[str, Mapping[str, Any]],
     windows: int,
@@ -31,54 +28,57 @@ def interval_entry(
         "pulls_times_white": math.sqrt(honest.inflation) if honest.enough else None,
         "windows_at_once": honest.lag,
         "freedom": honest.freedom,
-        "missing": honest.missing if honest.effects else None,
-        "allowed_for": _effects(system, honest),
+        "missing": honest.missing if honest.forces else None,
+        "allowed_for": {name: honest.each[name] for name in honest.forces},
+        "forces": {c.name: _force_entry(c, honest.each) for c in honest.found},
     }
 
 
-def _effects(system: AbstractSystem, honest: CorrectedFit) -> dict[str, dict[str, Any]]:
-    if honest.lacking is None:
-        return {}
-    table = free_parts(system, smooth_effects(system)).parameters
-    mean, sd = (np.asarray(x) for x in (honest.lacking.mean, honest.lacking.sd()))
+def force_arrays(honest: CorrectedFit) -> dict[str, np.ndarray]:
+    """The forces that are probable: ``forces/NAME``, rows of variable, mean and sd."""
+    return {f"forces/{c.name}": np.stack([c.at, c.mean, c.sd]) for c in honest.found}
+
+
+def _force_entry(curve: Curve, each: Mapping[str, float]) -> dict[str, Any]:
+    mean, sd = curve.largest
     return {
-        name: {
-            "meaning": table[name].meaning,
-            "unit": table[name].unit,
-            "mean": float(mean[k]),
-            "sd": float(sd[k]),
-        }
-        for k, name in enumerate(honest.effects)
+        "where": curve.where,
+        "of": curve.of,
+        "unit": curve.unit,
+        "of_unit": curve.of_unit,
+        "probability": max(each.get(kind, 0.0) for kind in curve.kinds),
+        "mean": mean,
+        "sd": sd,
     }
 
 
-def missing_physics_table(told: Mapping[str, Any]) -> list[dict[str, Any]]:
+def missing_forces_table(told: Mapping[str, Any]) -> list[dict[str, Any]]:
     """What the simulator may lack, clearest first, where something is probable."""
-    if not told["allowed_for"] or told["missing"] <= NOTHING:
+    if not told["forces"] or told["missing"] <= NOTHING:
         return []
 
     def clear(entry: Mapping[str, Any]) -> float:
         return abs(entry["mean"]) / entry["sd"] if entry["sd"] > 0.0 else 0.0
 
-    found = sorted(told["allowed_for"].items(), key=lambda x: -clear(x[1]))
+    found = sorted(told["forces"].values(), key=lambda entry: -clear(entry))
     rows = [
         [
-            name,
-            entry["meaning"],
+            entry["where"],
+            entry["of"],
             f"{digits(entry['mean'], 2)} +- {digits(entry['sd'], 2)}",
             entry["unit"],
+            f"{100.0 * entry['probability']:.0f} %",
         ]
-        for name, entry in found
+        for entry in found
     ]
     note = (
-        "All at once, as the intervals of the parameters allow for them. Effects that "
-        "act alike share what is missing, and are uncertain for it; sim2gp explain "
-        "asks for the one that explains it alone."
+        "All at once, as the intervals of the parameters allow for them; the size is "
+        "where the force is clearest. sim2gp explain asks which effect by name it is."
     )
     return [
         {
-            "title": "What the simulator may lack",
-            "columns": ["effect", "meaning", "size", "unit"],
+            "title": "Forces that the simulator may lack",
+            "columns": ["on", "by", "size", "unit", "probability"],
             "rows": rows,
             "note": note,
         }

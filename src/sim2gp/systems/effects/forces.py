@@ -27,7 +27,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from equinox import AbstractVar
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from sim2gp import checks
 from sim2gp.inference.parameters import Parameter
@@ -85,6 +85,15 @@ class Sines:
             slope = slope - sine * _clenshaw(x[half:] * k.astype(x.dtype), cosine)[0]
         return rate * slope
 
+    def features(self, z: Scalar) -> Float[Array, " k"]:
+        """Its values for each weight alone."""
+        angle, _ = self._angle(z)
+        half = len(self.sds) // 2 if self.cosines else len(self.sds)
+        turns = angle * jnp.arange(1, half + 1, dtype=angle.dtype)
+        return jnp.concatenate(
+            [jnp.sin(turns), *([jnp.cos(turns)] if self.cosines else [])]
+        )
+
     def _angle(self, z: Scalar) -> tuple[Scalar, Scalar]:
         """``w (z - start)``, and its derivative."""
         w, end = jnp.asarray(self.frequency, z.dtype), self.start + self.span
@@ -134,6 +143,12 @@ def periodic(count: int) -> Sines:
     return Sines(1.0, sds + sds, cosines=True)
 
 
+def ripple(count: int) -> Sines:
+    """Of an angle, up to so many waves in a turn, each as large: a motor's cogging."""
+    sds = (1.0,) * count
+    return Sines(1.0, sds + sds, cosines=True)
+
+
 @dataclass(frozen=True)
 class Sign:
     """Dry friction: against a velocity, smoothed over ``width``."""
@@ -144,6 +159,10 @@ class Sign:
     def value(self, x: Float[AnyArray, " 1"], z: Scalar) -> Scalar:
         """The force of the level ``x``."""
         return -x[0] * jnp.tanh(z / self.width)
+
+    def features(self, z: Scalar) -> Float[Array, " 1"]:
+        """The force of a level of one."""
+        return -jnp.tanh(z / self.width)[None]
 
     def slope(self, x: Float[AnyArray, " 1"], z: Scalar) -> Scalar:
         """Its derivative."""
@@ -312,8 +331,8 @@ class ForceField(eqx.Module):
 def _force(
     forces: tuple[MissingForce, ...], x: Float[AnyArray, " k"], q: Scalar, v: Scalar
 ) -> Scalar:
-    """The force on one joint. Its derivatives by the state are the same for every
-    parameter: they are computed once."""
+    """The force on one joint. Its derivatives by the state and by each weight are the
+    same for every parameter: they are computed once."""
     parts = zip(forces, _split(forces, x), strict=True)
     each = [f.basis.value(w, v if f.of_velocity else q) for f, w in parts]
     return sum(each[1:], each[0])
@@ -328,8 +347,10 @@ def _force_jvp(
     for f, w in zip(forces, _split(forces, x), strict=True):
         slope = f.basis.slope(w, v if f.of_velocity else q)
         by[f.of_velocity] = by[f.of_velocity] + slope
-    by_q, by_v = jax.lax.optimization_barrier((by[False], by[True]))
-    return _force(forces, x, q, v), _force(forces, dx, q, v) + by_q * dq + by_v * dv
+    each = [f.basis.features(v if f.of_velocity else q) for f in forces]
+    by_x = jnp.concatenate(each)
+    by_x, by_q, by_v = jax.lax.optimization_barrier((by_x, by[False], by[True]))
+    return _force(forces, x, q, v), by_x @ dx + by_q * dq + by_v * dv
 
 
 def _split(

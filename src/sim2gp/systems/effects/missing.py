@@ -4,13 +4,14 @@ import math
 from collections.abc import Mapping
 
 from sim2gp.systems.base import LONGEST_MEAN, AbstractSystem
-from sim2gp.systems.effects.base import AbstractEffect
 from sim2gp.systems.effects.forces import (
+    AbstractUnknownFunction,
     Gap,
     MissingForce,
     MissingInput,
     Sign,
     periodic,
+    ripple,
     smooth,
 )
 from sim2gp.systems.effects.scales import drives
@@ -18,6 +19,7 @@ from sim2gp.systems.effects.units import joint_of
 from sim2gp.systems.machine import plant_of
 
 HARMONICS = 2  # of a joint that may turn round
+RIPPLES = 12  # in a turn, of cogging
 #: Of dry friction's width: the change of velocity by the drive in a substep.
 WIDTH = 0.2
 DRY, CHANGE, GAP = 0.1, 0.1, 0.2  # prior sd, shares of the drive and of an input
@@ -26,8 +28,11 @@ INPUT_REACH, INPUT_LENGTH = 1.2, 0.3  # half-widths of an input
 
 
 def missing_forces(
-    system: AbstractSystem, box: Mapping[str, tuple[float, float]]
-) -> list[AbstractEffect]:
+    system: AbstractSystem,
+    box: Mapping[str, tuple[float, float]],
+    *,
+    fine: bool = False,
+) -> list[AbstractUnknownFunction]:
     """Of each joint a force by position, by velocity and of dry friction; of each input
     a smooth change and a dead zone.
 
@@ -35,13 +40,17 @@ def missing_forces(
     """
     plant = plant_of(system)
     step = min(plant.max_substep, LONGEST_MEAN)
-    found: list[AbstractEffect] = []
+    found: list[AbstractUnknownFunction] = []
     for name, drive in drives(plant).items():
         joint = joint_of(plant, name)
         turns = joint.angle and not math.isfinite(joint.low + joint.high)
         at = periodic(HARMONICS) if turns else smooth(*box[name])
         by_speed = smooth(*box[f"{name}.velocity"])
         sign = Sign(WIDTH * drive.acceleration * step)
+        if fine and joint.angle:
+            found.append(
+                MissingForce(name, DRY * drive.force, ripple(RIPPLES), what="ripple")
+            )
         found += [
             MissingForce(name, drive.force, at),
             MissingForce(

@@ -1,8 +1,8 @@
 """What a simulator may lack: every effect by what it acts on, and what to try.
 
 One list serves all who add physics to a machine: the search for missing physics
-(`candidates`), the corrected intervals (`smooth_effects`), the mismatch map
-(`sim2gp.systems.effects.strengths`) and project files (`named`, `possible`).
+(`candidates`), the mismatch map (`sim2gp.systems.effects.strengths`) and project files
+(`named`, `possible`).
 
 A candidate adds one scalar to a machine: the magnitude of an effect with a Gaussian
 prior around nothing, a delay, or the time constant of a low pass. Priors are a fifth of
@@ -169,19 +169,6 @@ def candidates(
         high = channel.high if math.isfinite(channel.high) else 1.0
         found += _of_input(channel.name, high, lag=not windows)
     return _new(found, system)
-
-
-def smooth_effects(system: AbstractSystem) -> tuple[AbstractPart, ...]:
-    """What a machine may lack and whose slope at nothing says what it does.
-
-    Each with its prior sd; none for a plant without a mass matrix, whose intervals
-    rest on the scatter of its windows alone.
-    """
-    plant = plant_of(system)
-    if not isinstance(plant, AbstractMechanism):
-        return ()
-    found = _new(_physics(plant), system)
-    return tuple(candidate.effect for candidate in found if candidate.smooth)
 
 
 def _new(found: Sequence[Candidate], system: AbstractSystem) -> tuple[Candidate, ...]:

@@ -1,0 +1,94 @@
+"""Forces that a machine may lack, as curves with a band over where it has been."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.parameters import Parameters
+from sim2gp.systems.base import AbstractSystem
+from sim2gp.systems.effects.forces import AbstractUnknownFunction, MissingForce
+from sim2gp.systems.machine import plant_of
+
+POINTS = 61
+
+
+class Curve(NamedTuple):
+    """What acts on ``where`` as a function of the channel ``of``: mean and sd.
+
+    ``kinds`` are the functions that it is the sum of.
+    """
+
+    where: str
+    of: str
+    unit: str
+    of_unit: str
+    kinds: tuple[str, ...]
+    at: Float[np.ndarray, " n"]
+    mean: Float[np.ndarray, " n"]
+    sd: Float[np.ndarray, " n"]
+
+    @property
+    def name(self) -> str:
+        """``q1 by q1.velocity``."""
+        return f"{self.where} by {self.of}"
+
+    @property
+    def largest(self) -> tuple[float, float]:
+        """Mean and sd where the mean is largest in sd."""
+        k = int(np.argmax(np.abs(self.mean) / np.maximum(self.sd, 1e-300)))
+        return float(self.mean[k]), float(self.sd[k])
+
+
+def curves_of(
+    system: AbstractSystem,
+    functions: Sequence[AbstractUnknownFunction],
+    box: Mapping[str, tuple[float, float]],
+    virtual: Gaussian,
+) -> tuple[Curve, ...]:
+    """Of each joint's position and velocity and of each input, all functions together.
+
+    ``virtual`` are the parameters of ``system``, which has the functions free. Call it
+    under `in_float64`.
+    """
+    plant, table = plant_of(system), system.parameters
+    units = {c.name: c.unit for c in (*plant.physical_states, *plant.actions)}
+    by: dict[tuple[str, str], list[AbstractUnknownFunction]] = {}
+    for f in functions:
+        of = f"{f.where}.velocity" if _of_velocity(f) else f.where
+        by.setdefault((f.where, of), []).append(f)
+    found = []
+    for (where, of), own in by.items():
+        at = np.linspace(*box[of], POINTS)
+        features = [_features(f, table, at) for f in own]
+        Phi = np.concatenate([each for each, _ in features], axis=1)
+        places = np.concatenate([each for _, each in features])
+        mean = Phi @ np.asarray(virtual.mean)[places]
+        sd = np.linalg.norm(Phi @ np.asarray(virtual.scale)[places], axis=1)
+        kinds = tuple(f.what for f in own)
+        about = own[0].unit(plant), units[of], kinds
+        found.append(Curve(where, of, *about, at, mean, sd))
+    return tuple(found)
+
+
+def _of_velocity(f: AbstractUnknownFunction) -> bool:
+    return isinstance(f, MissingForce) and f.of_velocity
+
+
+def _features(
+    f: AbstractUnknownFunction, table: Parameters, at: Float[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, "n k"], np.ndarray]:
+    """Values for each weight alone, shapes as they are given; the weights' places."""
+    places = table.groups[f.name]
+    own = f.own({name: jnp.asarray(x, float) for name, x in f.values.items()})
+    count = len(places)
+
+    def value(w: Array, z: Array) -> Array:
+        return f.basis.value(jnp.concatenate([w, own[count:]]), z)
+
+    slopes = jax.vmap(jax.jacfwd(value), in_axes=(None, 0))
+    return np.asarray(slopes(jnp.zeros(count), jnp.asarray(at))), places
