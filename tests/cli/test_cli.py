@@ -47,10 +47,11 @@ def demo(action: Callable[[Progress], Any]) -> Callable[..., stub_commands.Told]
         seeds: int,
         episodes: int,
         truth: str,
+        mismatch: bool,
         progress: Progress,
         sink: Any,
     ) -> stub_commands.Told:
-        assert truth == "prior"
+        assert (truth, mismatch) == ("prior", False)
         sink.scalars(0, {"seed": seed})
         action(progress)
         asked = {"seed": seed, "seeds": seeds, "machine": machine}

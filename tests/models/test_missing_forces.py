@@ -123,3 +123,22 @@ def test_an_update_narrows_the_forces_that_are_on(with_spring):
         before, after = belief.latent(s, a).sd(), updated.latent(s, a).sd()
     assert (after < before).all()
     assert int(updated.count) == int(belief.count) + 1
+
+
+def test_of_the_simulator_alone_the_forces_are_averaged(with_spring):
+    """Marginals, and the Schur complement of the information: in covariances."""
+    belief, _ = with_spring
+    alone = belief.without_functions()
+    own = slice(0, 8)
+    pairs = (belief.posterior, alone.posterior), (belief.prior, alone.prior)
+    for whole, part in pairs:
+        np.testing.assert_array_equal(part.mean, whole.mean[own])
+        root, got = np.asarray(whole.scale), np.asarray(part.scale)
+        C = (root @ root.T)[own, own]
+        unit = np.sqrt(np.outer(np.diag(C), np.diag(C)))
+        np.testing.assert_allclose(got @ got.T / unit, C / unit, atol=1e-9)
+    L0 = np.asarray(belief.prior.scale)
+    C = np.linalg.solve(L0, np.asarray(belief.posterior.scale))
+    precision = np.linalg.inv((C @ C.T)[own, own]) - np.eye(8)
+    A = np.asarray(alone.information)
+    np.testing.assert_allclose(A.T @ A, precision, rtol=1e-4, atol=1e-6)

@@ -59,6 +59,8 @@ class Demo(Writes):
     """Real episodes of each run, 5 s each."""
     truth: Literal["prior", "2sd", "3sd", "outside"] = "prior"
     """Hidden parameters: as believed, each so far off, or beyond its bounds."""
+    mismatch: Flag = False
+    """The machine has a force that its simulator lacks."""
     log_to: Annotated[
         Literal["jsonl", "tensorboard", "wandb"] | None,
         option("{jsonl,tensorboard,wandb}"),
@@ -67,7 +69,7 @@ class Demo(Writes):
 
     def run(self, call: Call) -> dict[str, Any]:
         out = run_directory(self.out, "demo")
-        about = ("machine", "seed", "seeds", "episodes", "truth")
+        about = ("machine", "seed", "seeds", "episodes", "truth", "mismatch")
         asked = {name: getattr(self, name) for name in about}
         with opened(self.log_to, out, asked) as sink:
             return call.saved(

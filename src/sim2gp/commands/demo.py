@@ -20,7 +20,20 @@ from sim2gp.data.one_step import OneStepLikelihood
 from sim2gp.data.transitions import Transitions
 from sim2gp.identification import diagnose
 from sim2gp.identification.misfit.residuals import misfit_of_transitions
-from sim2gp.models import PointEstimate, PriorMean, Sim2GP, Sim2GPBelief
+from sim2gp.identification.missing_physics.curves import (
+    Curve,
+    curves_of,
+    force_arrays,
+    functions_of,
+)
+from sim2gp.models import (
+    MissingForces,
+    PointEstimate,
+    PriorMean,
+    Sim2GP,
+    Sim2GPBelief,
+)
+from sim2gp.models.missing_forces import ON
 from sim2gp.planning import MPC
 from sim2gp.planning.loop import Episode, History, psrl
 from sim2gp.planning.oracle import AcceptedTruth, accept_truth
@@ -28,10 +41,11 @@ from sim2gp.planning.tasks import MACHINES, Task, episodes_to_95, hanging_return
 from sim2gp.runs import Progress
 from sim2gp.runs.provenance import provenance
 from sim2gp.runs.sinks import Nowhere, Sink, each_episode
-from sim2gp.systems.base import AbstractSystem
-from sim2gp.types import Key
+from sim2gp.studies.learners import effects_of, reach_of
+from sim2gp.systems.base import AbstractPlant, AbstractSystem
+from sim2gp.types import Key, in_float64
 
-LEARNER = "posterior sampling"
+LEARNER, WITH_FORCES = "posterior sampling", "missing forces"
 ORACLE_EPISODES = 5
 
 
@@ -76,24 +90,23 @@ def demo(
     seeds: int = 1,
     episodes: int = 3,
     truth: Literal["prior", "2sd", "3sd", "outside"] = "prior",
+    mismatch: bool = False,
     sink: Sink | None = None,
     progress: Progress | None = None,
 ) -> Demonstration:
     """Swing up ``seeds`` pendulums, each in so many ``episodes`` of 5 s.
 
     ``truth`` says how the hidden parameters are drawn: from the prior, 2 or 3 sd from
-    its mean, or beyond their bounds. ``sink`` (`sim2gp.sinks`) gets every episode's
-    numbers at once.
+    its mean, or beyond their bounds. With ``mismatch`` the machine has a force that its
+    simulator lacks, that of figure 2, and one learner looks for it. ``sink``
+    (`sim2gp.sinks`) gets every episode's numbers at once.
     """
     started = time.perf_counter()
-    make, preset = MACHINES[machine]
+    make, make_task = MACHINES[machine]
     system = make()
-    model = Sim2GP(system)
-    learners: dict[str, AbstractModel] = {
-        LEARNER: model,
-        "point estimate": PointEstimate(model),
-        "prior mean": PriorMean(model),
-    }
+    effects = effects_of(machine, "mismatch") if mismatch else ()
+    preset = partial(make_task, effects=effects)
+    learners = _learners(system, preset(), mismatch)
     parts, runs = 1 + len(learners) * episodes, []
     sink = sink or Nowhere()
     with (progress or Progress()).task("demo", seeds * parts) as task:
@@ -107,8 +120,26 @@ def demo(
             histories = _race(accepted.task, learners, episodes, key, told)
             runs.append(SeedRun(accepted, hanging_return(accepted.task), histories))
     summary, arrays = _demo_summary(system, machine, runs, seed, episodes)
-    summary["truth"] = truth
+    forces = _forces(next(iter(runs[0].histories.values())))
+    arrays |= force_arrays(forces)
+    summary["forces"] = {c.name: c.entry() for c in forces}
+    summary |= {"truth": truth, "mismatch": mismatch}
     return Demonstration(summary | provenance(started), arrays)
+
+
+def _learners(
+    system: AbstractPlant, task: Task, mismatch: bool
+) -> dict[str, AbstractModel]:
+    """Who meets the machine; the first is shown."""
+    model = Sim2GP(system)
+    if mismatch:
+        forces = MissingForces(model, reach=reach_of(task, system))
+        return {WITH_FORCES: forces, LEARNER: model}
+    return {
+        LEARNER: model,
+        "point estimate": PointEstimate(model),
+        "prior mean": PriorMean(model),
+    }
 
 
 def _race(
@@ -151,10 +182,11 @@ def _demo_summary(
     methods = list(runs[0].histories)
     returns = {m: np.stack([r.histories[m].returns for r in runs]) for m in methods}
     solved = {m: [r.solved(m) for r in runs] for m in methods}
-    first, shown = runs[0], runs[0].histories[LEARNER]
-    belief = shown.belief
-    assert isinstance(belief, Sim2GPBelief)
-    table = system.parameters
+    leader = methods[0]
+    first, shown = runs[0], runs[0].histories[leader]
+    flown = shown.belief
+    assert isinstance(flown, Sim2GPBelief)
+    belief, table = flown.without_functions(), system.parameters
     found = diagnose.summary(table, belief.prior, belief.posterior, belief.information)
     for name, value in first.accepted.task.truth.items():
         if name in found["parameters"]:
@@ -167,7 +199,7 @@ def _demo_summary(
         "seed": seed,
         "seeds": len(runs),
         "episodes": episodes,
-        "headline": _demo_headline(runs, seconds),
+        "headline": _demo_headline(runs, leader, seconds),
         "returns": {m: _squeeze(returns[m].tolist()) for m in methods},
         "oracle_return": _squeeze([r.oracle for r in runs]),
         "hang_return": _squeeze([r.hang for r in runs]),
@@ -179,7 +211,7 @@ def _demo_summary(
             for m in methods
         },
         "noise": dict(zip(states, np.asarray(belief.noise).tolist(), strict=True)),
-        "misfit": _misfit(belief, shown.data),
+        "misfit": _misfit(flown, shown.data),
         "log_evidence": float(belief.log_evidence),
         "n_transitions": int(belief.count),
         **found,
@@ -191,7 +223,7 @@ def _demo_summary(
         for m in methods
     }
     summary["tables"] = [_score_table(runs, methods, scores)]
-    summary["animation"] = _animation(first.accepted.task, machine, scores[LEARNER][0])
+    summary["animation"] = _animation(first.accepted.task, machine, scores[leader][0])
     arrays = {f"returns/{m}": returns[m] for m in methods}
     arrays |= {f"scores/{m}": scores[m] for m in methods}
     # Each episode's last state is left out: time and actions then are T long.
@@ -208,6 +240,22 @@ def _misfit(belief: Sim2GPBelief, data: Transitions) -> dict[str, Any]:
     return misfit_of_transitions(likelihood, *about).as_dict()
 
 
+@in_float64
+def _forces(history: History) -> tuple[Curve, ...]:
+    """Forces that the data have turned on, over where the machine has been."""
+    belief, data = history.belief, history.data
+    assert isinstance(belief, Sim2GPBelief)
+    system, table = belief.system, belief.system.parameters
+    sd = np.asarray(belief.prior.sd())
+    on = [g for g, i in table.groups.items() if sd[i[0]] > ON * table.free[i[0]].sd]
+    known = [f for f in functions_of(system) if f.name in on]
+    x = np.concatenate([data.state, data.action], axis=1)[np.asarray(data.mask)]
+    channels = (*system.physical_states, *system.actions)
+    ends = zip(x.min(axis=0).tolist(), x.max(axis=0).tolist(), strict=True)
+    box = {c.name: end for c, end in zip(channels, ends, strict=True)}
+    return curves_of(system, known, box, belief.posterior)
+
+
 def _animation(task: Task, machine: str, scores: np.ndarray) -> dict[str, Any]:
     """What the report needs to draw the machine's episodes."""
     return {
@@ -222,8 +270,8 @@ def _animation(task: Task, machine: str, scores: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _demo_headline(runs: list[SeedRun], seconds: float) -> str:
-    counts = [r.solved(LEARNER) for r in runs]
+def _demo_headline(runs: list[SeedRun], leader: str, seconds: float) -> str:
+    counts = [r.solved(leader) for r in runs]
     done = sorted(n for n in counts if n is not None)
     if not done:
         return "The learner did not reach 95 % of the oracle's score."

@@ -34,11 +34,12 @@ from sim2gp.identification.intervals.discrepancy import (
 )
 from sim2gp.identification.intervals.scatter import CorrectedFit
 from sim2gp.identification.intervals.words import (
-    force_arrays,
+    force_entries,
     interval_entry,
     missing_forces_table,
 )
 from sim2gp.identification.misfit.residuals import misfit_of_windows
+from sim2gp.identification.missing_physics.curves import force_arrays
 from sim2gp.identification.words import bound_warnings
 from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
@@ -72,7 +73,7 @@ def identification_results(
         project, logs, likelihood, known, honest, band, seed
     )
     arrays = _stored(table, known, honest.posterior, band, seed)
-    arrays |= force_arrays(honest)
+    arrays |= force_arrays(honest.found)
     other = (
         forecast_unseen(project, logs, windows, places, grid, known)
         if held_out
@@ -144,11 +145,10 @@ def _identification_summary(
         corrected=honest.posterior,
     )
     noise = dict(zip(names, np.asarray(fitted.noise.sd).tolist(), strict=True))
-    rows = sum(len(log) for log in logs)
-    actions = [channel.name for channel in system.actions]
+    rows, actions = sum(map(len, logs)), [channel.name for channel in system.actions]
     about = interval_entry(honest, found["parameters"], len(windows))
     listed = configuration_entries(system, logs, found["parameters"])
-    listed["tables"] = [*missing_forces_table(about), *listed.get("tables", ())]
+    tables = [*missing_forces_table(honest), *listed.get("tables", ())]
     return {
         "command": "identify",
         "title": f"{project.name}: what {_count_of_logs(logs)}",
@@ -158,6 +158,7 @@ def _identification_summary(
         "convergence": fitted.convergence.as_dict(),
         "noise": noise,
         "intervals": about,
+        "forces": force_entries(honest),
         "misfit": {
             **misfit_of_windows(likelihood, fitted).as_dict(),
             "noise": _noise_words(names, noise, windows, channel_units(system)),
@@ -181,6 +182,7 @@ def _identification_summary(
         "trace_note": "Forecasts of half a second from causal starts, of the logs that "
         "were fitted; they know the recorded inputs and nothing else of the future.",
         **listed,
+        "tables": tables,
         **found,
     }
 

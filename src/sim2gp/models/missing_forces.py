@@ -42,6 +42,7 @@ from sim2gp.types import Action, Key, State, in_float64
 DRAWS, ROWS = 128, 64
 BROAD = 3.0  # scale of every force in a first descent
 ROUNDS = 7  # of relevance and descent
+ON = 10.0 * OFF  # scale of a force that is on
 SAME = 1.2  # times the last noise: the last fit still explains the data
 
 

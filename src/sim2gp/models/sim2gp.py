@@ -85,8 +85,30 @@ class Sim2GPBelief(AbstractBelief):
 
         Weights of functions that may be missing (parameters in groups) are left out.
         """
-        own = np.flatnonzero([not p.group for p in self.system.parameters.free])
+        own = self._own()
         return self.posterior.mean[own], self.posterior.sd()[own]
+
+    @in_float64
+    def without_functions(self) -> "Sim2GPBelief":
+        """What it says of the simulator's own parameters, missing functions averaged.
+
+        It predicts nothing: its machine still has them.
+        """
+        own = self._own()
+        rest = np.setdiff1d(np.arange(self.posterior.mean.size), own)
+        A, r = self.information, len(rest)
+        rows = jnp.concatenate([A, jnp.eye(A.shape[1], dtype=A.dtype)[rest]])
+        left = triangular(rows[:, np.concatenate([rest, own])])[r:, r:]
+        prior, posterior = (
+            Gaussian(g.mean[own], Gaussian(g.mean[own], g.scale[own]).triangular())
+            for g in (self.prior, self.posterior)
+        )
+        new = prior, posterior, left
+        return eqx.tree_at(lambda b: (b.prior, b.posterior, b.information), self, new)
+
+    def _own(self) -> Int[np.ndarray, " p"]:
+        """Places of the simulator's own parameters."""
+        return np.flatnonzero([not p.group for p in self.system.parameters.free])
 
 
 class Sim2GP(AbstractModel):

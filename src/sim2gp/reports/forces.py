@@ -11,7 +11,7 @@ TWO_SIDED = 1.96  # sd of a 95 % band
 
 def missing_forces(summary: Summary, arrays: Arrays) -> Section:
     """Each force against its variable, with its 95 % band."""
-    known = (summary.get("intervals") or {}).get("forces") or {}
+    known = summary.get("forces") or {}
     charts = []
     for name, about in known.items():
         if f"forces/{name}" not in arrays:

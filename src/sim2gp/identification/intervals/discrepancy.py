@@ -166,20 +166,23 @@ def _identifiable(
     A smooth force of the velocity may be a damping: what acts so is called damping. Of
     each group the directions remain that no parameters mimic, with the prior that it
     has given that there are no others. Groups of a kind are on together: a joint alone
-    may show too little of its friction to tell it from damping.
+    may show too little of its friction to tell it from damping, and of all inputs the
+    gains may be the masses' scale.
     """
     A = np.asarray(np.linalg.qr(np.concatenate(list(pulls.factors)), mode="r"))
     Q, R = np.linalg.qr(A[:, own])
     Q = Q[:, np.abs(np.diag(R)) > 1e-12 * np.abs(R).max(initial=0.0)]
-    parts, kinds = [np.eye(A.shape[1])[:, own]], []
+    of: dict[str, list[int]] = {}
     for name, places in groups.items():
-        kept = _apart(A[:, places], Q)
+        of.setdefault(name.rsplit(".", 1)[-1], []).extend(places.tolist())
+    parts, found, start = [np.eye(A.shape[1])[:, own]], {}, len(own)
+    for kind, all_places in of.items():
+        kept = _apart(A[:, all_places], Q)
         W = np.zeros((A.shape[1], kept.shape[1]))
-        W[places] = kept
+        W[all_places] = kept
         parts.append(W)
-        kinds += [name.rsplit(".", 1)[-1]] * kept.shape[1]
-    of = np.asarray([""] * len(own) + kinds)
-    found = {kind: np.flatnonzero(of == kind) for kind in dict.fromkeys(kinds)}
+        found[kind] = np.arange(start, start + kept.shape[1])
+        start += kept.shape[1]
     return np.concatenate(parts, axis=1), found
 
 

@@ -4,11 +4,8 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 from sim2gp.identification.intervals import scatter as intervals
-from sim2gp.identification.intervals.scatter import NOTHING, CorrectedFit
-from sim2gp.identification.missing_physics.curves import Curve
+from sim2gp.identification.intervals.scatter import CorrectedFit
 from sim2gp.identification.words import digits
 from sim2gp.types import in_float64
 
@@ -30,37 +27,28 @@ def interval_entry(
         "freedom": honest.freedom,
         "missing": honest.missing if honest.forces else None,
         "allowed_for": {name: honest.each[name] for name in honest.forces},
-        "forces": {c.name: _force_entry(c, honest.each) for c in honest.found},
     }
 
 
-def force_arrays(honest: CorrectedFit) -> dict[str, np.ndarray]:
-    """The forces that are probable: ``forces/NAME``, rows of variable, mean and sd."""
-    return {f"forces/{c.name}": np.stack([c.at, c.mean, c.sd]) for c in honest.found}
-
-
-def _force_entry(curve: Curve, each: Mapping[str, float]) -> dict[str, Any]:
-    mean, sd = curve.largest
+def force_entries(honest: CorrectedFit) -> dict[str, Any]:
+    """The entry "forces" of a summary: those that are rather there than not."""
+    each = honest.each
     return {
-        "where": curve.where,
-        "of": curve.of,
-        "unit": curve.unit,
-        "of_unit": curve.of_unit,
-        "probability": max(each.get(kind, 0.0) for kind in curve.kinds),
-        "mean": mean,
-        "sd": sd,
+        c.name: c.entry() | {"probability": max(each.get(k, 0.0) for k in c.kinds)}
+        for c in honest.found
     }
 
 
-def missing_forces_table(told: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """What the simulator may lack, clearest first, where something is probable."""
-    if not told["forces"] or told["missing"] <= NOTHING:
+def missing_forces_table(honest: CorrectedFit) -> list[dict[str, Any]]:
+    """What the simulator may lack, clearest first."""
+    forces = force_entries(honest)
+    if not forces:
         return []
 
     def clear(entry: Mapping[str, Any]) -> float:
         return abs(entry["mean"]) / entry["sd"] if entry["sd"] > 0.0 else 0.0
 
-    found = sorted(told["forces"].values(), key=lambda entry: -clear(entry))
+    found = sorted(forces.values(), key=lambda entry: -clear(entry))
     rows = [
         [
             entry["where"],

@@ -1,7 +1,7 @@
 """Forces that a machine may lack, as curves with a band over where it has been."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.parameters import Parameters
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.effects.forces import AbstractUnknownFunction, MissingForce
-from sim2gp.systems.machine import plant_of
+from sim2gp.systems.machine import Machine, plant_of
 
 POINTS = 61
 
@@ -31,6 +31,13 @@ class Curve(NamedTuple):
     at: Float[np.ndarray, " n"]
     mean: Float[np.ndarray, " n"]
     sd: Float[np.ndarray, " n"]
+
+    def entry(self) -> dict[str, Any]:
+        """What a summary says of it: where, of what, how large where it is clearest."""
+        mean, sd = self.largest
+        about = {"where": self.where, "of": self.of}
+        units = {"unit": self.unit, "of_unit": self.of_unit}
+        return about | units | {"mean": mean, "sd": sd}
 
     @property
     def name(self) -> str:
@@ -73,6 +80,17 @@ def curves_of(
         about = own[0].unit(plant), units[of], kinds
         found.append(Curve(where, of, *about, at, mean, sd))
     return tuple(found)
+
+
+def functions_of(system: AbstractSystem) -> tuple[AbstractUnknownFunction, ...]:
+    """The functions of a machine that may be missing."""
+    effects = system.effects if isinstance(system, Machine) else ()
+    return tuple(e for e in effects if isinstance(e, AbstractUnknownFunction))
+
+
+def force_arrays(curves: Sequence[Curve]) -> dict[str, np.ndarray]:
+    """Of a run: ``forces/NAME``, rows of the variable, the mean and the sd."""
+    return {f"forces/{c.name}": np.stack([c.at, c.mean, c.sd]) for c in curves}
 
 
 def _of_velocity(f: AbstractUnknownFunction) -> bool:
