@@ -238,7 +238,7 @@ def test_friction_that_the_simulator_lacks_is_in_the_intervals(
     one = np.zeros(len(likelihood.windows), int)
     assert away(truth, belief.posterior).max() > 12.0
     alone = corrected_windows(likelihood, belief, one, ())
-    assert alone.forces == ()
+    assert alone.kinds == ()
     assert away(truth, alone.posterior).max() > 7.0
     found = corrected_windows(likelihood, belief, one)
     assert found.missing > 0.99

@@ -62,7 +62,7 @@ def fit_windows(
         e, noise = np.zeros(windows.start.shape), likelihood.first_noise()
         rounds = NOISE_ROUNDS
     else:
-        z = jnp.linalg.solve(prior.scale, warm_start.posterior.mean - prior.mean)
+        z = prior.whitened(warm_start.posterior.mean)
         first = jnp.full((starts, p), jnp.nan).at[0].set(z)
         e, noise, rounds = warm_start.nuisances, warm_start.noise, WARM_ROUNDS
     begin = first, e, noise, rounds, FREEDOM if robust else np.inf

@@ -68,8 +68,7 @@ class Estimate(eqx.Module):
 
     def z(self) -> Float[Array, " p"]:
         """The MAP, whitened by the prior; call it under `in_float64`."""
-        away = self.posterior.mean - self.prior.mean
-        return jnp.linalg.solve(self.prior.scale, away)
+        return self.prior.whitened(self.posterior.mean)
 
     @in_float64
     def with_measurements(self, table: Parameters) -> "Estimate":

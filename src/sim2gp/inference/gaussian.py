@@ -30,6 +30,11 @@ class Gaussian(eqx.Module):
         """The point at standard normal coordinates ``eps``."""
         return self.mean + self.scale @ eps
 
+    def whitened(self, x: Float[AnyArray, " n"]) -> Float[AnyArray, " n"]:
+        """The standard normal coordinates of a point; ``scale`` must be square."""
+        found: AnyArray = library(x).linalg.solve(self.scale, x - self.mean)
+        return found
+
     def sample(self, key: Key) -> Float[Array, " n"]:
         """One draw."""
         return self.at(jax.random.normal(key, (self.scale.shape[1],), self.scale.dtype))

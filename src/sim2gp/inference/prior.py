@@ -96,8 +96,7 @@ class ParameterPrior(AbstractPrior):
 
     def moved(self, z: Float[AnyArray, " p"], dz: Float[AnyArray, " p"]) -> AnyArray:
         about = self.gaussian
-        tt = self.table.moved(about.at(z), about.scale @ dz)
-        return library(z).linalg.solve(about.scale, tt - about.mean)
+        return about.whitened(self.table.moved(about.at(z), about.scale @ dz))
 
     @property
     def members(self) -> Float[np.ndarray, "g p"]:
@@ -129,8 +128,7 @@ class ParameterPrior(AbstractPrior):
     @in_float64
     def linearised(self, tt: Float[Array, " p"]) -> Gaussian:
         """As a Gaussian, the measured sums linearised at the virtual ``tt``."""
-        away = jnp.asarray(tt, float) - self.gaussian.mean
-        z = jnp.linalg.solve(self.gaussian.scale, away)
+        z = self.gaussian.whitened(jnp.asarray(tt, float))
         rows = self.table.measurement_rows(self.gaussian, z)
         about = rows.at[:, -1].add(-rows[:, :-1] @ z)
         full = stack(about, jnp.eye(z.size, z.size + 1, dtype=z.dtype))

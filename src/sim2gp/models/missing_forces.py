@@ -91,7 +91,7 @@ class MissingForces(AbstractModel):
         """
         assert isinstance(belief, Sim2GPBelief)
         rows, about = jax.tree.map(jnp.asarray, data), self.sim.prior
-        z = jnp.linalg.solve(about.scale, belief.posterior.mean - about.mean)
+        z = about.whitened(belief.posterior.mean)
         first = np.asarray([at[0] for at in self.system.parameters.groups.values()])
         scales = (jnp.diag(belief.prior.scale) / jnp.diag(about.scale))[first]
         last = _Start(z, belief.noise, scales, belief.count > 0)

@@ -180,8 +180,7 @@ class Sim2GP(AbstractModel):
         rows = jax.tree.map(jnp.asarray, data)
         if self.frozen:
             return belief_of(self, _noise_alone(self, rows), rows)
-        away = belief.posterior.mean - self.prior.mean
-        warm = jnp.linalg.solve(self.prior.scale, away)
+        warm = self.prior.whitened(belief.posterior.mean)
         first = jnp.stack([warm, jnp.zeros_like(warm)])
         found = _fit(self, rows, drawn_starts(first, STARTS, key))
         names = self.system.parameters.names

@@ -22,7 +22,7 @@ from jaxtyping import Float, Int
 Groups = Mapping[str, Int[np.ndarray, " _"]]
 Scales = Mapping[str, float]  # of the groups that are on
 NONE = ""  # no group at all
-#: Prior probability that nothing is missing; of one group more, as often as of these.
+#: Prior probability that nothing is missing; and of one group more, relative.
 NOTHING, MORE = 0.5, 0.5
 SHARES = tuple(10.0 ** (-0.4 * k) for k in range(6))  # scales, alike
 MOST = 4  # groups

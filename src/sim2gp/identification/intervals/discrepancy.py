@@ -82,14 +82,13 @@ def corrected_windows(
     system, whole, own = _with_forces_at_zero(system, fitted, given)
     wider, p = WindowsLikelihood(system, cut), len(own)
     mean, scale = (np.asarray(x) for x in (whole.prior.mean, whole.prior.scale))
-    here = np.asarray(whole.posterior.mean)
-    rows = rows_of(wider, whole, jnp.asarray(here))
+    rows = rows_of(wider, whole, whole.posterior.mean)
     pulls = pulls_of_rows(rows, cut, group)
     T, groups = _identifiable(pulls, own, system.parameters.groups)
     k = T.shape[1]
     prior = Gaussian(jnp.zeros(k), jnp.eye(k))
     at = np.zeros(k)
-    at[:p] = np.linalg.solve(scale, here - mean)[own]
+    at[:p] = np.asarray(whole.prior.whitened(whole.posterior.mean))[own]
     onto = _Onto(mean, scale @ T)
     for _ in range(ROUNDS):
         now = Gaussian(jnp.asarray(at), prior.scale)
@@ -121,7 +120,7 @@ def forces_of(
     """What a machine may lack where its recordings have been.
 
     Nothing of a plant without a mass matrix, whose intervals rest on the scatter of its
-    windows alone.
+    windows alone: an acceleration of one joint is no force on an arm.
     """
     if not isinstance(plant_of(system), AbstractMechanism):
         return ()

@@ -54,7 +54,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from sim2gp.identification.intervals.averaging import NONE, Groups, averaged
+from sim2gp.identification.intervals.averaging import NONE, NOTHING, Groups, averaged
 from sim2gp.identification.intervals.pulls import Pulls
 from sim2gp.identification.misfit.tests import must_be_finite
 from sim2gp.identification.missing_physics.curves import Curve
@@ -67,7 +67,6 @@ from sim2gp.types import in_float64
 FEWEST = 4.0
 #: Of Bartlett's weights: ``1.5 W / b`` degrees of freedom (Priestley 1981).
 BARTLETT = 1.5
-NOTHING = 0.5  # probability of more than which something is said to be missing
 LIKE_WHITE = 1.3  # times as wide: small samples alone make so much of white noise
 MUCH = 3.0  # times as wide: a summary says why, wherever it names the interval
 
@@ -102,8 +101,8 @@ class CorrectedFit:
         return tuple(c for c in self.curves if likely & set(c.kinds))
 
     @property
-    def forces(self) -> tuple[str, ...]:
-        """What it may lack."""
+    def kinds(self) -> tuple[str, ...]:
+        """Kinds of forces that it may lack."""
         return tuple(name for name in self.each if name != NONE)
 
 
@@ -223,7 +222,7 @@ def _missing_percent(found: CorrectedFit) -> str:
 
 def _missing_physics_remark(found: CorrectedFit) -> str:
     """Whether physics that is missing is in the intervals."""
-    if not found.forces:
+    if not found.kinds:
         return (
             "This covers errors that come and go, not physics that the model lacks "
             "(sim2gp explain)."

@@ -25,8 +25,8 @@ def interval_entry(
         "pulls_times_white": math.sqrt(honest.inflation) if honest.enough else None,
         "windows_at_once": honest.lag,
         "freedom": honest.freedom,
-        "missing": honest.missing if honest.forces else None,
-        "allowed_for": {name: honest.each[name] for name in honest.forces},
+        "missing": honest.missing if honest.kinds else None,
+        "allowed_for": {name: honest.each[name] for name in honest.kinds},
     }
 
 
