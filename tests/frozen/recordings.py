@@ -30,18 +30,23 @@ def figures(run: Any) -> dict[str, np.ndarray]:
 
 
 def check_same(
-    was: Mapping[str, Any], now: Mapping[str, Any], share: float = SHARE
+    was: Mapping[str, Any],
+    now: Mapping[str, Any],
+    share: float = SHARE,
+    width: float = SHARE,
 ) -> None:
     """Assert that no figure of a run has moved by more than its share.
 
-    ``share`` is that of the posterior's means.
+    ``share`` is that of the posterior's means, ``width`` that of corrected sd.
     """
+    ratio = now["intervals_sd"] / was["intervals_sd"]
+    assert np.max(np.abs(ratio - 1.0)) < width
     assert abs(now["log_evidence"] - was["log_evidence"]) < SHARE
-    for name, width in (("belief", 1.0), ("intervals", WIDE)):
-        sd = was[f"{name}_sd"]
-        moved = np.abs(now[f"{name}_mean"] - was[f"{name}_mean"]) / (width * sd)
+    assert np.max(np.abs(now["belief_sd"] / was["belief_sd"] - 1.0)) < SHARE
+    for name, unit in (("belief", 1.0), ("intervals", WIDE)):
+        sd = unit * was[f"{name}_sd"]
+        moved = np.abs(now[f"{name}_mean"] - was[f"{name}_mean"]) / sd
         assert np.max(moved) < share
-        assert np.max(np.abs(now[f"{name}_sd"] / sd - 1.0)) < SHARE
     np.testing.assert_allclose(now["held_out"], was["held_out"], rtol=SHARE)
 
 
