@@ -54,8 +54,8 @@ def test_a_project_is_identified_as_before(name: str, tmp_path: Path) -> None:
     was, now = (sg.load_run(run) for run in (GOLDEN / "runs" / name, out))
     before, after = figures(was), figures(now)
     # Intervals allow for forces in place of named effects: the Furuta's are 1 to 4 %
-    # wider. The starts' rates have another prior since (docs/decisions.md, Windows): it moves
-    # the arm's means by up to .031 sd.
+    # wider. The starts' rates have another prior since (docs/decisions.md, Windows): it
+    # moves the arm's means by up to .031 sd.
     assert after["log_evidence"] > before["log_evidence"]
     check_same(
         before | {"log_evidence": after["log_evidence"]}, after, share=0.04, width=0.05
