@@ -59,6 +59,7 @@ MODELS = {
     **{
         f"PointEstimate({name})": lambda make=make: sg.PointEstimate(make())
         for name, make in PLAIN.items()
+        if name != "MissingForces"  # whose beliefs are those of Sim2GP
     },
     "PointEstimate(Auto)": lambda: sg.PointEstimate(sg.Auto([sim(), nlm()])),
     "Auto(PointEstimate)": lambda: sg.Auto([sg.PointEstimate(sim()), sim()]),
