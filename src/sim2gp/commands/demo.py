@@ -184,9 +184,9 @@ def _demo_summary(
     solved = {m: [r.solved(m) for r in runs] for m in methods}
     leader = methods[0]
     first, shown = runs[0], runs[0].histories[leader]
-    flown = shown.belief
-    assert isinstance(flown, Sim2GPBelief)
-    belief, table = flown.without_functions(), system.parameters
+    learned = shown.belief
+    assert isinstance(learned, Sim2GPBelief)
+    belief, table = learned.without_functions(), system.parameters
     found = diagnose.summary(table, belief.prior, belief.posterior, belief.information)
     for name, value in first.accepted.task.truth.items():
         if name in found["parameters"]:
@@ -211,7 +211,7 @@ def _demo_summary(
             for m in methods
         },
         "noise": dict(zip(states, np.asarray(belief.noise).tolist(), strict=True)),
-        "misfit": _misfit(flown, shown.data),
+        "misfit": _misfit(learned, shown.data),
         "log_evidence": float(belief.log_evidence),
         "n_transitions": int(belief.count),
         **found,

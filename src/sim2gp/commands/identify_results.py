@@ -135,6 +135,7 @@ def _identification_summary(
     seed: int,
 ) -> dict[str, Any]:
     system, windows = project.system, likelihood.windows
+    inputs = [channel.name for channel in system.actions]
     names = channels(system, windows)
     found = diagnose.summary(
         system.parameters,
@@ -145,8 +146,7 @@ def _identification_summary(
         corrected=honest.posterior,
     )
     noise = dict(zip(names, np.asarray(fitted.noise.sd).tolist(), strict=True))
-    rows, actions = sum(map(len, logs)), [channel.name for channel in system.actions]
-    about = interval_entry(honest, found["parameters"], len(windows))
+    rows = sum(len(log) for log in logs)
     listed = configuration_entries(system, logs, found["parameters"])
     tables = [*missing_forces_table(honest), *listed.get("tables", ())]
     return {
@@ -157,7 +157,7 @@ def _identification_summary(
         "converged": True,
         "convergence": fitted.convergence.as_dict(),
         "noise": noise,
-        "intervals": about,
+        "intervals": interval_entry(honest, found["parameters"], len(windows)),
         "forces": force_entries(honest),
         "misfit": {
             **misfit_of_windows(likelihood, fitted).as_dict(),
@@ -171,7 +171,7 @@ def _identification_summary(
         "n_windows": len(windows),
         "units": channel_units(system),
         "band": {
-            "input_sd": dict(zip(actions, band.input_sd.tolist(), strict=True)),
+            "input_sd": dict(zip(inputs, band.input_sd.tolist(), strict=True)),
             "inflation": band.inflation,
         },
         "warnings": [

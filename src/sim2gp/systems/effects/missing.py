@@ -36,7 +36,8 @@ def missing_forces(
     """Of each joint a force by position, by velocity and of dry friction; of each input
     a smooth change and a dead zone.
 
-    ``box`` is where the machine moves, by channel.
+    ``box`` is where the machine moves, by channel. With ``fine``, of each hinge the
+    cogging of a motor as well.
     """
     plant = plant_of(system)
     step = min(plant.max_substep, LONGEST_MEAN)
