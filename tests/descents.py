@@ -9,11 +9,11 @@ from jaxtyping import Array, Float
 
 from sim2gp.inference.arrowhead import Blocks, Noise
 from sim2gp.inference.convergence import Convergence, converged
+from sim2gp.inference.descent import NOTHING, multi_start
 from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.laplace import Laplace, laplace
 from sim2gp.inference.least_squares import factor, prior_rows
-from sim2gp.inference.levenberg_marquardt import multi_start
 from sim2gp.inference.likelihood import AbstractLikelihood
 from sim2gp.inference.prior import AbstractPrior
 from sim2gp.types import AnyArray
@@ -123,16 +123,11 @@ class Found(eqx.Module):
         return self.about.at.cost
 
 
-def descend(likelihood, starts, e, noise, update, prior=None, **options) -> Found:
-    """The best of several descents, and the noise by ``update``; the prior stays."""
+def descend(likelihood, starts, e, noise, learning=NOTHING, prior=None) -> Found:
+    """The best of several descents."""
     prior = standard(starts.shape[1]) if prior is None else prior
-
-    def both(at, noise, prior, damping):
-        return update(at, noise), prior
-
-    at, noise, _, steps, costs = multi_start(
-        likelihood, prior, starts, e, noise, both, **options
-    )
+    found = multi_start(likelihood, prior, starts, e, noise, learning)
+    at, noise, _, steps, costs = found
     about = laplace(at, noise)
     return Found(about, noise, costs, about.convergence(steps))
 
@@ -145,8 +140,7 @@ def minimise(
     prior: AbstractPrior | None = None,
 ) -> Found:
     """One descent."""
-    one = start[None]
-    return descend(likelihood, one, e, noise, lambda _, x: x, prior, rounds=0)
+    return descend(likelihood, start[None], e, noise, prior=prior)
 
 
 def estimate_of(

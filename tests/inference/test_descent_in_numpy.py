@@ -122,7 +122,7 @@ class Given(Arctangent):
 def test_what_no_step_can_better_is_named(value, error, code) -> None:
     likelihood = Given(jnp.ones((1, 1)), jnp.ones(1), [], value)
     prior = ParameterPrior(Gaussian(jnp.zeros(1), jnp.eye(1)), UNBOUNDED)
-    found = estimate(likelihood, prior, starts=jnp.zeros((1, 1)), rounds=1)
+    found = estimate(likelihood, prior, starts=jnp.zeros((1, 1)))
     with pytest.raises(error, match=code):
         found.convergence.check(("z",), "here")
 
@@ -178,7 +178,7 @@ def test_another_start_is_followed_where_it_is_better_and_elsewhere(
     whitened = 0.1 * np.asarray(starts)[:, None]
     e = np.zeros((1, 0))
     steps = list(
-        search(likelihood, prior, whitened, e, noise, lambda _, *known: known, SMALL)
+        search(likelihood, prior, whitened, e, noise, lambda _, known: known, SMALL)
     )
     assert sum(at.steps == 1 for at in steps) == descents
     assert abs(10.0 * float(steps[-1].at.z[0]) - where) < 0.1

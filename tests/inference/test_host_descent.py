@@ -235,7 +235,7 @@ def test_a_large_first_noise_does_not_end_a_descent():
         about = np.zeros(2), np.zeros((1, 0)), noise
         likelihood = LinearLikelihood(counts, floor, at, *about)
         known = ParameterPrior(prior, Parameters(PAIR))
-        found.append(estimate(likelihood, known, starts=jnp.zeros((1, 2)), rounds=0))
+        found.append(estimate(likelihood, known, starts=jnp.zeros((1, 2))))
     for x in found:
         assert float(x.noise.sd[0]) == pytest.approx(1e-3, rel=0.2)
         exact, _ = np.linalg.lstsq(J, y, rcond=None)[:2]

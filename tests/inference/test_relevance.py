@@ -128,7 +128,7 @@ def test_a_fit_with_groups_is_the_conjugate_one_at_its_scales():
     )
     prior = ParameterPrior(table().prior(), table())
     found = jax.jit(
-        lambda z: estimate(likelihood, prior, starts=z, rounds=8),
+        lambda z: estimate(likelihood, prior, starts=z),
     )(jnp.zeros((1, sum(SIZES))))
     sd, s = np.diag(found.prior.scale), float(found.noise.sd[0])
     scales = (sd / np.asarray(table().prior().sd()))[[1, 5]]

@@ -29,16 +29,16 @@ def fit(
     likelihood: AbstractLikelihood,
     system: AbstractSystem,
     noise: Noise | None,
-    rounds: int = 0,
+    learn: bool = False,
 ) -> Estimate:
-    """From the prior's mean; without rounds the noise stays as it is."""
+    """From the prior's mean; unless it is to ``learn`` the noise stays."""
     table = system.parameters
     found = estimate(
         likelihood,
         ParameterPrior(table.prior(), table),
         starts=jnp.zeros((1, len(table))),
         noise=noise,
-        rounds=rounds,
+        learn=learn,
     )
     found.convergence.check(table.names, "a test")
     return found
@@ -113,7 +113,7 @@ def test_each_likelihood_has_its_own_noise() -> None:
     first = stack.first_noise()
     np.testing.assert_array_equal(first.sd[:2], one_step.first_noise().sd)
     np.testing.assert_array_equal(first.sd[2:], windows.first_noise().sd)
-    found = fit(stack, system, None, rounds=200)
+    found = fit(stack, system, None, learn=True)
     (J1, y1), (J2, y2) = rows_of(one_step), rows_of(windows)
     mean, C = found.posterior.mean, found.posterior.covariance()
     r = np.einsum("nci,i->nc", J1, mean) - y1

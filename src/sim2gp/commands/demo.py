@@ -26,6 +26,7 @@ from sim2gp.identification.missing_physics.curves import (
     force_arrays,
     functions_of,
 )
+from sim2gp.inference.relevance import ON
 from sim2gp.models import (
     MissingForces,
     PointEstimate,
@@ -33,7 +34,6 @@ from sim2gp.models import (
     Sim2GP,
     Sim2GPBelief,
 )
-from sim2gp.models.missing_forces import ON
 from sim2gp.planning import MPC
 from sim2gp.planning.loop import Episode, History, psrl
 from sim2gp.planning.oracle import AcceptedTruth, accept_truth

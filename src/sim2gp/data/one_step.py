@@ -16,7 +16,6 @@ from sim2gp.inference.likelihood import AbstractLikelihood
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import in_float64
 
-NOISE_ROUNDS = 5  # EM; the last change of sig is below 1e-3 relative from here on
 FLOOR = 1e-3  # prior guess of the noise, relative to each channel's rms change
 
 

@@ -18,8 +18,6 @@ from sim2gp.inference.prior import ParameterPrior
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import Key, in_float64
 
-NOISE_ROUNDS = 8  # fewer leave noise and starts of real logs short of a fixed point
-WARM_ROUNDS = 3  # of a fit that begins with the noise of another one
 #: Share of the windows that a fit on the host begins with, how few they may be, and of
 #: how many rows: of fewer, all windows are as fast. So near to its MAP, in posterior
 #: sd, that part comes: all windows have another one.
@@ -60,18 +58,16 @@ def fit_windows(
         zeros = np.zeros if likelihood.on_host else jnp.zeros
         first = drawn_starts(zeros((1, p)), starts, key)
         e, noise = np.zeros(windows.start.shape), likelihood.first_noise()
-        rounds = NOISE_ROUNDS
     else:
         z = prior.whitened(warm_start.posterior.mean)
         first = jnp.full((starts, p), jnp.nan).at[0].set(z)
-        e, noise, rounds = warm_start.nuisances, warm_start.noise, WARM_ROUNDS
-    begin = first, e, noise, rounds, FREEDOM if robust else np.inf
+        e, noise = warm_start.nuisances, warm_start.noise
+    begin = first, e, noise, FREEDOM if robust else np.inf
     # By way of NumPy: JAX compiles again for numbers whose type it calls weak.
     begin = jax.device_put(jax.tree.map(np.asarray, begin))
-    first, e, noise, needed, freedom = begin
+    first, e, noise, freedom = begin
     about = ParameterPrior(prior, system.parameters)
-    same: dict[str, Any] = {"freedom": freedom, "needed": needed, "report": report}
-    same["rounds"] = NOISE_ROUNDS
+    same: dict[str, Any] = {"freedom": freedom, "report": report}
     some = _first_windows(likelihood) if warm_start is None else None
     if some is not None:
         part = likelihood.some(some)

@@ -18,29 +18,21 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sim2gp.inference.arrowhead import Noise, eliminate
-from sim2gp.inference.convergence import Convergence, converged
+from sim2gp.inference.convergence import NEAR, Convergence, converged
+from sim2gp.inference.descent import Learning, Scales, multi_start
 from sim2gp.inference.gaussian import Gaussian
-from sim2gp.inference.host_descent import SMALL, Progress, search
+from sim2gp.inference.host_descent import SMALL, STILL, Progress, search
 from sim2gp.inference.laplace import Laplace, expected_noise, laplace, log_normaliser
 from sim2gp.inference.least_squares import posterior
-from sim2gp.inference.levenberg_marquardt import (
-    EXACT,
-    Ends,
-    Point,
-    evaluate,
-    multi_start,
-)
+from sim2gp.inference.levenberg_marquardt import Point, evaluate
 from sim2gp.inference.likelihood import AbstractLikelihood
 from sim2gp.inference.linalg import library
 from sim2gp.inference.parameters import Parameters
 from sim2gp.inference.prior import AbstractPrior, ParameterPrior
-from sim2gp.inference.relevance import linear_of, relevant
+from sim2gp.inference.relevance import linear_of, price, relevant
 from sim2gp.types import AnyArray, AnyScalar, Key, Scalar, in_float64
 
 SPREAD = 0.7  # prior sd, of starts that are drawn
-#: How a descent ends after which scales change: roughly, for the next begins elsewhere.
-SCALED = Ends(tolerance=1e-2, most=6, until=SMALL)
-
 
 #: Called with each step that a fit on the host keeps, and a function for its posterior.
 Report = Callable[[Progress, Callable[[], "Estimate"]], None]
@@ -102,21 +94,20 @@ def estimate(
     prior: AbstractPrior,
     *,
     starts: Float[Array, "starts p"],
-    rounds: int,
     nuisances: Float[Array, "W n"] | None = None,
     noise: Noise | None = None,
+    learn: bool = True,
     freedom: float | Scalar = jnp.inf,
-    needed: Int[Array, ""] | None = None,
     report: Report | None = None,
     until: float = SMALL,
 ) -> Estimate:
-    """Descend from each of the whitened ``starts``, then ``rounds`` of EM.
+    """Descend from each of the whitened ``starts``; from the best, the noise as well.
 
     ``nuisances`` and ``noise`` are those of another fit to begin with; zeros and the
-    likelihood's own first noise without. Rounds beyond those ``needed``, and starts
-    that are no number, are compiled and not taken. A simulator on the host learns the
-    noise in turns with its steps until both rest, the step at ``until`` posterior sd.
-    After each of them it calls ``report``. What did not converge is reported by
+    likelihood's own first noise without. The noise is learned in turns with the steps
+    until both rest, or stays where it is not to ``learn``. Starts that are no number
+    are compiled and not taken. A simulator on the host rests at a step of ``until``
+    posterior sd, and calls ``report`` after each. What did not converge is reported by
     `Convergence.check`.
     """
     if nuisances is None:
@@ -126,8 +117,9 @@ def estimate(
         noise = likelihood.first_noise()
     start = starts, nuisances, noise
     if likelihood.on_host:
-        return _estimate_on_host(likelihood, prior, start, freedom, report, until)
-    return _estimate(likelihood, prior, *start, freedom, needed, rounds)
+        how = learn, report, until
+        return _estimate_on_host(likelihood, prior, start, freedom, *how)
+    return _estimate(likelihood, prior, *start, freedom, learn)
 
 
 # As in JAX, what is not finite is judged and not warned of.
@@ -137,6 +129,7 @@ def _estimate_on_host(
     prior: AbstractPrior,
     start: tuple[Float[Array, "starts p"], Float[Array, "W n"], Noise],
     freedom: float | Scalar,
+    learn: bool,
     report: Report | None,
     until: float,
 ) -> Estimate:
@@ -145,17 +138,18 @@ def _estimate_on_host(
     of_numpy = jax.tree.map(np.asarray, of_numpy)
     counts, floor, freedom, (starts, e, noise), of_prior = of_numpy
 
-    def update(
-        found: Laplace, noise: Noise, prior: AbstractPrior
-    ) -> tuple[Noise, AbstractPrior]:
-        return _learned(found, noise, prior, counts, floor, freedom)
+    assert not _is_scaled(prior)  # windows of logs have a given prior
+
+    def update(found: Laplace, noise: Noise) -> Noise:
+        return expected_noise(noise, *found.squares(), counts, floor, freedom)
 
     def about(found: Progress) -> Estimate:
-        args = found.noise, found.prior, counts, found.steps, found.away
+        args = found.noise, of_prior, counts, found.steps, found.away
         known: Estimate = jax.device_put(_about(found.found, *args))
         return known
 
-    for found in search(likelihood, of_prior, starts, e, noise, update, until):
+    learned = update if learn else None
+    for found in search(likelihood, of_prior, starts, e, noise, learned, until):
         if report is not None:
             report(found, partial(about, found))
     return about(found)
@@ -173,9 +167,7 @@ def _about(
 
     ``away`` is how far the MAP may be, in posterior sd, where the descent knows.
     """
-    xp, about = library(found.at.z), prior.gaussian
-    each = prior.each() if _is_scaled(prior) else xp.ones(about.mean.size)
-    evidence = found.log_joint() + log_normaliser(noise, counts)
+    about, each = prior.gaussian, _each(prior)
     return Estimate(
         Gaussian(about.mean, about.scale * each[None]),
         posterior(found.full, found.at.z, about),
@@ -183,9 +175,23 @@ def _about(
         found.at.e,
         found.arrow.data[:-1, :-1] * each[None],
         found.at.scores * each[None],
-        evidence - xp.sum(xp.log(each)),
+        _evidence(found, noise, prior, counts),
         found.convergence(steps, away),
     )
+
+
+def _each(prior: AbstractPrior) -> Float[AnyArray, " p"]:
+    """What the data multiply each parameter's prior sd by."""
+    mean = prior.gaussian.mean
+    return prior.each() if _is_scaled(prior) else library(mean).ones(mean.size)
+
+
+def _evidence(
+    found: Laplace, noise: Noise, prior: AbstractPrior, counts: Float[AnyArray, "W c"]
+) -> AnyScalar:
+    """Laplace's log evidence, nats."""
+    xp, each = library(found.at.z), _each(prior)
+    return found.log_joint() + log_normaliser(noise, counts) - xp.sum(xp.log(each))
 
 
 @eqx.filter_jit
@@ -196,48 +202,37 @@ def _estimate(
     nuisances: Float[Array, "W n"],
     noise: Noise,
     freedom: float | Scalar,
-    needed: Int[Array, ""] | None,
-    rounds: int,
+    learn: bool,
 ) -> Estimate:
     """The whole fit as one program, of simulators that JAX can compile."""
     counts, floor = likelihood.counts, likelihood.floor
 
-    def update(
-        at: Point, noise: Noise, prior: AbstractPrior, damping: Scalar
-    ) -> tuple[Noise, AbstractPrior]:
-        found = laplace(at, noise)
-        return _learned(found, noise, prior, counts, floor, freedom, damping)
+    def learned(at: Point, noise: Noise) -> Noise:
+        squares = laplace(at, noise).squares()
+        return expected_noise(noise, *squares, counts, floor, freedom)
 
-    at, noise, prior, steps, _ = multi_start(
-        likelihood,
-        prior,
-        starts,
-        nuisances,
-        noise,
-        update,
-        rounds=rounds,
-        needed=needed,
-        ends=SCALED if _is_scaled(prior) else EXACT,
-    )
+    def choose(
+        at: Point, noise: Noise, prior: AbstractPrior, trust: Scalar
+    ) -> tuple[Noise, AbstractPrior, Scalar]:
+        assert _is_scaled(prior)
+        linear = linear_of(laplace(at, noise), noise.weights, counts, floor)
+        noise, chosen = relevant(linear, at.z, noise, prior, trust)
+        other = jnp.max(jnp.abs(jnp.log(chosen.scales / prior.scales)))
+        return noise, chosen, other
+
+    def score(at: Point, noise: Noise, prior: AbstractPrior) -> Scalar:
+        assert _is_scaled(prior)
+        evidence = _evidence(laplace(at, noise), noise, prior, counts)
+        return evidence - price(prior.scales)
+
+    start, learning = (starts, nuisances, noise), Learning()
+    if learn:
+        learning = Learning(learned)
+        if _is_scaled(prior):
+            scales = Scales(choose, score)
+            learning = Learning(learned, scales, until=NEAR, still=STILL)
+    at, noise, prior, steps, _ = multi_start(likelihood, prior, *start, learning)
     return _about(laplace(at, noise), noise, prior, counts, steps)
-
-
-def _learned(
-    found: Laplace,
-    noise: Noise,
-    prior: AbstractPrior,
-    counts: Float[AnyArray, "W c"],
-    floor: Float[AnyArray, " c"],
-    freedom: AnyScalar,
-    damping: AnyScalar = 0.0,
-) -> tuple[Noise, AbstractPrior]:
-    """Noise and scales of the prior, where the data are linearised."""
-    expected = expected_noise(noise, *found.squares(), counts, floor, freedom)
-    if not _is_scaled(prior):
-        return expected, prior
-    linear = linear_of(found, expected.weights, counts, floor)
-    noise = Noise(noise.sd, expected.weights)
-    return relevant(linear, found.at.z, noise, prior, damping)
 
 
 def _is_scaled(prior: AbstractPrior) -> TypeGuard[ParameterPrior]:

@@ -42,9 +42,8 @@ NOTHING = 1e-2
 MOST_STEPS, FIRST_STEPS = 100, 30
 NOISE_TURNS, NEARLY = 10, 0.05  # of EM at one point; of the first, in a last one
 
-#: Noise that the residuals about a MAP are expected to have, and the scales of the
-#: prior, given those until now.
-Update = Callable[[Laplace, Noise, AbstractPrior], tuple[Noise, AbstractPrior]]
+#: Noise that the residuals about a MAP are expected to have, given that until now.
+Update = Callable[[Laplace, Noise], Noise]
 
 
 class Progress(NamedTuple):
@@ -56,7 +55,6 @@ class Progress(NamedTuple):
 
     found: Laplace
     noise: Noise
-    prior: AbstractPrior
     steps: int
     step_sd: float
     damping: float
@@ -87,9 +85,9 @@ def descend(
     """
     change = 0.0
     if update is not None:
-        here, noise, prior, change = _rested(update, here, noise, prior)
+        here, noise, change = _rested(update, prior, here, noise)
     sd, refused = float(here.newton_step_sd()), 0
-    yield Progress(here, noise, prior, 1, sd, damping, sd)
+    yield Progress(here, noise, 1, sd, damping, sd)
     for count in range(2, (most or MOST_STEPS) + 1):
         cost = float(here.at.cost)
         if not np.isfinite(cost) or damping >= MOST_DAMPING:
@@ -108,12 +106,12 @@ def descend(
             here = _linearised(prior, z, e, trial, noise)
         if keep or vain:
             if update is not None:
-                here, noise, prior, change = _rested(update, here, noise, prior)
+                here, noise, change = _rested(update, prior, here, noise)
             sd = float(here.newton_step_sd())
             # Of a noise that is another now, the step says nothing: the first is large.
             vain = vain and change <= STILL
             away = min(sd, size) if vain else sd
-            yield Progress(here, noise, prior, count, sd, damping, away)
+            yield Progress(here, noise, count, sd, damping, away)
         if vain or (sd <= until and change <= STILL):
             return
 
@@ -130,13 +128,13 @@ def begin_at(
 
 
 def _rested(
-    update: Update, here: Laplace, noise: Noise, prior: AbstractPrior
-) -> tuple[Laplace, Noise, AbstractPrior, float]:
+    update: Update, prior: AbstractPrior, here: Laplace, noise: Noise
+) -> tuple[Laplace, Noise, float]:
     """The noise where it rests at a point, which asks nothing of the simulator."""
     first, at, enough = noise, here.at, 0.1 * STILL
     for turn in range(NOISE_TURNS):
         before = noise
-        noise, prior = update(here, noise, prior)
+        noise = update(here, noise)
         again = point(at.z, at.e, at.blocks, prior.rows(at.z), noise)
         here = laplace(again, noise)
         moved = _change(noise, before)
@@ -144,7 +142,7 @@ def _rested(
             enough = max(enough, NEARLY * moved)
         if moved <= enough:
             break
-    return here, noise, prior, _change(noise, first)
+    return here, noise, _change(noise, first)
 
 
 def _change(new: Noise, old: Noise) -> float:
@@ -157,7 +155,7 @@ def search(
     starts: Float[np.ndarray, "starts p"],
     e: Starts,
     noise: Noise,
-    update: Update,
+    update: Update | None,
     until: float,
 ) -> Iterator[Progress]:
     """Each step that is kept on the way to the MAP; the last one yielded is there.

@@ -33,11 +33,10 @@ from sim2gp.inference.prior import ParameterPrior
 from sim2gp.types import AnyScalar, Scalar
 
 EM_ROUNDS, ROUNDS = 100, 200
-#: A scale falls by no more in one update: the linear model is not true far away.
-FALL = 5.0
 EARNED = 3.0  # nats: noise alone gives one group as much in 1 of 400 cases
 #: Of a group that is off, and of one that is as strong as it may be, in prior sd.
 OFF, MOST = 1e-4, 20.0
+ON = 10.0 * OFF  # from here on a group is on
 
 
 class Linear(NamedTuple):
@@ -57,15 +56,19 @@ def relevant(
     z: Float[Array, " p"],
     noise: Noise,
     prior: ParameterPrior,
-    damping: AnyScalar = 0.0,
+    trust: AnyScalar = 0.0,
 ) -> tuple[Noise, ParameterPrior]:
-    """Noise and scales of highest evidence on data that are linearised at ``z``."""
+    """Noise and scales of highest evidence on data that are linearised at ``z``.
+
+    ``trust`` is a precision that keeps the other parameters where they are, in that of
+    their prior: far away the linear model is not true.
+    """
     members = jnp.asarray(prior.members)
-    trust = damping * (1.0 - jnp.sum(members, axis=0))
+    held = trust * (1.0 - jnp.sum(members, axis=0))
 
     def turn(i: Array, carry: tuple) -> tuple:
         variance, tau2 = carry
-        x, S = _posterior(linear, z, variance, prior.each(jnp.sqrt(tau2)), trust)
+        x, S = _posterior(linear, z, variance, prior.each(jnp.sqrt(tau2)), held)
         rows = jnp.append(x - z, 1.0)
         squares = jnp.einsum("i,cij,j->c", rows, linear.grams, rows)
         spread = jnp.einsum("cij,ji->c", linear.grams[:, :-1, :-1], S)
@@ -81,14 +84,18 @@ def relevant(
     start = noise.sd**2, prior.scales**2
     variance, tau2 = jax.lax.fori_loop(0, ROUNDS, turn, start)
     each = prior.each(jnp.sqrt(tau2))
-    x, S = _posterior(linear, z, variance, each, trust)
+    x, S = _posterior(linear, z, variance, each, held)
     whitened = S / jnp.outer(each, each)
     # Where the linear model would go far to do without it, a group stays.
     gain = jax.vmap(_gained, (0, None, None))
     earned = jnp.maximum(*(gain(members, w / each, whitened) for w in (x, z)))
     scales = jnp.where(earned > EARNED, jnp.sqrt(tau2), OFF)
-    scales = jnp.maximum(scales, prior.scales / FALL)
     return Noise(jnp.sqrt(variance), noise.weights), prior.scaled(scales)
+
+
+def price(scales: Float[Array, " g"]) -> Scalar:
+    """Nats that the groups of these scales must have earned."""
+    return jnp.sum(jnp.where(scales > ON, EARNED, 0.0))
 
 
 def _posterior(
@@ -96,13 +103,13 @@ def _posterior(
     z: Float[Array, " p"],
     variance: Float[Array, " c"],
     each: Float[Array, " p"],
-    trust: Float[Array, " p"],
+    held: Float[Array, " p"],
 ) -> tuple[Float[Array, " p"], Float[Array, "p p"]]:
     """Mean and covariance of the whitened parameters."""
     total = jnp.sum(linear.grams / variance[:, None, None], axis=0)
     known = 1.0 / each**2
     # In units of the prior's sd the matrix has eigenvalues of one or more.
-    A = each[:, None] * (total[:-1, :-1] * each[None]) + jnp.diag(1.0 + trust * each**2)
+    A = each[:, None] * (total[:-1, :-1] * each[None]) + jnp.diag(1.0 + held * each**2)
     slope = each * (total[:-1, -1] + known * z)
     root = cho_factor(A)
     inverse = cho_solve(root, jnp.eye(z.size))

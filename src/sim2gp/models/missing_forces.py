@@ -39,10 +39,8 @@ from sim2gp.systems.effects.missing import missing_forces
 from sim2gp.types import Action, Key, State, in_float64
 
 #: Draws of the simulator's parameters, and transitions that judge them.
-DRAWS, ROWS = 128, 64
+DRAWS, ROWS = 64, 64
 BROAD = 3.0  # scale of every force in a first descent
-ROUNDS = 7  # of relevance and descent
-ON = 10.0 * OFF  # scale of a force that is on
 SAME = 1.2  # times the last noise: the last fit still explains the data
 
 
@@ -149,7 +147,7 @@ def _fit(model: MissingForces, data: Transitions, last: _Start, key: Key) -> Est
         z, sd = jax.lax.cond(start.project, best_draw, given, start)
         noise, about = Noise(sd, jnp.ones(1)), prior.scaled(start.scales)
         starts = z[None]
-        return estimate(likelihood, about, starts=starts, rounds=ROUNDS, noise=noise)
+        return estimate(likelihood, about, starts=starts, noise=noise)
 
     def skip(start: _Start) -> Estimate:
         shapes = jax.eval_shape(descend, start)

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from sim2gp import checks
 from sim2gp.belief import AbstractBelief, AbstractModel
-from sim2gp.data.one_step import NOISE_ROUNDS, OneStepLikelihood
+from sim2gp.data.one_step import OneStepLikelihood
 from sim2gp.data.transitions import Transitions
 from sim2gp.inference import linearized
 from sim2gp.inference.estimate import (
@@ -220,7 +220,6 @@ def _fit(
         likelihood,
         ParameterPrior(model.prior, model.system.parameters),
         starts=starts,
-        rounds=NOISE_ROUNDS,
     )
 
 

@@ -69,7 +69,7 @@ def select_constants(
     prior, likelihood = table.prior(), WindowsLikelihood(system, windows)
     linear = _linearise_prior(likelihood, prior, batches, until)
     zeros = jnp.zeros((1, len(table)))
-    fitted = estimate(linear, ParameterPrior(prior, table), starts=zeros, rounds=0)
+    fitted = estimate(linear, ParameterPrior(prior, table), starts=zeros)
     if not np.isfinite(fitted.log_evidence):
         raise _not_finite()
     # Windows that are left out are taken to have as much information as the others.

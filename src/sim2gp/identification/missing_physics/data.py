@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sim2gp.data import one_step
 from sim2gp.data.one_step import OneStepLikelihood
 from sim2gp.data.transitions import Transitions, with_history
 from sim2gp.data.windows import Windows
@@ -39,15 +38,13 @@ DRAWN = 2  # random starts of a one-step fit, next to the prior's mean
 class AbstractData(abc.ABC):
     """Rows that every candidate machine must explain.
 
-    ``freedom`` is the Student-t's, ``rounds`` those of EM, ``cluster`` the windows
-    whose errors may be correlated, ``period`` the time between actions in s, 0 where it
-    varies.
+    ``freedom`` is the Student-t's, ``cluster`` the windows whose errors may be
+    correlated, ``period`` the time between actions in s, 0 where it varies.
     """
 
     system: AbstractSystem
     period: float
     freedom: float
-    rounds: int
     cluster: Int[np.ndarray, " W"]
 
     @abc.abstractmethod
@@ -82,7 +79,6 @@ class AbstractData(abc.ABC):
             starts=jnp.asarray(starts, float),
             nuisances=warm_start.nuisances,
             noise=warm_start.noise,
-            rounds=self.rounds,
             freedom=jnp.asarray(self.freedom),
         )
         rows = int(np.asarray(likelihood.counts).max(axis=1).sum())
@@ -131,7 +127,7 @@ class OneStepData(AbstractData):
         self.episodes = [
             (np.asarray(S, float), np.asarray(A, float)) for S, A in episodes
         ]
-        self.freedom, self.rounds = np.inf, one_step.NOISE_ROUNDS
+        self.freedom = np.inf
         self.cluster = np.zeros(1, int)
 
     def transitions(self, history: int = 0) -> Transitions:
@@ -148,7 +144,6 @@ class OneStepData(AbstractData):
             likelihood,
             ParameterPrior(table.prior(), table),
             starts=drawn_starts(jnp.zeros((1, len(table))), 1 + DRAWN, key),
-            rounds=self.rounds,
         )
         rows = int(likelihood.counts[0, 0])
         found.convergence.check(table.names, f"{rows} transitions")
@@ -183,7 +178,6 @@ class WindowData(AbstractData):
         self.cut, self.robust, self.cluster = cut, robust, cluster
         self.windows = cut(system)
         self.freedom = fit.FREEDOM if robust else np.inf
-        self.rounds = fit.NOISE_ROUNDS
 
     @in_float64
     def fit(self) -> Estimate:

@@ -39,7 +39,6 @@ from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.effects.registry import Candidate
 from sim2gp.types import AnyArray, in_float64
 
-ROUNDS = 5  # EM for the noise, of a linearised fit
 ALIAS = 1e-5  # sine of the angle to the others' span; less cannot be separated
 SHARED = 0.3  # of a column: a parameter that explains so much of it is named
 FARTHEST = 3.0  # prior sd, of a refit's start
@@ -151,7 +150,6 @@ def _linear(
         _LinearPrior(standard, rows, z0),
         starts=z0[None],
         nuisances=bare.nuisances,
-        rounds=ROUNDS,
         freedom=jnp.asarray(data.freedom),
     )
     root = np.asarray(found.posterior.scale)
