@@ -184,13 +184,18 @@ class Gap:
     width: float
     sds: ClassVar[tuple[float, ...]] = (1.0,)
 
-    def value(self, x: Float[AnyArray, " 2"], z: Scalar) -> Scalar:
+    def value(self, x: Float[AnyArray, " 2"], z: Points) -> Points:
         """What it takes away: ``x[0]`` at the edge, where ``z`` is the width ``x[1]``.
 
         A true dead zone takes all of the input, ``x[0] = x[1]``.
         """
         w = x[1]
         return (dead_zone(z, w, SOFT * w) - z) * (x[0] / w)
+
+    def features(self, z: Float[AnyArray, "*b"]) -> Float[Array, "*b 1"]:
+        """What it takes away for ``x[0] = 1``, at the width's median."""
+        x = jnp.asarray([1.0, self.width])
+        return jnp.asarray(self.value(x, jnp.asarray(z)))[..., None]
 
 
 Basis = Sines | Sign | Gap
