@@ -148,7 +148,12 @@ def _estimate_on_host(
     def update(
         found: Laplace, noise: Noise, prior: AbstractPrior
     ) -> tuple[Noise, AbstractPrior]:
-        return _learned(found, noise, prior, counts, floor, freedom)
+        args = found, noise, prior, counts, floor, freedom
+        if not _is_scaled(prior):
+            return _learned(*args)
+        learned = _learned_in_jax(*jax.device_put(args))
+        both: tuple[Noise, AbstractPrior] = jax.tree.map(np.asarray, learned)
+        return both
 
     def about(found: Progress) -> Estimate:
         args = found.noise, found.prior, counts, found.steps, found.away
@@ -238,6 +243,9 @@ def _learned(
     linear = linear_of(found, expected.weights, counts, floor)
     noise = Noise(noise.sd, expected.weights)
     return relevant(linear, found.at.z, noise, prior, damping)
+
+
+_learned_in_jax = eqx.filter_jit(_learned)  # scales of a prior: a long iteration
 
 
 def _is_scaled(prior: AbstractPrior) -> TypeGuard[ParameterPrior]:
