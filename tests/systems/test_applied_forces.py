@@ -120,8 +120,9 @@ def test_a_step_within_jax_is_the_hosts_and_so_are_its_derivatives() -> None:
         return system.transition(tt + x[n : n + p], x0 + x[:n], a + x[n + p :], h)
 
     zero = jnp.zeros(n + p + 2)
-    J = np.asarray(jax.jacfwd(f)(zero))
-    np.testing.assert_allclose(jax.jacrev(f)(zero), J, atol=1e-12)
+    J = np.asarray(jax.jit(jax.jacfwd(f))(zero))
+    np.testing.assert_allclose(jax.jit(jax.jacrev(f))(zero), J, atol=1e-12)
+    f = jax.jit(f)
     scale = np.concatenate([np.ones(n), np.diag(prior.scale), np.ones(2)])
     for k in range(zero.size):
         step = zero.at[k].set(1e-5 * scale[k])
@@ -201,6 +202,10 @@ def test_a_force_is_in_newton_metres_of_what_moves_the_joint() -> None:
     one, two = (np.abs(spread[j] * [4.0, 2.0]).max() / spread[j, j] for j in (0, 1))
     assert found["q1"].force == pytest.approx(one, rel=0.03)
     assert found["q2"].force == pytest.approx(two, rel=0.03)
-    part = missing_forces(plant, BOX)[0]
-    assert part.unit(plant) == "N m"
+    parts = {f.name: f for f in missing_forces(plant, BOX)}
+    assert parts["q1.position_force"].unit(plant) == "N m"
+    # Steep, but a step of the largest expected size does not reverse the joint.
+    dry = parts["q2.dry_friction"]
+    steepest = dry.magnitude * spread[1, 1] * STEP / dry.basis.width
+    assert steepest == pytest.approx(0.5, rel=0.03)
     assert Coulomb("q1", 1.0).unit(plant) == "rad/s^2"
