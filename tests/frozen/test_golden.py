@@ -54,8 +54,8 @@ def test_a_project_is_identified_as_before(name: str, tmp_path: Path) -> None:
     was, now = (sg.load_run(run) for run in (GOLDEN / "runs" / name, out))
     before, after = figures(was), figures(now)
     # Intervals allow for forces in place of named effects: the Furuta's are 1 to 4 %
-    # wider. Those of the arm, a MuJoCo model, allowed for noise alone: now its scatter is
-    # judged from the forces' pulls as well, and they are up to 15 % narrower. The
+    # wider. Those of the arm, a MuJoCo model, allowed for noise alone. Now its scatter
+    # is judged from the forces' pulls as well: they are up to 15 % narrower. The
     # starts' rates have another prior since (docs/decisions.md, Windows): it moves the
     # arm's means by up to .031 sd.
     assert after["log_evidence"] > before["log_evidence"]
