@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from interval_mujoco import knowing_arm, moved, mujoco_arm
 from planted_effects import Cogging
 from sim2gp.data.logs import Log
 from sim2gp.systems import (
@@ -37,6 +38,11 @@ class Condition(NamedTuple):
     friction: float = 0.0  # N m of dry friction in both joints
     width: float = WIDTH  # rad/s, of its tanh; the library's effect has that of WIDTH
     cogging: float = 0.0  # N m in both joints: no library has it
+    mujoco: bool = False  # whether the arm is a MuJoCo model (`interval_mujoco.py`)
+
+    def system(self) -> AbstractSystem:
+        """The simulator that is fitted."""
+        return mujoco_arm() if self.mujoco else UniformRodArm()
 
 
 CONDITIONS = {
@@ -49,6 +55,13 @@ CONDITIONS = {
         "dry friction, 20 mN m, five times as sharp", friction=0.02, width=WIDTH / 5.0
     ),
     "cogging10": Condition("cogging, 10 mN m", cogging=0.01),
+    "mujoco": Condition("a MuJoCo arm, white noise", mujoco=True),
+    "mujoco_friction20": Condition(
+        "a MuJoCo arm, dry friction, 20 mN m", friction=0.02, mujoco=True
+    ),
+    "mujoco_cogging10": Condition(
+        "a MuJoCo arm, cogging, 10 mN m", cogging=0.01, mujoco=True
+    ),
 }
 
 
@@ -90,7 +103,10 @@ def recordings(condition: Condition, sets: int, chunk: int) -> Recordings:
     turns = 2.0 * np.pi * np.multiply.outer(FREQUENCIES, time)
     torque = np.sin(turns[:, :, None, None] + phase[:, None]).sum(axis=0)
     torque *= TORQUE / np.sqrt(np.mean(torque**2, axis=0))
-    states = flown(values, torque, condition)
+    if condition.mujoco:
+        states = moved(values, torque, condition, PERIOD)
+    else:
+        states = flown(values, torque, condition)
     white = rng.standard_normal((len(time), sets, 2))
     noise = coloured(white, condition.rho)
     return Recordings(truth, torque, states[..., :2] + NOISE * noise)
@@ -141,6 +157,8 @@ def _rate(
 
 def with_what_is_missing(condition: Condition) -> AbstractSystem:
     """The simulator of an oracle who knows what is missing, not how much of it."""
+    if condition.mujoco:
+        return knowing_arm(condition)
     joints = "q1", "q2"
     effects: list[AbstractEffect] = [
         Cogging(q, 0.05, TURNS)

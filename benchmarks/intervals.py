@@ -37,6 +37,7 @@ from interval_arms import (
     with_what_is_missing,
 )
 from interval_sysid import intervals
+from sim2gp.data.logs import Log
 from sim2gp.data.split_log import cut
 from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.identification.fit import fit_windows
@@ -46,7 +47,7 @@ from sim2gp.identification.intervals.scatter import NOTHING, CorrectedFit
 from sim2gp.identification.misfit.residuals import misfit_of_windows
 from sim2gp.runs.cells import Cells, add_options
 from sim2gp.runs.workers import cores, spread
-from sim2gp.systems import UniformRodArm
+from sim2gp.systems import AbstractSystem, UniformRodArm
 from sim2gp.types import in_float64
 
 WINDOW, LONGER = 0.2, 1.0  # s; the first is the default of a project file
@@ -70,7 +71,7 @@ FLOWN = ("longer", "sysid")  # of these, the ones with cells
 SPEAK = {WINDOW: "speak", LONGER: "speak_longer"}
 #: Of a cell, too: the probability that something is missing.
 MISSING = "missing"
-ASKED = {"white": (0.92, 0.98)}  # of the others:
+ASKED = {"white": (0.92, 0.98), "mujoco": (0.92, 0.98)}  # of the others:
 ASKED_ELSE, ASKED_SCORE = (0.90, 0.99), 1.5
 Z = 1.959963984540054
 
@@ -98,14 +99,14 @@ def work(job: Job) -> dict[str, Any]:
     """Errors and sd of every method, in prior sd: (sets, 2, constants)."""
     condition = CONDITIONS[job.condition]
     data = recordings(condition, CHUNK, job.chunk)
-    system, key = UniformRodArm(), jax.random.key(job.chunk)
+    system, key = condition.system(), jax.random.key(job.chunk)
     prior_sd = np.asarray(system.parameters.prior().sd())
     if job.also:
-        return _also(job, data, prior_sd, key)
+        return _also(job, system, data, prior_sd, key)
     about = SPEAK[WINDOW], MISSING
     found: dict[str, list[Any]] = {name: [] for name in (*METHODS, *about)}
     for s in range(CHUNK):
-        likelihood, belief, group = _fitted(data, s, WINDOW, key)
+        likelihood, belief, group = _fitted(system, data.log(s), WINDOW, key)
         found[SPEAK[WINDOW]].append(misfit_of_windows(likelihood, belief).alarm)
         pulls = pulls_of_windows(likelihood, belief, group)
         x = candidates.linear(likelihood, belief, pulls)
@@ -136,14 +137,16 @@ def work(job: Job) -> dict[str, Any]:
     return found
 
 
-def _also(job: Job, data: Recordings, prior_sd: Any, key: Any) -> dict[str, Any]:
+def _also(
+    job: Job, system: AbstractSystem, data: Recordings, prior_sd: Any, key: Any
+) -> dict[str, Any]:
     """Like `work`, of one method alone."""
     found: dict[str, list[Any]] = {job.also: []}
     for s in range(CHUNK):
         if job.also == "sysid":
             centre, sd = intervals(data, s, UniformRodArm().parameters)
         else:
-            likelihood, belief, group = _fitted(data, s, LONGER, key)
+            likelihood, belief, group = _fitted(system, data.log(s), LONGER, key)
             alarm = misfit_of_windows(likelihood, belief).alarm
             found.setdefault(SPEAK[LONGER], []).append(alarm)
             centre, sd = _units(corrected_windows(likelihood, belief, group), prior_sd)
@@ -152,10 +155,11 @@ def _also(job: Job, data: Recordings, prior_sd: Any, key: Any) -> dict[str, Any]
     return found
 
 
-def _fitted(data: Recordings, s: int, window: float, key: Any) -> tuple[Any, Any, Any]:
+def _fitted(
+    system: AbstractSystem, log: Log, window: float, key: Any
+) -> tuple[Any, Any, Any]:
     """Windows, their estimate and their recordings, of one set."""
-    system = UniformRodArm()
-    windows, of = cut([data.log(s)], system, window=window)
+    windows, of = cut([log], system, window=window)
     belief = fit_windows(system, windows, key=key)
     return WindowsLikelihood(system, windows), belief, np.asarray([k for k, _ in of])
 

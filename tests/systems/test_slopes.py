@@ -94,6 +94,39 @@ def test_a_step_is_differentiated_as_its_differences_are(integrator, friction):
     assert np.all(np.abs(J - expected).max(axis=(0, 1)) <= 1e-6 * size + 1e-10)
 
 
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+@pytest.mark.parametrize("friction", [True, False])
+def test_a_step_under_forces_is_mujocos_own_and_so_are_its_slopes(integrator, friction):
+    """`mj_step` with `qfrc_applied`, and central differences of it in every force."""
+    engine, theta = opened(tree(integrator, friction), OPEN + [FRICTION] * friction)
+    theta, s, u, h = points(engine, theta, 20)
+    f = 2.0 * np.random.default_rng(5).normal(size=(len(s), engine.model.nv))
+    model, data = engine.model, mujoco.MjData(engine.model)
+
+    def stepped(k: int, f: np.ndarray) -> np.ndarray:
+        mujoco.mj_resetData(model, data)
+        data.qpos[:], data.qvel[:] = np.split(s[k], 2)
+        data.ctrl[:], data.qfrc_applied[:] = u[k], f
+        mujoco.mj_step(model, data)
+        return np.concatenate([data.qpos, data.qvel])
+
+    out = engine.flow(theta, s, np.concatenate([u, f], axis=1), h)
+    mine = np.stack([stepped(k, f[k]) for k in range(len(s))])
+    assert np.allclose(out, mine, rtol=0.0, atol=1e-12)
+    assert not np.allclose(out, engine.flow(theta, s, u, h), rtol=0.0, atol=1e-4)
+    x = theta, s, np.concatenate([u, f], axis=1), h
+    _, others = AbstractSimulator.slopes(engine, *x)
+    engine.flow = None  # nothing is left to differences
+    J = engine.jacobian(*x, out)
+    size = np.abs(others).max(axis=(0, 1))
+    assert np.all(np.abs(J - others).max(axis=(0, 1)) <= 1e-6 * size + 1e-10)
+    steps = 1e-4 * np.eye(model.nv)
+    for k in range(len(s)):
+        each = [stepped(k, f[k] + d) - stepped(k, f[k] - d) for d in steps]
+        expected = np.stack(each, axis=1) / 2e-4
+        assert np.allclose(J[k, :, -model.nv :], expected, rtol=1e-5, atol=1e-8)
+
+
 LEG = """<mujoco><option timestep=".004"/><worldbody><body name="trunk" pos="0 0 1">
 <joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>
 <joint name="pitch" axis="0 1 0"/><geom name="trunk" size=".1" mass="3"/>

@@ -106,9 +106,9 @@ def estimate(
     ``nuisances`` and ``noise`` are those of another fit to begin with; zeros and the
     likelihood's own first noise without. The noise is learned in turns with the steps
     until both rest, or stays where it is not to ``learn``. Starts that are no number
-    are compiled and not taken. A simulator on the host rests at a step of ``until``
-    posterior sd, and calls ``report`` after each. What did not converge is reported by
-    `Convergence.check`.
+    are compiled and not taken. A simulator on the host keeps the scales of a prior,
+    rests at a step of ``until`` posterior sd, and calls ``report`` after each. What did
+    not converge is reported by `Convergence.check`.
     """
     if nuisances is None:
         shape = len(likelihood.counts), likelihood.n_nuisances
@@ -137,8 +137,6 @@ def _estimate_on_host(
     of_numpy = (likelihood.counts, likelihood.floor, freedom, start, prior)
     of_numpy = jax.tree.map(np.asarray, of_numpy)
     counts, floor, freedom, (starts, e, noise), of_prior = of_numpy
-
-    assert not _is_scaled(prior)  # windows of logs have a given prior
 
     def update(found: Laplace, noise: Noise) -> Noise:
         return expected_noise(noise, *found.squares(), counts, floor, freedom)

@@ -1,8 +1,9 @@
 """The simulator on the host that moves a machine, with the forces on its joints.
 
 JAX asks a simulator on the host for single steps; whole windows of logs it moves by
-itself (`sim2gp.data.window_slopes`). Forces on the joints of such a machine are kicks
-around each of its steps, as in `sim2gp.systems.effects.kicks`.
+itself (`sim2gp.data.window_slopes`). Effects on the joints of such a machine are kicks
+around each of its steps (`sim2gp.systems.effects.kicks`); missing forces act within the
+steps of an engine that takes forces (`sim2gp.systems.applied_forces`).
 """
 
 from collections.abc import Callable, Sequence
@@ -15,9 +16,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sim2gp.inference.linearized import value_and_jacobian
+from sim2gp.systems.applied_forces import WithForces
 from sim2gp.systems.base import AbstractPlant, AbstractSystem
-from sim2gp.systems.effects.forces import Forcing
-from sim2gp.systems.effects.kicks import kick
+from sim2gp.systems.effects.forces import ForceField, Forcing
+from sim2gp.systems.effects.kicks import is_applied, kick
 from sim2gp.systems.machine import Machine, plant_of
 from sim2gp.systems.plants.external import AbstractSimulator
 from sim2gp.types import AnyArray
@@ -26,15 +28,19 @@ from sim2gp.types import AnyArray
 def simulator_of(system: AbstractSystem) -> AbstractSimulator | None:
     """The simulator that moves whole windows of a machine; None where JAX does.
 
-    Its parameters are those of the plant, then the magnitudes of the machine's effects
-    on the joints.
+    Its parameters are those of the plant, then the weights of missing forces that it
+    takes as forces, then the magnitudes of the machine's other effects on the joints.
     """
     plant = plant_of(system)
     engine = getattr(plant, "engine", None)
     if not isinstance(engine, AbstractSimulator) or getattr(plant, "mjx", None):
         return None
     forcing = system.forcing if isinstance(system, Machine) else ()
-    return WithForces(engine, plant, forcing) if forcing else engine
+    kicks = tuple(x for x in forcing if not is_applied(plant, x))
+    for field in forcing[len(kicks) :]:
+        assert isinstance(field, ForceField)  # `is_applied`
+        engine = WithForces(engine, plant.states, field)
+    return WithKicks(engine, plant, kicks) if kicks else engine
 
 
 class OnHost(NamedTuple):
@@ -95,7 +101,7 @@ def numbers_on_host(
     return OnHost(*(x for x, _ in found)), OnHost(*(J for _, J in found))
 
 
-class WithForces(AbstractSimulator):
+class WithKicks(AbstractSimulator):
     """A simulator whose steps lie between half kicks of its joints' velocities."""
 
     def __init__(

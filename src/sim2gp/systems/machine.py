@@ -242,11 +242,14 @@ class Machine(AbstractSystem):
             a = self._each(params, Gain) * a
         if self._of(Offset):
             a = a + self._each(params, Offset)
-        for effect in self.effects:
-            if isinstance(effect, AbstractInputEffect):
-                i = index_of(effect.where, self.actions)
-                a = a.at[i].set(effect.through(effect.own(params.parts), a[i]))
-        return a
+        on_inputs = [e for e in self.effects if isinstance(e, AbstractInputEffect)]
+        if not on_inputs:
+            return a
+        each = list(a)  # an array that is set again and again compiles for long
+        for effect in on_inputs:
+            i = index_of(effect.where, self.actions)
+            each[i] = effect.through(effect.own(params.parts), each[i])
+        return jnp.stack(each)
 
     def _offset(self, params: MachineParams) -> Float[Array, " n"]:
         """What the encoders leave out of each state."""

@@ -1,8 +1,11 @@
-"""Machines of two joints: inertia and forces, solved in closed form, with effects.
+"""Machines on whose joints forces act: their own equations, or an engine's.
+
+Those of two joints have inertia and forces, solved in closed form, with effects:
 
     (M + dM(q)) dv/dt = forces(q, v, a) + force(q, v),
 
-where ``dM`` and ``force`` are those of the effects (`sim2gp.systems.effects`).
+where ``dM`` and ``force`` are those of the effects (`sim2gp.systems.effects`). An
+engine is given missing forces alone, each held for one of its steps.
 """
 
 import abc
@@ -13,7 +16,7 @@ import jax.numpy as jnp
 from equinox import AbstractVar
 from jaxtyping import Array, Float
 
-from sim2gp.systems.base import AbstractODE, index_of, rk4
+from sim2gp.systems.base import AbstractODE, AbstractPlant, index_of, rk4
 from sim2gp.systems.function_checks import check_mechanism
 from sim2gp.types import Action, AnyArray, Scalar, State
 
@@ -85,6 +88,30 @@ class AbstractMechanism(AbstractODE):
     def joint(self, name: str) -> int:
         """Index of a joint by the name of its position channel (E103 if unknown)."""
         return index_of(name, self.states[:2])
+
+
+class AbstractForcedPlant(AbstractPlant):
+    """A plant with an engine that takes a force on each of its joints, in N or N m.
+
+    Its first states are the positions of the joints; their velocities follow.
+    """
+
+    @property
+    @abc.abstractmethod
+    def joint_inertias(self) -> Float[AnyArray, " j"]:
+        """What a force on each joint accelerates, ``1 / (M^-1)_jj`` at the model's
+        reference, the other joints free; kg m^2 or kg."""
+
+    @abc.abstractmethod
+    def flow_forced(
+        self, params: Any, forces: Acting, s: State, a: Action, h: float | Scalar
+    ) -> State:
+        """`flow` under missing forces."""
+
+
+def takes_forces(plant: AbstractPlant) -> bool:
+    """Whether missing forces are in N and N m; else each accelerates its joint."""
+    return isinstance(plant, AbstractMechanism | AbstractForcedPlant)
 
 
 def solve_two(

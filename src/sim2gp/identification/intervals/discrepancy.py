@@ -39,7 +39,7 @@ from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.effects.forces import AbstractUnknownFunction
 from sim2gp.systems.effects.missing import missing_forces
 from sim2gp.systems.machine import plant_of
-from sim2gp.systems.mechanism import AbstractMechanism
+from sim2gp.systems.mechanism import takes_forces
 from sim2gp.systems.parts import AbstractPart
 from sim2gp.types import in_float64
 
@@ -119,10 +119,10 @@ def forces_of(
 ) -> tuple[AbstractUnknownFunction, ...]:
     """What a machine may lack where its recordings have been.
 
-    Nothing of a plant without a mass matrix, whose intervals rest on the scatter of its
+    Nothing of a plant that takes no forces, whose intervals rest on the scatter of its
     windows alone: an acceleration of one joint is no force on an arm.
     """
-    if not isinstance(plant_of(system), AbstractMechanism):
+    if not takes_forces(plant_of(system)):
         return ()
     return tuple(missing_forces(system, box, fine=True))
 

@@ -6,7 +6,7 @@ how far the pulls scatter.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -16,6 +16,9 @@ from sim2gp.data.windows_likelihood import WindowsLikelihood, linearise
 from sim2gp.identification.misfit.tests import must_be_finite
 from sim2gp.inference.estimate import Estimate
 from sim2gp.types import in_float64
+
+#: Derivatives that a simulator on the host has in memory at once (256 MiB).
+TOGETHER = 2**25
 
 
 @dataclass(frozen=True)
@@ -85,15 +88,48 @@ def cost_of_rows(rows: Float[np.ndarray, "W k npr"], cut: Windows) -> float:
 def rows_of(
     likelihood: WindowsLikelihood, fitted: Estimate, tt: Array
 ) -> Float[np.ndarray, "W k npr"]:
-    """Of each window ``[J_e J_z r]``, whitened, the start's prior in its last rows."""
+    """Of each window ``[J_e J_z r]``, whitened, the start's prior in its last rows.
+
+    Rows that nothing measures are left out. A simulator on the host is asked for some
+    windows at a time: of hundreds of forces all derivatives at once are large.
+    """
+    (W, L), n = likelihood.windows.span.shape, fitted.nuisances.shape[1]
+    one = L * n * (n + len(fitted.prior.mean))
+    size = max(1, TOGETHER // one) if likelihood.on_host else W
+    parts = (np.arange(k, min(k + size, W)) for k in range(0, W, size))
+    most = int(np.asarray(likelihood.windows.mask).any(axis=2).sum(axis=1).max())
+    return np.concatenate([_some_rows(likelihood, fitted, tt, i, most) for i in parts])
+
+
+def _some_rows(
+    likelihood: WindowsLikelihood,
+    fitted: Estimate,
+    tt: Array,
+    which: Int[np.ndarray, " w"],
+    most: int,
+) -> Float[np.ndarray, "w k npr"]:
+    """`rows_of` of some windows, of which none has more than ``most`` measured rows."""
+    if len(which) < len(fitted.nuisances):
+        likelihood = likelihood.some(which)
+        fitted = _some(fitted, which)
     e, p = np.asarray(fitted.nuisances), fitted.prior.mean.size
     n = e.shape[1]
     found = linearise(likelihood, fitted, tt)
+    measured = np.asarray(likelihood.windows.mask).any(axis=2)
+    order = np.argsort(~measured, axis=1, kind="stable")[:, :most, None]
+    r = np.take_along_axis(np.asarray(found.residual), order, axis=1)
+    J = np.take_along_axis(np.asarray(found.jacobian), order[..., None], axis=1)
     weight = np.sqrt(np.asarray(fitted.noise.weights))[:, None, None]
     scale = weight / np.asarray(fitted.noise.sd)
-    r, J = np.asarray(found.residual) * scale, np.asarray(found.jacobian)
-    J = J * scale[..., None]
     rows = np.concatenate([J[..., p:], J[..., :p], r[..., None]], axis=-1)
+    rows *= scale[..., None]
     own = np.zeros((len(e), n, n + p + 1))
     own[..., :n], own[..., -1] = np.eye(n), e
     return np.concatenate([rows.reshape(len(e), -1, n + p + 1), own], axis=1)
+
+
+def _some(fitted: Estimate, which: Int[np.ndarray, " w"]) -> Estimate:
+    """What an estimate says of some of its windows."""
+    noise = replace(fitted.noise, weights=fitted.noise.weights[which])
+    of_windows = {"nuisances": fitted.nuisances[which], "scores": fitted.scores[which]}
+    return replace(fitted, noise=noise, **of_windows)

@@ -30,6 +30,7 @@ from equinox import AbstractVar
 from jaxtyping import Array, Float
 
 from sim2gp import checks
+from sim2gp.inference.linalg import library
 from sim2gp.inference.parameters import Parameter
 from sim2gp.systems.base import AbstractPlant, index_of
 from sim2gp.systems.effects.base import (
@@ -48,13 +49,16 @@ COUNT = 6  # of features
 SOFT = 0.05  # of a dead zone's width: how soon it ends
 WIDTH_SD = 0.6  # of the logarithm of a dead zone's width
 
+#: One value, or a batch of them in NumPy.
+Points = Float[AnyArray, "*b"]
+
 
 @dataclass(frozen=True)
 class Sines:
     """``sin(k w (z - start))``, ``k = 1..count``, on ``span``; constant beyond it.
 
     With ``cosines`` those too, after the sines. ``sds`` are those of the weights of a
-    function whose own sd is one.
+    function whose own sd is one. Of NumPy arrays, points may come in batches.
     """
 
     frequency: float
@@ -63,48 +67,49 @@ class Sines:
     span: float = math.inf
     cosines: bool = False
 
-    def value(self, x: Float[AnyArray, " k"], z: Scalar) -> Scalar:
+    def value(self, x: Float[AnyArray, "k *b"], z: Points) -> Points:
         """The function with weights ``x``."""
-        angle, _ = self._angle(z)
-        sine, cosine = jnp.sin(angle), jnp.cos(angle)
+        xp, (angle, _) = library(z), self._angle(z)
+        sine, cosine = xp.sin(angle), xp.cos(angle)
         if not self.cosines:
             return sine * _clenshaw(x, cosine)[0]
         half = len(self.sds) // 2
         first, second = _clenshaw(x[half:], cosine)
         return sine * _clenshaw(x[:half], cosine)[0] + cosine * first - second
 
-    def slope(self, x: Float[AnyArray, " k"], z: Scalar) -> Scalar:
+    def slope(self, x: Float[AnyArray, "k *b"], z: Points) -> Points:
         """Its derivative."""
-        angle, rate = self._angle(z)
-        sine, cosine = jnp.sin(angle), jnp.cos(angle)
+        xp, (angle, rate) = library(z), self._angle(z)
+        sine, cosine = xp.sin(angle), xp.cos(angle)
         half = len(self.sds) // 2 if self.cosines else len(self.sds)
         k = np.arange(1, half + 1)
-        first, second = _clenshaw(x[:half] * k.astype(x.dtype), cosine)
+        first, second = _clenshaw((x[:half].T * k.astype(x.dtype)).T, cosine)
         slope = cosine * first - second
         if self.cosines:
-            slope = slope - sine * _clenshaw(x[half:] * k.astype(x.dtype), cosine)[0]
+            others = (x[half:].T * k.astype(x.dtype)).T
+            slope = slope - sine * _clenshaw(others, cosine)[0]
         return rate * slope
 
-    def features(self, z: Scalar) -> Float[Array, " k"]:
+    def features(self, z: Float[AnyArray, "*b"]) -> Float[AnyArray, "*b k"]:
         """Its values for each weight alone."""
-        angle, _ = self._angle(z)
+        xp, (angle, _) = library(z), self._angle(z)
         half = len(self.sds) // 2 if self.cosines else len(self.sds)
-        turns = angle * jnp.arange(1, half + 1, dtype=angle.dtype)
-        return jnp.concatenate(
-            [jnp.sin(turns), *([jnp.cos(turns)] if self.cosines else [])]
-        )
+        turns = angle[..., None] * xp.arange(1, half + 1, dtype=angle.dtype)
+        cosines = [xp.cos(turns)] if self.cosines else []
+        return xp.concatenate([xp.sin(turns), *cosines], axis=-1)
 
-    def _angle(self, z: Scalar) -> tuple[Scalar, Scalar]:
+    def _angle(self, z: Points) -> tuple[Points, AnyArray]:
         """``w (z - start)``, and its derivative."""
-        w, end = jnp.asarray(self.frequency, z.dtype), self.start + self.span
+        xp, end = library(z), self.start + self.span
+        w = xp.asarray(self.frequency, z.dtype)
         if not math.isfinite(end):
             return w * (z - self.start), w
         inside = (z > self.start) & (z < end)
-        angle = w * (jnp.clip(z, self.start, end) - self.start)
-        return angle, jnp.where(inside, w, 0.0)
+        angle = w * (xp.clip(z, self.start, end) - self.start)
+        return angle, xp.where(inside, w, xp.zeros_like(w))
 
 
-def _clenshaw(x: Float[AnyArray, " k"], cosine: Scalar) -> tuple[Scalar, Scalar]:
+def _clenshaw(x: Float[AnyArray, "k *b"], cosine: Points) -> tuple[Points, Points]:
     """``b_1`` and ``b_2`` of Clenshaw's recurrence.
 
     ``sum x_k sin(k a) = b_1 sin(a)`` and ``sum x_k cos(k a) = b_1 cos(a) - b_2``: one
@@ -156,17 +161,17 @@ class Sign:
     width: float
     sds: ClassVar[tuple[float, ...]] = (1.0,)
 
-    def value(self, x: Float[AnyArray, " 1"], z: Scalar) -> Scalar:
+    def value(self, x: Float[AnyArray, "1 *b"], z: Points) -> Points:
         """The force of the level ``x``."""
-        return -x[0] * jnp.tanh(z / self.width)
+        return -x[0] * library(z).tanh(z / self.width)
 
-    def features(self, z: Scalar) -> Float[Array, " 1"]:
+    def features(self, z: Float[AnyArray, "*b"]) -> Float[AnyArray, "*b 1"]:
         """The force of a level of one."""
-        return -jnp.tanh(z / self.width)[None]
+        return -library(z).tanh(z / self.width)[..., None]
 
-    def slope(self, x: Float[AnyArray, " 1"], z: Scalar) -> Scalar:
+    def slope(self, x: Float[AnyArray, "1 *b"], z: Points) -> Points:
         """Its derivative."""
-        return x[0] * (jnp.tanh(z / self.width) ** 2 - 1.0) / self.width
+        return x[0] * (library(z).tanh(z / self.width) ** 2 - 1.0) / self.width
 
 
 @dataclass(frozen=True)
@@ -179,13 +184,18 @@ class Gap:
     width: float
     sds: ClassVar[tuple[float, ...]] = (1.0,)
 
-    def value(self, x: Float[AnyArray, " 2"], z: Scalar) -> Scalar:
+    def value(self, x: Float[AnyArray, " 2"], z: Points) -> Points:
         """What it takes away: ``x[0]`` at the edge, where ``z`` is the width ``x[1]``.
 
         A true dead zone takes all of the input, ``x[0] = x[1]``.
         """
         w = x[1]
         return (dead_zone(z, w, SOFT * w) - z) * (x[0] / w)
+
+    def features(self, z: Float[AnyArray, "*b"]) -> Float[Array, "*b 1"]:
+        """What it takes away for ``x[0] = 1``, at the width's median."""
+        x = jnp.asarray([1.0, self.width])
+        return jnp.asarray(self.value(x, jnp.asarray(z)))[..., None]
 
 
 Basis = Sines | Sign | Gap
@@ -307,7 +317,17 @@ class ForceField(eqx.Module):
         self, system: AbstractMechanism, params: Any, x: AnyArray, q: Pair, v: Pair
     ) -> Pair:
         """As `AbstractJointEffect.force`, for all weights."""
-        names, none = [c.name for c in system.states[:2]], jnp.zeros_like(q[0])
+        return self.on_joints(system, x, q, v)
+
+    def on_joints(
+        self,
+        plant: AbstractPlant,
+        x: Float[AnyArray, " k"],
+        q: Float[Array, " j"],
+        v: Float[Array, " j"],
+    ) -> Float[Array, " j"]:
+        """The force on each joint of a plant, whose first states are positions."""
+        names, none = [c.name for c in plant.states[: q.size]], jnp.zeros_like(q[0])
         at, moving = (dict(zip(names, y, strict=True)) for y in (q, v))
         found = self.along(x.astype(q.dtype), at, moving)
         return jnp.stack([found.get(name, none) for name in names])

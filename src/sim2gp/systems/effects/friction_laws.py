@@ -13,6 +13,7 @@ of 800/s, where RK4 needs substeps of 2.5 ms.
 import math
 
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from sim2gp.types import Scalar
 
@@ -36,7 +37,9 @@ def coulomb_arctangent(v: Scalar, level: Scalar, width: float) -> Scalar:
     return level * (2.0 / jnp.pi) * jnp.arctan(v / width)
 
 
-def dead_zone(u: Scalar, width: Scalar, smoothing: float | Scalar) -> Scalar:
+def dead_zone(
+    u: Float[Array, "*b"], width: Scalar, smoothing: float | Scalar
+) -> Float[Array, "*b"]:
     """An input without effect below ``width``: ``u sigmoid((|u| - width) / eps)``."""
     z = jnp.clip((jnp.abs(u) - width) / smoothing, -40.0, 40.0)
     return u / (1.0 + jnp.exp(-z))

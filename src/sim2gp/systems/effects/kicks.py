@@ -1,10 +1,14 @@
 """Forces on the joints of a plant that has no mass matrix: a function, or an engine.
 
-Such a plant takes a force as the acceleration that it makes. In one substep the plant
+Such a plant takes an effect as the acceleration that it makes. In one substep the plant
 flows between two half kicks of its joints' velocities, the second in reverse order
 (Strang 1968), so that the error of a step is of third order in its length. A kick is
 the effect's own closed form (`AbstractJointForce.accelerated`): friction may be as
-steep as it likes. Missing forces are smooth, and take the midpoint rule.
+steep as it likes.
+
+Missing forces are smooth. A function takes them as kicks, too, by the midpoint rule. An
+engine takes forces in N and N m (`AbstractForcedPlant`): there they are no kicks, but
+act within the engine's steps, each held from where the step begins.
 """
 
 from collections.abc import Iterable
@@ -14,8 +18,8 @@ import jax.numpy as jnp
 
 from sim2gp.systems.base import AbstractPlant
 from sim2gp.systems.effects.base import AbstractJointForce
-from sim2gp.systems.effects.forces import ForceField
-from sim2gp.systems.mechanism import Acting, Effects
+from sim2gp.systems.effects.forces import ForceField, Forcing
+from sim2gp.systems.mechanism import AbstractForcedPlant, Acting, Effects
 from sim2gp.types import Action, Scalar, State
 
 
@@ -29,9 +33,19 @@ def kicked(
 ) -> State:
     """State ``h`` seconds later of a plant whose joints are accelerated by effects."""
     half = jnp.asarray(0.5 * h, s.dtype)
-    s = kick(plant, effects, s, half)
-    s = plant.flow(params, s, a, h)
-    return kick(plant, reversed(effects), s, half)
+    kicks = [x for x in effects if not is_applied(plant, x[0])]
+    s = kick(plant, kicks, s, half)
+    if len(kicks) == len(effects):
+        s = plant.flow(params, s, a, h)
+    else:
+        assert isinstance(plant, AbstractForcedPlant)  # `is_applied`
+        s = plant.flow_forced(params, effects[-1], s, a, h)
+    return kick(plant, reversed(kicks), s, half)
+
+
+def is_applied(plant: AbstractPlant, effect: Forcing) -> bool:
+    """Whether an engine takes it as forces, not as kicks."""
+    return isinstance(effect, ForceField) and isinstance(plant, AbstractForcedPlant)
 
 
 def kick(

@@ -40,7 +40,8 @@ def missing_forces(
     cogging of a motor as well.
     """
     plant = plant_of(system)
-    step = min(plant.max_substep, LONGEST_MEAN)
+    # An engine holds a force for its own step, which must not reverse the joint.
+    step = plant.own_step or min(plant.max_substep, LONGEST_MEAN)
     found: list[AbstractUnknownFunction] = []
     for name, drive in drives(plant).items():
         joint = joint_of(plant, name)

@@ -288,9 +288,13 @@ def _arm(plant: TwoLink | UniformRodArm) -> list[Candidate]:
 
 
 def _of_any(plant: AbstractPlant) -> list[Candidate]:
-    """Of each joint whose velocity is a state, as large as what moves it."""
+    """Of each joint whose velocity is a state, as large as what moves it.
+
+    Without a mass matrix an effect is a kick: an acceleration.
+    """
+    kicks = not isinstance(plant, AbstractMechanism)
     found: list[Candidate] = []
     for name, drive in drives(plant).items():
         made = _slide if joint_of(plant, name).unit == "m" else _Joint
-        found += _of_joint(made(name, drive.force))
+        found += _of_joint(made(name, drive.acceleration if kicks else drive.force))
     return found

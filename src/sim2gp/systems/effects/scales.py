@@ -9,7 +9,7 @@ import numpy as np
 
 from sim2gp.systems.base import LONGEST_MEAN, AbstractPlant
 from sim2gp.systems.effects.units import joints_of, velocity_of
-from sim2gp.systems.mechanism import AbstractMechanism
+from sim2gp.systems.mechanism import AbstractForcedPlant, AbstractMechanism
 from sim2gp.types import in_float64
 
 AWAY = 0.5  # rad or m from zero, where a joint's weight is felt
@@ -18,7 +18,7 @@ AWAY = 0.5  # rad or m from zero, where a joint's weight is felt
 class Drive(NamedTuple):
     """The largest force that inputs and weight give a joint at rest, and what it does.
 
-    ``force`` is in N or N m, or an acceleration where a plant has no mass matrix;
+    ``force`` is in N or N m, or an acceleration where a plant takes no forces;
     ``acceleration`` is in the joint's unit per s^2.
     """
 
@@ -31,7 +31,8 @@ def drives(plant: AbstractPlant) -> dict[str, Drive]:
     """Of each joint whose velocity is a state; 1 where nothing moves it.
 
     With nominal parameters, each input at either end of its range, the joints at zero
-    and away from it.
+    and away from it. Of an engine the force is the one that accelerates the joint as
+    much alone.
     """
     names = [c.name for c in plant.physical_states]
     joints = [c for c in joints_of(plant) if f"{c.name}.velocity" in names]
@@ -52,11 +53,12 @@ def drives(plant: AbstractPlant) -> dict[str, Drive]:
     h = LONGEST_MEAN
     flow = jax.jit(lambda s, a: (plant.flow(params, s, a, h) - s) / h)
     found = np.abs([each(s, a) for s in (rest, away) for a in inputs])
-    most = [float(x) if 0.0 < x < math.inf else 1.0 for x in np.max(found, axis=0)]
-    inertia = [1.0] * len(joints)
+    most = np.max(found, axis=0)
+    forces = accelerations = np.where((most > 0.0) & np.isfinite(most), most, 1.0)
     if isinstance(plant, AbstractMechanism):
         first, _, second = plant.inertia(params, jnp.zeros(2))
-        inertia = [float(first), float(second)]
-    return {
-        c.name: Drive(f, f / m) for c, f, m in zip(joints, most, inertia, strict=True)
-    }
+        accelerations = forces / np.asarray([first, second])
+    if isinstance(plant, AbstractForcedPlant):
+        forces = accelerations * plant.joint_inertias
+    both = zip(joints, forces.tolist(), accelerations.tolist(), strict=True)
+    return {c.name: Drive(f, a) for c, f, a in both}

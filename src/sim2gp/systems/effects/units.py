@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 from sim2gp.errors import error
 from sim2gp.systems.base import AbstractPlant, AbstractSystem, Channel, index_of
-from sim2gp.systems.mechanism import AbstractMechanism
+from sim2gp.systems.mechanism import AbstractMechanism, takes_forces
 
 
 def only_on(name: str, plant: AbstractPlant, homes: Mapping[type, str]) -> None:
@@ -41,19 +41,27 @@ def velocity_of(plant: AbstractPlant, name: str) -> int:
 
 
 def force_unit(plant: AbstractPlant, name: str) -> str:
-    """N on a slide, N m on a hinge; of a plant without a mass matrix acceleration."""
-    return law_unit(plant, name, (0, 0))
+    """Of a missing force: N on a slide, N m on a hinge, or an acceleration
+    (`takes_forces`)."""
+    return _unit(plant, name, (0, 0), takes_forces(plant))
 
 
 def law_unit(plant: AbstractPlant, name: str, powers: tuple[int, int]) -> str:
     """Unit of ``x`` in a force ``x q^i v^j`` on a joint, ``powers`` being ``(i, j)``.
 
-    Raises `InputError` E103 for a joint that is not there.
+    An acceleration of a plant without a mass matrix. Raises `InputError` E103 for a
+    joint that is not there.
     """
+    return _unit(plant, name, powers, isinstance(plant, AbstractMechanism))
+
+
+def _unit(
+    plant: AbstractPlant, name: str, powers: tuple[int, int], is_force: bool
+) -> str:
     of_position, of_velocity = powers
     position = joint_of(plant, name).unit
     length, seconds = -of_position - of_velocity, of_velocity
-    if isinstance(plant, AbstractMechanism):
+    if is_force:
         force = [("N", 1)] if position == "m" else [("N", 1), ("m", 1)]
         return _written([*force, ("s", seconds), (position, length)])
     velocity_of(plant, name)

@@ -1,7 +1,8 @@
 """C MuJoCo as a simulator on the host: batches of rows, in several threads.
 
 A row's parameters are set in a copy of the model. What MuJoCo derives from masses and
-lengths when it compiles a model is derived again for each of their values.
+lengths when it compiles a model is derived again for each of their values. Inputs may
+have a force on each joint behind them, in N or N m: they are held alike.
 """
 
 import copy
@@ -22,7 +23,6 @@ from sim2gp.systems.mujoco.slopes.numbers import moved_by, numbers_of, tree_of
 from sim2gp.systems.mujoco.slopes.step import Model, acceleration_slopes, in_closed_form
 from sim2gp.systems.plants.external import (
     AbstractSimulator,
-    Arguments,
     Differences,
     untouched,
 )
@@ -186,15 +186,16 @@ class Engine(AbstractSimulator):
         a: Float[np.ndarray, "B m"],
         h: Float[np.ndarray, " B"],
     ) -> tuple[Float[np.ndarray, "B n"], Float[np.ndarray, "B n pnm"]]:
-        at = Arguments(theta, s, a[:, None], h[:, None])
-        sizes = np.cumsum([theta.shape[1], s.shape[1]])
-        of_theta, of_s, of_a = (
-            np.broadcast_to(part, (len(s), *part.shape))
-            for part in np.split(np.eye(sizes[-1] + a.shape[1]), sizes)
-        )
-        along = Arguments(of_theta, of_s, of_a[:, None], h)
-        states, J = self.linearised_rollout(at, along)
-        return states[:, 0], J[:, 0]
+        return self.slopes_of_steps(theta, s, a, h)
+
+    def _inputs(self, width: int) -> int:
+        """What MuJoCo is given: its controls, and forces on the joints where asked."""
+        import mujoco
+
+        spec = int(mujoco.mjtState.mjSTATE_CTRL)
+        if width > self.model.nu:
+            spec |= int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
+        return spec
 
     def _linearised(self, theta: Float[np.ndarray, " p"], h: float) -> Model:
         """The numbers of the model and what the parameters change of them."""
@@ -272,7 +273,13 @@ class Engine(AbstractSimulator):
         pool = self._alone if few else self._pool
         datas = self._datas[:1] if few else self._datas
         with _quiet():
-            out, _ = pool.rollout(chosen, datas, start, np.ascontiguousarray(control))
+            out, _ = pool.rollout(
+                chosen,
+                datas,
+                start,
+                np.ascontiguousarray(control),
+                control_spec=self._inputs(control.shape[-1]),
+            )
         # Where a state runs away MuJoCo stops, or begins again.
         due = h * np.arange(1, control.shape[1] + 1)
         ahead = np.abs(out[..., 0] - due) < 1e-6 * due

@@ -19,7 +19,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from sim2gp.errors import InputError, error
-from sim2gp.systems.base import steps_in
+from sim2gp.systems.base import AbstractPlant, steps_in
+from sim2gp.systems.effects.forces import ForceField
 from sim2gp.systems.mujoco.constants import CENTRED, DERIVED, Constant, set_constants
 from sim2gp.systems.mujoco.inertia import unframe
 from sim2gp.types import Action, Scalar, State
@@ -65,7 +66,10 @@ class MJXEngine:
     def flow(
         self, theta: Float[Array, " p"], s: State, a: Action, h: Scalar
     ) -> Float[Array, " n"]:
-        """The state ``h`` seconds later, in substeps no longer than the time step."""
+        """The state ``h`` seconds later, in substeps no longer than the time step.
+
+        ``a`` may have a force on each joint behind the inputs, as the C engine's.
+        """
         from mujoco import mjx
 
         with _lenient():
@@ -77,8 +81,10 @@ class MJXEngine:
             data = mjx.make_data(model)
             data = _cast(data, s.dtype)
             data = data.replace(
-                qpos=s[:nq], qvel=s[nq : nq + nv], act=s[nq + nv :], ctrl=a
+                qpos=s[:nq], qvel=s[nq : nq + nv], act=s[nq + nv :], ctrl=a[: model.nu]
             )
+            if a.size > model.nu:
+                data = data.replace(qfrc_applied=a[model.nu :])
             data = jax.lax.fori_loop(
                 0, count, lambda _, d: _cast(mjx.step(model, d), s.dtype), data
             )
@@ -96,16 +102,47 @@ class MJXEngine:
             return _derived(model) if self.derive else model
 
 
+class MJXWithForces:
+    """A model in MJX under missing forces, as the C engine has them
+    (`sim2gp.systems.applied_forces`); their weights are its last parameters."""
+
+    def __init__(
+        self, engine: MJXEngine, plant: AbstractPlant, field: ForceField
+    ) -> None:
+        self.engine, self.plant, self.field = engine, plant, field
+
+    def flow(
+        self, theta: Float[Array, " p"], s: State, a: Action, h: Scalar
+    ) -> Float[Array, " n"]:
+        """As `MJXEngine.flow`; a step's derivative by forces serves all weights."""
+        of_engine, w = jnp.split(theta, [theta.size - len(self.field.values)])
+        nv = self.engine.model.nv
+        count = steps_in(h, self.engine.timestep)
+        span = h / count.astype(h.dtype)
+
+        def step(_: Any, s: State) -> State:
+            f = self.field.on_joints(self.plant, w, s[:nv], s[nv : 2 * nv])
+            both = jnp.concatenate([a, f])
+            return mjx_flow(self.engine, of_engine, s, both, span)
+
+        found: State = jax.lax.fori_loop(0, count, step, s)
+        return found
+
+
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def mjx_flow(
-    engine: MJXEngine, theta: Float[Array, " p"], s: State, a: Action, h: Scalar
+    engine: MJXEngine | MJXWithForces,
+    theta: Float[Array, " p"],
+    s: State,
+    a: Action,
+    h: Scalar,
 ) -> State:
     """`MJXEngine.flow` with derivatives in both modes; none is taken in ``h``."""
     return engine.flow(theta, s, a, h)
 
 
 @mjx_flow.defjvp
-def _(engine: MJXEngine, primals: Any, tangents: Any) -> Any:
+def _(engine: MJXEngine | MJXWithForces, primals: Any, tangents: Any) -> Any:
     theta, s, a, h = primals
     cuts = [theta.size, theta.size + s.size]
 

@@ -22,7 +22,10 @@ from jaxtyping import Array, Float
 
 from sim2gp.errors import error
 from sim2gp.inference.parameters import Parameter, Parameters
-from sim2gp.systems.base import AbstractPlant, Channel
+from sim2gp.systems.applied_forces import WithForces
+from sim2gp.systems.base import Channel
+from sim2gp.systems.effects.forces import ForceField
+from sim2gp.systems.mechanism import AbstractForcedPlant, Acting
 from sim2gp.systems.mujoco.constants import (
     OF_INERTIA,
     SIGNED,
@@ -34,7 +37,7 @@ from sim2gp.systems.mujoco.constants import (
 )
 from sim2gp.systems.mujoco.engine import Engine
 from sim2gp.systems.mujoco.load import compiled
-from sim2gp.systems.mujoco.mjx import MJXEngine, mjx_flow
+from sim2gp.systems.mujoco.mjx import MJXEngine, MJXWithForces, mjx_flow
 from sim2gp.systems.mujoco.model_file import ModelFile
 from sim2gp.systems.mujoco.unsupported import check_supported
 from sim2gp.systems.plants.external import flow
@@ -46,7 +49,7 @@ FACTOR = 3.0
 SHARE = 0.2
 
 
-class MuJoCo(AbstractPlant):
+class MuJoCo(AbstractForcedPlant):
     """A MuJoCo model whose parameters are named by path
     (`sim2gp.systems.mujoco.constants`).
 
@@ -158,14 +161,33 @@ class MuJoCo(AbstractPlant):
         """Values in the order of the engine's parameters."""
         return jnp.stack([jnp.asarray(values[name]) for name in self.names])
 
+    @property
+    def joint_inertias(self) -> Float[np.ndarray, " j"]:
+        return np.asarray(1.0 / self.engine.model.dof_invweight0)
+
     def flow(
         self, params: Float[Array, " p"], s: State, a: Action, h: float | Scalar
     ) -> State:
-        theta = params.astype(s.dtype)
-        span = jnp.asarray(h, s.dtype)
+        args = params.astype(s.dtype), s, a.astype(s.dtype), jnp.asarray(h, s.dtype)
         if self.mjx is not None:
-            return mjx_flow(self.mjx, theta, s, a.astype(s.dtype), span)
-        return flow(self.engine, theta, s, a.astype(s.dtype), span)
+            return mjx_flow(self.mjx, *args)
+        return flow(self.engine, *args)
+
+    def flow_forced(
+        self,
+        params: Float[Array, " p"],
+        forces: Acting,
+        s: State,
+        a: Action,
+        h: float | Scalar,
+    ) -> State:
+        field, x = forces
+        assert isinstance(field, ForceField)  # `is_applied`
+        theta = jnp.concatenate([params, x]).astype(s.dtype)
+        args = theta, s, a.astype(s.dtype), jnp.asarray(h, s.dtype)
+        if self.mjx is not None:
+            return mjx_flow(MJXWithForces(self.mjx, self, field), *args)
+        return flow(WithForces(self.engine, self.states, field), *args)
 
 
 def loaded(model: Any, root: Path | None = None) -> Any:

@@ -146,6 +146,24 @@ class AbstractSimulator(abc.ABC):
         J = moved / apart[..., None]
         return out[0], np.moveaxis(J, 0, -1)
 
+    def slopes_of_steps(
+        self,
+        theta: Float[np.ndarray, "B p"],
+        s: Float[np.ndarray, "B n"],
+        a: Float[np.ndarray, "B m"],
+        h: Float[np.ndarray, " B"],
+    ) -> tuple[Float[np.ndarray, "B n"], Float[np.ndarray, "B n pnm"]]:
+        """`slopes` of a simulator that divides a time into steps."""
+        at = Arguments(theta, s, a[:, None], h[:, None])
+        sizes = np.cumsum([theta.shape[1], s.shape[1]])
+        of_theta, of_s, of_a = (
+            np.broadcast_to(part, (len(s), *part.shape))
+            for part in np.split(np.eye(sizes[-1] + a.shape[1]), sizes)
+        )
+        along = Arguments(of_theta, of_s, of_a[:, None], h)
+        states, J = self.linearised_rollout(at, along)
+        return states[:, 0], J[:, 0]
+
     def substeps(self, span: Float[np.ndarray, "*r"]) -> Int[np.ndarray, "*r"]:
         """How many equal steps `slopes` divides each of these times into."""
         return np.ones(span.shape, int)

@@ -2,7 +2,7 @@
 
 A step of length ``h`` ends at ``v' = v + h a``, ``q' = q + h v'``, where ``a`` solves
 
-    F = ID(q, v, a) - passive - actuators - dry friction = 0
+    F = ID(q, v, a) - passive - actuators - dry friction - applied = 0
 
 (`rigid_body`, `actuation`), so that ``F_a da = -(F_q dq + F_v dv + F_u du + F_c dc)``
 by the implicit function theorem. Dry friction is a force ``-D (a0 + rate v)`` within
@@ -71,7 +71,10 @@ class Equation(NamedTuple):
 def acceleration_slopes(
     of: Model, q: Batch, v: Batch, u: Batch, after: Batch, h: float
 ) -> Slopes:
-    """Slopes of the acceleration of steps that end at velocities ``after``."""
+    """Slopes of the acceleration of steps that end at velocities ``after``.
+
+    ``u`` may have applied forces behind the inputs of the actuators.
+    """
     a = (after - v) / h
     found = _smooth(of, q, v, u, after, a, h)
     left = found.F
@@ -92,6 +95,7 @@ def _smooth(
     at = rigid_body.motion(tree, has, q, v, a)
     bodies = rigid_body.forces(tree, has.inertia, at)
     links = rigid_body.inverse_dynamics(tree, at, bodies, a)
+    u, applied = u[: model.nu], u[model.nu :]
     acts, drives = actuation.torques(model, tree, has, q, v, after, u)
     rotor = has.armature[:, None] * a
     size = links.size + acts.size + np.abs(rotor) + has.frictionloss[:, None]
@@ -105,13 +109,18 @@ def _smooth(
         by_c[:, i] = change.armature[:, None] * a
         by_c[:, i] -= actuation.by_numbers(*about, q, damped, drives)
         by_c[:, i] += rigid_body.by_numbers(tree, at, bodies, change)
+    F, by_u = links.tau + rotor - acts.tau, -acts.by_u
+    if len(applied):
+        F, size = F - applied, size + np.abs(applied)
+        by_force = _diagonal(np.full_like(applied, -1.0))
+        by_u = np.concatenate([by_u, by_force], axis=1)
     return Equation(
-        links.tau + rotor - acts.tau,
+        F,
         size + 1e-12,
         mass + _diagonal(h * late),
         links.by_q - _diagonal(acts.by_q),
         links.by_v - _diagonal(acts.by_v + acts.by_v_after),
-        -acts.by_u,
+        by_u,
         by_c,
         mass,
         late,
