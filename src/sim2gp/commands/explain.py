@@ -216,7 +216,8 @@ def window_data(project: Project, logs: Sequence[Log], seed: int = 0) -> WindowD
         return cut_logs(dataclasses.replace(project, system=system), logs)[0]
 
     robust = project.spec.likelihood.robust
-    return WindowData(project.system, cut, cluster.ravel(), robust=robust, seed=seed)
+    of = cluster.ravel(), log
+    return WindowData(project.system, cut, *of, robust=robust, seed=seed)
 
 
 def _flown(run: Demonstration) -> OneStepData:

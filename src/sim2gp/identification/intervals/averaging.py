@@ -26,6 +26,7 @@ NONE = ""  # no group at all
 NOTHING, MORE = 0.5, 0.5
 SHARES = tuple(10.0 ** (-0.4 * k) for k in range(6))  # scales, alike
 MOST = 4  # groups
+NEGLIGIBLE = 1e-4  # probability of a choice
 
 
 class _Found(NamedTuple):
@@ -36,9 +37,16 @@ class _Found(NamedTuple):
 
 
 def averaged(
-    root: Float[np.ndarray, "q p"], data: Float[np.ndarray, " q"], groups: Groups
+    root: Float[np.ndarray, "q p"],
+    data: Float[np.ndarray, " q"],
+    groups: Groups,
+    at_best: tuple[Float[np.ndarray, "q p"], Float[np.ndarray, " q"]] | None = None,
 ) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p p"], dict[str, float]]:
-    """Mean and scale of the unknowns; the probability of each group, and of `NONE`."""
+    """Mean and scale of the unknowns; the probability of each group, and of `NONE`.
+
+    ``at_best`` are root and data of another linearisation of the same model. Mean and
+    scale are then its own; probabilities are those of the first.
+    """
     best = _posterior(root, data, groups, {})
     found = [best]
     while len(best.scales) < min(MOST, len(groups)):
@@ -51,6 +59,13 @@ def averaged(
     logs = np.asarray([f.log_probability for f in found])
     weights = np.exp(logs - logs.max())
     weights = weights / weights.sum()
+    if at_best is not None:
+        likely = weights > NEGLIGIBLE
+        weights = np.where(likely, weights, 0.0) / weights[likely].sum()
+        found = [
+            _posterior(*at_best, groups, f.scales) if likely[k] else f
+            for k, f in enumerate(found)
+        ]
     mean = weights @ np.stack([f.mean for f in found])
     rows = [
         math.sqrt(w) * np.concatenate([f.scale.T, [f.mean - mean]])

@@ -84,7 +84,8 @@ def corrected_windows(
     mean, scale = (np.asarray(x) for x in (whole.prior.mean, whole.prior.scale))
     rows = rows_of(wider, whole, whole.posterior.mean)
     pulls = pulls_of_rows(rows, cut, group)
-    T, groups = _identifiable(pulls, own, system.parameters.groups)
+    A = np.asarray(np.linalg.qr(np.concatenate(list(pulls.factors)), mode="r"))
+    T, groups = identifiable(A, own, system.parameters.groups)
     k = T.shape[1]
     prior = Gaussian(jnp.zeros(k), jnp.eye(k))
     at = np.zeros(k)
@@ -157,18 +158,19 @@ def _with_forces_at_zero(
     return system, whole, own
 
 
-def _identifiable(
-    pulls: Pulls, own: Int[np.ndarray, " o"], groups: Groups
+def identifiable(
+    A: Float[np.ndarray, "q p"], own: Int[np.ndarray, " o"], groups: Groups
 ) -> tuple[Float[np.ndarray, "p k"], Groups]:
     """Coordinates of parameters and forces, without what parameters do as well.
 
+    ``A`` are rows of the data's slopes by parameters and weights, ``own`` the places of
+    parameters.
     A smooth force of the velocity may be a damping: what acts so is called damping. Of
     each group the directions remain that no parameters mimic, with the prior that it
     has given that there are no others. Groups of a kind are on together: a joint alone
     may show too little of its friction to tell it from damping, and of all inputs the
     gains may be the masses' scale.
     """
-    A = np.asarray(np.linalg.qr(np.concatenate(list(pulls.factors)), mode="r"))
     Q, R = np.linalg.qr(A[:, own])
     Q = Q[:, np.abs(np.diag(R)) > 1e-12 * np.abs(R).max(initial=0.0)]
     of: dict[str, list[int]] = {}

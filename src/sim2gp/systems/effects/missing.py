@@ -25,6 +25,8 @@ WIDTH = 0.2
 DRY, CHANGE, GAP = 0.1, 0.1, 0.2  # prior sd, shares of the drive and of an input
 GAP_WIDTH = 0.12  # median of a dead zone's width, share of an input
 INPUT_REACH, INPUT_LENGTH = 1.2, 0.3  # half-widths of an input
+#: Of details: how many, and half-widths of where a machine moves.
+DETAILS, DETAIL_REACH, DETAIL = 16, 1.2, 0.15
 
 
 def missing_forces(
@@ -32,12 +34,14 @@ def missing_forces(
     box: Mapping[str, tuple[float, float]],
     *,
     fine: bool = False,
+    closely: bool = False,
 ) -> list[AbstractUnknownFunction]:
     """Of each joint a force by position, by velocity and of dry friction; of each input
     a smooth change and a dead zone.
 
     ``box`` is where the machine moves, by channel. With ``fine``, of each hinge the
-    cogging of a motor as well.
+    cogging of a motor as well. ``closely``, each function by position and by velocity
+    has details too, and a joint that turns round is also pulled to where it started.
     """
     plant = plant_of(system)
     step = min(plant.max_substep, LONGEST_MEAN)
@@ -52,6 +56,11 @@ def missing_forces(
             found.append(
                 MissingForce(name, DRY * drive.force, ripple(RIPPLES), what="ripple")
             )
+        if closely:
+            found += _details(name, drive.force, box)
+            if turns:
+                long = smooth(*box[name])
+                found.append(MissingForce(name, drive.force, long, what="pull"))
         found += [
             MissingForce(name, drive.force, at),
             MissingForce(
@@ -70,3 +79,18 @@ def missing_forces(
             MissingInput(name, GAP * half, Gap(GAP_WIDTH * half), what="dead_zone"),
         ]
     return found
+
+
+def _details(
+    name: str, force: float, box: Mapping[str, tuple[float, float]]
+) -> list[AbstractUnknownFunction]:
+    """Of a joint, by position and by velocity: a spring's play, a detent, a cusp."""
+    options = {"count": DETAILS, "reach": DETAIL_REACH, "length": DETAIL}
+    by_position = smooth(*box[name], **options)
+    by_speed = smooth(*box[f"{name}.velocity"], **options)
+    return [
+        MissingForce(name, DRY * force, by_position, what="position_detail"),
+        MissingForce(
+            name, DRY * force, by_speed, of_velocity=True, what="velocity_detail"
+        ),
+    ]
