@@ -12,7 +12,7 @@ the posterior probability grows; all that was tried is averaged (Madigan and Raf
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +29,13 @@ MOST = 4  # groups
 NEGLIGIBLE = 1e-4  # probability of a choice
 
 
+class Moments(NamedTuple):
+    """Mean and scale of all unknowns, of one choice of groups."""
+
+    mean: Float[np.ndarray, " p"]
+    scale: Float[np.ndarray, "p p"]
+
+
 class _Found(NamedTuple):
     scales: Scales
     log_probability: float
@@ -40,12 +47,12 @@ def averaged(
     root: Float[np.ndarray, "q p"],
     data: Float[np.ndarray, " q"],
     groups: Groups,
-    at_best: tuple[Float[np.ndarray, "q p"], Float[np.ndarray, " q"]] | None = None,
+    moments: Callable[[Scales], Moments] | None = None,
 ) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p p"], dict[str, float]]:
     """Mean and scale of the unknowns; the probability of each group, and of `NONE`.
 
-    ``at_best`` are root and data of another linearisation of the same model. Mean and
-    scale are then its own; probabilities are those of the first.
+    ``moments`` give mean and scale of one choice, where those of the linear model are
+    not to be used.
     """
     best = _posterior(root, data, groups, {})
     found = [best]
@@ -59,13 +66,12 @@ def averaged(
     logs = np.asarray([f.log_probability for f in found])
     weights = np.exp(logs - logs.max())
     weights = weights / weights.sum()
-    if at_best is not None:
+    nothing = float(weights[0])
+    if moments is not None:
         likely = weights > NEGLIGIBLE
-        weights = np.where(likely, weights, 0.0) / weights[likely].sum()
-        found = [
-            _posterior(*at_best, groups, f.scales) if likely[k] else f
-            for k, f in enumerate(found)
-        ]
+        found = [found[k] for k in np.argsort(-weights, kind="stable") if likely[k]]
+        found = [f._replace(**moments(f.scales)._asdict()) for f in found]
+        weights = np.sort(weights[likely])[::-1] / weights[likely].sum()
     mean = weights @ np.stack([f.mean for f in found])
     rows = [
         math.sqrt(w) * np.concatenate([f.scale.T, [f.mean - mean]])
@@ -75,7 +81,7 @@ def averaged(
     scale = np.asarray(np.linalg.qr(np.concatenate(rows), mode="r")).T
     of = {name: [name in f.scales for f in found] for name in groups}
     each = {name: float(weights @ np.asarray(on, float)) for name, on in of.items()}
-    return mean, scale, {NONE: float(weights[0])} | each
+    return mean, scale, {NONE: nothing} | each
 
 
 def _more(scales: Scales, groups: Groups) -> Iterator[Scales]:

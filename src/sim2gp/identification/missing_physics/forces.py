@@ -1,23 +1,29 @@
 """Forces that the simulator of a run lacks: of one-step data, and of windows of logs.
 
-One step of exact states has white noise. So its rows are linearised where the machine
-with all of its forces fits best, and the average over which forces are on is that of
-the corrected intervals (`sim2gp.identification.intervals`), without the scatter of
-windows.
+Windows have the corrected intervals (`sim2gp.identification.intervals`), with functions
+that have details. One step of exact states has white noise, and all of a machine's
+unknowns may be unknown: its masses and its motor too, so that data say how large a force
+is next to the motor. Where forces are on, the slopes by masses and motor then look like
+forces. So the average over which forces are on is taken where they are off, and mean and
+covariance where they are on.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-
-import time
-from typing import Any
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from sim2gp.identification.intervals.averaging import NOTHING, averaged
+from sim2gp.identification.intervals.averaging import (
+    NOTHING,
+    Groups,
+    Moments,
+    Scales,
+    averaged,
+)
 from sim2gp.identification.intervals.discrepancy import (
     corrected_windows,
     identifiable,
@@ -29,22 +35,25 @@ from sim2gp.identification.missing_physics.data import (
     WindowData,
 )
 from sim2gp.identification.missing_physics.reach import box_of
+from sim2gp.identification.missing_physics.shapes import is_nothing
 from sim2gp.inference.arrowhead import Noise
 from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.prior import ParameterPrior
 from sim2gp.inference.relevance import Linear, relevant
 from sim2gp.systems.assemble import free_parts
-from sim2gp.systems.base import AbstractSystem
-from sim2gp.systems.effects.forces import AbstractUnknownFunction
 from sim2gp.systems.effects.missing import missing_forces
 from sim2gp.systems.machine import plant_of
 from sim2gp.systems.mechanism import AbstractMechanism
 from sim2gp.types import in_float64
 
-ROUNDS = 20  # linearisations
-HALVINGS = 8
+STEPS = 40  # of a descent
+DAMPING = 1.0, 1e6  # first and last, of parameters in prior sd
+FREE = 1e-2  # of a prior that leaves weights free, relative to 1 / sd
 SETTLED = 0.1  # nats
+
+#: Factors ``[J r]`` of each channel's rows, at any unknowns.
+Rows = Callable[[Float[np.ndarray, " k"]], Float[np.ndarray, "c q k1"]]
 
 
 @dataclass(frozen=True)
@@ -56,172 +65,212 @@ class FoundForces:
 
     @property
     def found(self) -> tuple[Curve, ...]:
-        """Forces that are rather there than not."""
+        """Forces that are rather there than not, and whose band leaves zero."""
         likely = {kind for kind, p in self.each.items() if kind and p > NOTHING}
-        return tuple(c for c in self.curves if likely & set(c.kinds))
+        some = (c for c in self.curves if likely & set(c.kinds))
+        return tuple(c for c in some if not is_nothing(c))
 
 
 def find_forces(data: AbstractData, bare: Estimate) -> FoundForces:
     """Which forces the machine of ``data`` lacks, given the fit without any.
 
-    None of a plant without a mass matrix.
+    None of a plant without a mass matrix. Raises `NotFinite` E203.
     """
     if not isinstance(plant_of(data.system), AbstractMechanism):
         return FoundForces()
     if isinstance(data, OneStepData):
         return _of_transitions(data, bare)
     assert isinstance(data, WindowData)
-    return _of_windows(data, bare)
-
-
-def _of_windows(data: WindowData, bare: Estimate) -> FoundForces:
+    box = box_of(data.system, data.windows)
+    forces = missing_forces(data.system, box, fine=True, closely=True)
     likelihood = data.likelihood(data.system)
-    found = corrected_windows(likelihood, bare, data.recording, closely(data))
+    found = corrected_windows(likelihood, bare, data.recording, tuple(forces))
     return FoundForces(found.each, found.curves)
 
 
 @in_float64
 def _of_transitions(data: OneStepData, bare: Estimate) -> FoundForces:
+    """The parameters come first among the unknowns, then weights in all directions
+    that no parameter does as well."""
     machine, box = data.system, _visited(data)
     forces = missing_forces(machine, box, fine=True, closely=True)
     system = free_parts(machine, forces, period=data.period)
-    table = system.parameters
+    table, likelihood = system.parameters, data.likelihood(system)
     own = np.asarray([table.names.index(name) for name in machine.parameters.names])
-    prior = ParameterPrior(table.prior(), table)
+    prior, counts = ParameterPrior(table.prior(), table), likelihood.counts[0]
+
+    def rows_onto(onto: Float[np.ndarray, "p k"]) -> Rows:
+        def rows(y: Float[np.ndarray, " k"]) -> Float[np.ndarray, "c q k1"]:
+            z, none = jnp.asarray(onto @ y), jnp.zeros((1, 0))
+            found = np.asarray(data.blocks(system, z[None], none)[0, 0])
+            return np.concatenate([found[..., :-1] @ onto, found[..., -1:]], axis=2)
+
+        return rows
+
     start = np.zeros(len(table))
     start[own] = np.asarray(bare.z())
-    z, rows, noise = _descend(data, system, prior, start, bare.noise, own)
-    # With forces on, masses and motor times a number are forces divided by it: that the
-    # forces are there must be seen where they are off, and how large where they are on.
-    off = np.zeros(len(z))
-    off[own] = z[own]
-    A, data_off = _whitened(_rows(data, system, off), noise, off)
-    T, groups = identifiable(A, own, table.groups)
-    on, data_on = _whitened(rows, noise, z)
-    mean, scale, each = averaged(A @ T, data_off, groups, (on @ T, data_on))
-    about = prior.gaussian
-    at = about.at(jnp.asarray(T @ mean))
-    virtual = Gaussian(at, about.scale @ jnp.asarray(T @ scale))
+    # With forces off, whatever the parameters' order in the table.
+    first = _joined(rows_onto(np.eye(len(table)))(start), np.asarray(bare.noise.sd))
+    T, groups = identifiable(first[:, :-1], own, table.groups)
+    of_all, o, count = rows_onto(T), len(own), float(counts[0])
+    y, rows = _descend(of_all, np.append(start[own], np.zeros(T.shape[1] - o)), o, count)
+    sd = jnp.sqrt(_squares(rows) / counts)
+    whole = rows_onto(np.eye(len(table)))(T @ y)
+    grams = jnp.asarray(np.swapaxes(whole, 1, 2) @ whole)
+    linear = Linear(grams, 0.0 * likelihood.floor, counts, likelihood.floor)
+    noise, _ = _relevant(linear, jnp.asarray(T @ y), Noise(sd, jnp.ones(1)), prior)
+    sd = np.asarray(noise.sd)
+    off = np.append(y[:o], np.zeros(len(y) - o))
+    about = _whitened(of_all(off), sd, off)
+    top = _best_choice(about, groups)
+    some = np.concatenate([np.arange(o), *(groups[name] for name in sorted(top))])
+    some = some.astype(int)
+    best = y.copy()
+    best[some], _ = _descend(rows_onto(T[:, some]), y[some], o, count)
+    best[np.setdiff1d(np.arange(len(y)), some)] = 0.0
+    on = _AtBest(*_whitened(of_all(best), sd, best), best[:o], groups)
+    mean, scale, each = averaged(*about, groups, on.moments)
+    onto = np.asarray(prior.gaussian.scale) @ T
+    virtual = Gaussian(
+        prior.gaussian.at(jnp.asarray(T @ mean)), jnp.asarray(onto @ scale)
+    )
     return FoundForces(each, curves_of(system, forces, box, virtual))
 
 
-def _descend(
-    data: OneStepData,
-    system: AbstractSystem,
-    prior: ParameterPrior,
-    z: Float[np.ndarray, " p"],
-    noise: Noise,
-    own: Int[np.ndarray, " o"],
-) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "c k k"], Noise]:
-    """Where the machine with all its forces fits best: parameters, rows, noise.
+def _best_choice(
+    about: tuple[Float[np.ndarray, "q k"], Float[np.ndarray, " q"]], groups: Groups
+) -> Scales:
+    """The groups that are on in the most probable choice, and their scales."""
+    tried: list[Scales] = []
 
-    Each step goes to the posterior of the linearised rows, with the noise and the
-    scales of highest evidence there, and is halved as long as residuals fall by that.
+    def note(scales: Scales) -> Moments:
+        tried.append(scales)
+        k = about[0].shape[1]
+        return Moments(np.zeros(k), np.zeros((k, k)))
+
+    averaged(*about, groups, note)
+    return tried[0]
+
+
+@dataclass(frozen=True)
+class _AtBest:
+    """The linear model where forces are on; parameters come first.
+
+    A prior whose scale is the data's says nothing of a force's size. So parameters
+    follow from their own prior and the data, all weights free, and weights follow.
     """
-    likelihood = data.likelihood(system)
-    counts, floor = likelihood.counts[0], likelihood.floor
-    rows, none = _rows(data, system, z), jnp.zeros_like(floor)
-    for k in range(ROUNDS):
-        t0 = time.perf_counter()
-        grams = jnp.asarray(np.swapaxes(rows, 1, 2) @ rows)
-        linear = Linear(grams, none, counts, floor)
-        noise, scaled = _relevant(linear, jnp.asarray(z), noise, prior)
-        noise = jax.block_until_ready(noise)
-        t1 = time.perf_counter()
-        R = _whole(rows, noise)
-        each = np.asarray(scaled.each())
-        whole = np.concatenate([R[:, :-1] * each, np.eye(len(z))])
-        data_and_prior = np.concatenate([R[:, :-1] @ z - R[:, -1], np.zeros(len(z))])
-        step = each * np.linalg.lstsq(whole, data_and_prior)[0] - z
-        best = _misfit(rows, counts, floor) - SETTLED
-        before, tried = best, None
-        for share in 0.5 ** np.arange(HALVINGS):
-            at = z + share * step
-            found = _rows(data, system, at)
-            change = _weights(_whole(found, noise), at, each, own)
-            now = _misfit(found, counts, floor, change)
-            if now > best and tried is not None:
+
+    root: Float[np.ndarray, "q k"]
+    data: Float[np.ndarray, " q"]
+    own: Float[np.ndarray, " o"]
+    groups: Groups
+
+    def moments(self, scales: Scales) -> Moments:
+        """Mean and scale with so strong forces."""
+        o, k = len(self.own), self.root.shape[1]
+        D = np.zeros(k)
+        for name, share in scales.items():
+            D[self.groups[name]] = share
+        on = np.flatnonzero(D)
+        O, B = self.root[:, :o], self.root[:, on] * D[on]
+        free = np.linalg.qr(np.concatenate([B, FREE * np.eye(len(on))]))[0][: len(B)]
+        rest = np.concatenate([O - free @ (free.T @ O), np.eye(o)])
+        of_own = np.linalg.inv(np.linalg.qr(rest, mode="r"))
+        Q, R = np.linalg.qr(np.concatenate([B, np.eye(len(on))]))
+        onto = D[on, None] * np.linalg.solve(R, Q[: len(B)].T)
+        mean, scale = np.zeros(k), np.zeros((k, k))
+        mean[:o], mean[on] = self.own, onto @ (self.data - O @ self.own)
+        scale[:o, :o], scale[on, :o] = of_own, -onto @ O @ of_own
+        scale[np.ix_(on, o + np.arange(len(on)))] = D[on, None] * np.linalg.inv(R)
+        return Moments(mean, scale)
+
+
+class _Point(NamedTuple):
+    """Unknowns, rows there, and nats of misfit and prior."""
+
+    y: Float[np.ndarray, " k"]
+    rows: Float[np.ndarray, "c q k1"]
+    nats: float
+
+
+def _descend(
+    rows: Rows, y: Float[np.ndarray, " k"], o: int, count: float
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "c q k1"]]:
+    """Where the machine with its forces fits best: the unknowns, and rows there.
+
+    Variable projection (Golub and Pereyra 1973; Kaufman 1975): at any parameters, the
+    first ``o`` unknowns, the weights are solved for, as they are linear, and
+    Levenberg-Marquardt descends in the parameters alone. In both together its way would
+    be a narrow curve, along which masses and forces have one ratio. Each channel's
+    noise is what is left.
+    """
+    at, damping = _solved(rows, y, o, count), DAMPING[0]
+    for _ in range(STEPS):
+        R = _joined(at.rows, np.sqrt(_squares(at.rows) / count))
+        O, B = R[:, :o], R[:, o:-1] / FREE
+        Q, T = np.linalg.qr(np.concatenate([B, np.eye(B.shape[1])]))
+        onto = Q[: len(B)].T @ O
+        H = O.T @ O - onto.T @ onto + (1.0 + damping) * np.eye(o)
+        step = -np.linalg.solve(H, O.T @ R[:, -1] + at.y[:o])
+        follow = -np.linalg.solve(T, onto @ step) / FREE
+        there = _solved(rows, at.y + np.concatenate([step, follow]), o, count)
+        gain = at.nats - there.nats
+        if not gain > 0.0:
+            damping = 10.0 * damping
+            if damping > DAMPING[1]:
                 break
-            if now <= best:
-                best, tried = now, at + change
-        t2 = time.perf_counter()
-        if VERBOSE:
-            print("round", k, share, before - best, best, np.asarray(noise.sd).round(4), round(t1 - t0, 2), round(t2 - t1, 2), len(z))
-        if tried is None:
+            continue
+        at = there
+        if gain < SETTLED:
             break
-        z, prior = tried, scaled
-        rows = _rows(data, system, z)
-    return z, rows, noise
+        damping = 0.1 * damping
+    return at.y, at.rows
 
 
-def _rows(
-    data: OneStepData, system: AbstractSystem, z: Float[np.ndarray, " p"]
-) -> Float[np.ndarray, "c k k"]:
-    """Factors ``[J r]`` of each channel's rows at ``z``."""
-    return np.asarray(data.blocks(system, z[None], jnp.zeros((1, 0)))[0, 0])
+def _solved(rows: Rows, y: Float[np.ndarray, " k"], o: int, count: float) -> _Point:
+    """With the weights that are best for these parameters."""
+    found = rows(y)
+    R = _joined(found, np.sqrt(_squares(found) / count))
+    slack = FREE * np.eye(len(y) - o)
+    whole = np.concatenate([R[:, o:-1], slack])
+    change = np.linalg.lstsq(whole, -np.append(R[:, -1], FREE * y[o:]))[0]
+    y = np.append(y[:o], y[o:] + change)
+    found = rows(y)
+    prior = y[:o] @ y[:o] + FREE**2 * y[o:] @ y[o:]
+    nats = 0.5 * (count * np.sum(np.log(_squares(found))) + prior)
+    return _Point(y, found, float(nats))
+
+
+def _squares(rows: Float[np.ndarray, "c q k1"]) -> Float[np.ndarray, " c"]:
+    """Of each channel's residuals."""
+    return np.asarray(np.sum(rows[:, :, -1] ** 2, axis=1))
+
+
+def _joined(
+    rows: Float[np.ndarray, "c q k1"], sd: Float[np.ndarray, " c"]
+) -> Float[np.ndarray, "r k1"]:
+    """All rows, in sd of the noise."""
+    return np.concatenate(list(rows / np.asarray(sd)[:, None, None]))
 
 
 def _whitened(
-    rows: Float[np.ndarray, "c k k"], noise: Noise, z: Float[np.ndarray, " p"]
-) -> tuple[Float[np.ndarray, "k p"], Float[np.ndarray, " k"]]:
-    """The linear model about ``z``: its slopes, and data as if it went through zero."""
-    R = np.asarray(np.linalg.qr(_whole(rows, noise), mode="r"))
-    return R[:, :-1], R[:, :-1] @ z - R[:, -1]
-
-
-def _whole(rows: Float[np.ndarray, "c k k"], noise: Noise) -> np.ndarray:
-    """All rows, in sd of the noise."""
-    return np.concatenate(list(rows / np.asarray(noise.sd)[:, None, None]))
-
-
-def _weights(
-    R: Float[np.ndarray, "q p1"],
-    z: Float[np.ndarray, " p"],
-    each: Float[np.ndarray, " p"],
-    own: Int[np.ndarray, " o"],
-) -> Float[np.ndarray, " p"]:
-    """From ``z`` to where the weights of forces are best, parameters as they are."""
-    free = np.setdiff1d(np.arange(len(z)), own)
-    whole = np.concatenate([R[:, free], np.diag(1.0 / each[free])])
-    wanted = np.concatenate([-R[:, -1], -z[free] / each[free]])
-    change = np.zeros(len(z))
-    change[free] = np.linalg.lstsq(whole, wanted)[0]
-    return change
-
-
-def _misfit(
-    rows: Float[np.ndarray, "c k k"],
-    counts: Any,
-    floor: Any,
-    change: Float[np.ndarray, " p"] | None = None,
-) -> float:
-    """Nats after a small change, each channel's noise at its best."""
-    left = rows[:, :, -1]
-    if change is not None:
-        left = left + rows[:, :, :-1] @ change
-    squares = np.sum(left**2, axis=1) + 2.0 * np.asarray(floor) ** 2
-    return 0.5 * float(np.sum(np.asarray(counts) * np.log(squares)))
+    rows: Float[np.ndarray, "c q k1"],
+    sd: Float[np.ndarray, " c"],
+    y: Float[np.ndarray, " k"],
+) -> tuple[Float[np.ndarray, "k k"], Float[np.ndarray, " k"]]:
+    """The linear model about ``y``: its slopes, and data as if it went through zero."""
+    R = np.asarray(np.linalg.qr(_joined(rows, sd), mode="r"))
+    return R[:, :-1], R[:, :-1] @ y - R[:, -1]
 
 
 _relevant = jax.jit(relevant)
-VERBOSE = False
 
 
 def _visited(data: OneStepData) -> dict[str, tuple[float, float]]:
     """The range of each channel in the episodes."""
-    channels = (*data.system.physical_states, *data.system.actions)
     d = len(data.system.physical_states)
-    columns: Sequence[Float[np.ndarray, " N"]] = [
-        *np.concatenate([S[:, :d] for S, _ in data.episodes]).T,
-        *np.concatenate([A for _, A in data.episodes]).T,
-    ]
-    return {
-        c.name: (float(x.min()), float(x.max()))
-        for c, x in zip(channels, columns, strict=True)
-    }
-
-
-def closely(data: WindowData) -> tuple[AbstractUnknownFunction, ...]:
-    """What may be missing of a machine, looked at closely."""
-    box = box_of(data.system, data.windows)
-    return tuple(missing_forces(data.system, box, fine=True, closely=True))
+    S = np.concatenate([S[:, :d] for S, _ in data.episodes])
+    A = np.concatenate([A for _, A in data.episodes])
+    channels = (*data.system.physical_states, *data.system.actions)
+    ends = [(float(x.min()), float(x.max())) for x in (*S.T, *A.T)]
+    return dict(zip((c.name for c in channels), ends, strict=True))

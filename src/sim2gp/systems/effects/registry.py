@@ -9,7 +9,7 @@ prior around nothing, a delay, or the time constant of a low pass. Priors are a 
 what the machine itself does, so that no candidate is favoured by its unit: a force by
 the largest of its motor or weight, a stiffness and a drag by that force at a typical
 position and speed, a dead zone by the input's range. A force on a joint that is listed
-in `_FORCES` is a candidate of every machine: its powers give its unit and its prior.
+in `FORCES` is a candidate of every machine: its powers give its unit and its prior.
 """
 
 import dataclasses
@@ -51,14 +51,14 @@ from sim2gp.systems.plants.two_link import TwoLink, UniformRodArm
 from sim2gp.systems.sensors import EncoderOffset
 
 #: On every joint. Each of these is a candidate too: `_force` gives it a prior.
-_FORCES: tuple[type[AbstractJointForce], ...] = (
+FORCES: tuple[type[AbstractJointForce], ...] = (
     Coulomb,
     Stribeck,
     Spring,
     Drag,
     Viscous,
 )
-_JOINT: tuple[Any, ...] = *_FORCES, EncoderOffset
+_JOINT: tuple[Any, ...] = *FORCES, EncoderOffset
 #: Every part by what it acts on; `possible` says which machines can have it.
 REGISTRY: dict[str, tuple[Any, ...]] = {
     "hinge": (*_JOINT, BaseTilt, BaseTiltSide, Payload, PoleGeometry, RodInertia),
@@ -240,7 +240,7 @@ def _force(kind: type[AbstractJointForce], joint: _Joint) -> Candidate:
 
 def _other_forces(joint: _Joint) -> list[Candidate]:
     """All forces but dry friction, which comes first."""
-    return [_force(kind, joint) for kind in _FORCES if kind is not Coulomb]
+    return [_force(kind, joint) for kind in FORCES if kind is not Coulomb]
 
 
 def _of_joint(joint: _Joint) -> list[Candidate]:
