@@ -22,7 +22,9 @@ Law = Callable[[Any], Any]
 
 def dead_spring(z: Any) -> Any:
     """A spring with play: nothing until a third of the range, then stiff."""
-    return (jax.nn.softplus(-(z + 0.35) / 0.04) - jax.nn.softplus((z - 0.35) / 0.04)) / 16.0
+    return (
+        jax.nn.softplus(-(z + 0.35) / 0.04) - jax.nn.softplus((z - 0.35) / 0.04)
+    ) / 16.0
 
 
 def notch(z: Any) -> Any:

@@ -55,10 +55,10 @@ SHARE = 0.9  # of the range, inside the band
 PLACES: dict[str, dict[str, tuple[str, float]]] = {
     "furuta": {"position": ("theta", 6e-3), "velocity": ("theta", 4e-3)},
     "cartpole": {"position": ("x", 3.0), "velocity": ("x", 1.5)},
-    ARM: {"position": ("q1", 0.03), "velocity": ("q1", 0.03)},
+    ARM: {"position": ("q1", 0.1), "velocity": ("q1", 0.1)},
 }
 INPUT = {"furuta": "voltage", "cartpole": "voltage", ARM: "torque1"}
-COGGING = {"furuta": ("theta", 5e-3), ARM: ("q2", 0.015)}
+COGGING = {"furuta": ("theta", 5e-3), ARM: ("q2", 0.03)}
 
 
 def planted_on(
@@ -304,7 +304,11 @@ def main() -> None:
             found.append(known)
             share = f"{known['inside']:.2f}" if "inside" in known else "-"
             told = f"{case.name}: {share} {known['reported']}"
-            print(told, {k: v for k, v in known.items() if k in ("error", "sd", "size")}, flush=True)
+            print(
+                told,
+                {k: v for k, v in known.items() if k in ("error", "sd", "size")},
+                flush=True,
+            )
             task.advance(told)
     said = claims(found)
     print(to_json(said))

@@ -29,6 +29,7 @@ def missing_forces(summary: Summary, arrays: Arrays) -> Section:
         ]
         said = f"{svg.extent(mean)}, {about['of']} {svg.extent(at, about['of_unit'])}"
         title = f"on {about['where']}, by {about['of']}"
+        title += f": {about['name']}" * ("name" in about)
         charts.append(
             svg.chart(axes, marks, title=title, said=said, unit=about["unit"])
         )

@@ -14,7 +14,7 @@ from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.effects.forces import AbstractUnknownFunction, MissingForce
 from sim2gp.systems.machine import Machine, plant_of
 
-POINTS = 61
+POINTS = 201
 
 
 class Curve(NamedTuple):

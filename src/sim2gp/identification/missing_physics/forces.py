@@ -1,21 +1,20 @@
 """Forces that the simulator of a run lacks: of one-step data, and of windows of logs.
 
 Windows have the corrected intervals (`sim2gp.identification.intervals`), with functions
-that have details. One step of exact states has white noise, and all of a machine's
-unknowns may be unknown: its masses and its motor too, so that data say how large a force
-is next to the motor. Where forces are on, the slopes by masses and motor then look like
-forces. So the average over which forces are on is taken where they are off, and mean and
-covariance where they are on.
+that have details. One step of exact states has white noise, and masses and motor may
+both be unknown, so that data say how large a force is next to the motor. Where forces
+are on, the slopes by masses and motor then look like forces. So the average over which
+forces are on is taken where they are off, and mean and covariance where they are on.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float, Int
 
 from sim2gp.identification.intervals.averaging import (
     NOTHING,
@@ -36,7 +35,6 @@ from sim2gp.identification.missing_physics.data import (
 )
 from sim2gp.identification.missing_physics.reach import box_of
 from sim2gp.identification.missing_physics.shapes import is_nothing
-from sim2gp.inference.arrowhead import Noise
 from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.prior import ParameterPrior
@@ -48,9 +46,11 @@ from sim2gp.systems.mechanism import AbstractMechanism
 from sim2gp.types import in_float64
 
 STEPS = 40  # of a descent
+CHOICES = 3  # of forces, each from the last one's best fit
 DAMPING = 1.0, 1e6  # first and last, of parameters in prior sd
 FREE = 1e-2  # of a prior that leaves weights free, relative to 1 / sd
 SETTLED = 0.1  # nats
+FARTHEST = 0.3  # prior sd that a step may take a parameter: bounds saturate far away
 
 #: Factors ``[J r]`` of each channel's rows, at any unknowns.
 Rows = Callable[[Float[np.ndarray, " k"]], Float[np.ndarray, "c q k1"]]
@@ -101,7 +101,7 @@ def _of_transitions(data: OneStepData, bare: Estimate) -> FoundForces:
 
     def rows_onto(onto: Float[np.ndarray, "p k"]) -> Rows:
         def rows(y: Float[np.ndarray, " k"]) -> Float[np.ndarray, "c q k1"]:
-            z, none = jnp.asarray(onto @ y), jnp.zeros((1, 0))
+            z, none = onto @ y, jnp.zeros((1, 0))
             found = np.asarray(data.blocks(system, z[None], none)[0, 0])
             return np.concatenate([found[..., :-1] @ onto, found[..., -1:]], axis=2)
 
@@ -112,29 +112,46 @@ def _of_transitions(data: OneStepData, bare: Estimate) -> FoundForces:
     # With forces off, whatever the parameters' order in the table.
     first = _joined(rows_onto(np.eye(len(table)))(start), np.asarray(bare.noise.sd))
     T, groups = identifiable(first[:, :-1], own, table.groups)
-    of_all, o, count = rows_onto(T), len(own), float(counts[0])
-    y, rows = _descend(of_all, np.append(start[own], np.zeros(T.shape[1] - o)), o, count)
-    sd = jnp.sqrt(_squares(rows) / counts)
-    whole = rows_onto(np.eye(len(table)))(T @ y)
-    grams = jnp.asarray(np.swapaxes(whole, 1, 2) @ whole)
-    linear = Linear(grams, 0.0 * likelihood.floor, counts, likelihood.floor)
-    noise, _ = _relevant(linear, jnp.asarray(T @ y), Noise(sd, jnp.ones(1)), prior)
-    sd = np.asarray(noise.sd)
-    off = np.append(y[:o], np.zeros(len(y) - o))
-    about = _whitened(of_all(off), sd, off)
-    top = _best_choice(about, groups)
-    some = np.concatenate([np.arange(o), *(groups[name] for name in sorted(top))])
-    some = some.astype(int)
-    best = y.copy()
-    best[some], _ = _descend(rows_onto(T[:, some]), y[some], o, count)
-    best[np.setdiff1d(np.arange(len(y)), some)] = 0.0
-    on = _AtBest(*_whitened(of_all(best), sd, best), best[:o], groups)
+    of_all, whole, o = rows_onto(T), rows_onto(np.eye(len(table))), len(own)
+    y, noise = np.append(start[own], np.zeros(T.shape[1] - o)), bare.noise
+    last: Scales | None = None
+    for _ in range(CHOICES):
+        off = np.append(y[:o], np.zeros(len(y) - o))
+        rows = whole(T @ off)
+        grams = jnp.asarray(np.swapaxes(rows, 1, 2) @ rows)
+        linear = Linear(grams, 0.0 * likelihood.floor, counts, likelihood.floor)
+        noise, _ = _relevant(linear, jnp.asarray(T @ off), noise, prior)
+        sd = np.asarray(noise.sd)
+        about = _whitened(of_all(off), sd, off)
+        top = _best_choice(about, groups)
+        if last is not None and top.keys() == last.keys():
+            break
+        starts = [start[own]] if last is None else [y[:o], start[own]]
+        last = top
+        some = [np.arange(o), *(groups[name] for name in sorted(top))]
+        y = _best_fit(T, np.concatenate(some), rows_onto, starts, counts)
+    on = _AtBest(*_whitened(of_all(y), sd, y), y[:o], groups)
     mean, scale, each = averaged(*about, groups, on.moments)
     onto = np.asarray(prior.gaussian.scale) @ T
     virtual = Gaussian(
         prior.gaussian.at(jnp.asarray(T @ mean)), jnp.asarray(onto @ scale)
     )
     return FoundForces(each, curves_of(system, forces, box, virtual))
+
+
+def _best_fit(
+    T: Float[np.ndarray, "p k"],
+    some: Int[np.ndarray, " s"],
+    rows_onto: Callable[[Float[np.ndarray, "p s"]], Rows],
+    starts: Sequence[Float[np.ndarray, " o"]],
+    counts: Array,
+) -> Float[np.ndarray, " k"]:
+    """All unknowns, those in ``some`` at the best of descents from these parameters."""
+    best, o = np.zeros(T.shape[1]), len(starts[0])
+    rows, none = rows_onto(T[:, some]), np.zeros(len(some) - o)
+    tried = [_descend(rows, np.append(x, none), o, float(counts[0])) for x in starts]
+    best[some] = min(tried, key=lambda at: at.nats).y
+    return best
 
 
 def _best_choice(
@@ -193,10 +210,8 @@ class _Point(NamedTuple):
     nats: float
 
 
-def _descend(
-    rows: Rows, y: Float[np.ndarray, " k"], o: int, count: float
-) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "c q k1"]]:
-    """Where the machine with its forces fits best: the unknowns, and rows there.
+def _descend(rows: Rows, y: Float[np.ndarray, " k"], o: int, count: float) -> _Point:
+    """Where the machine with its forces fits best.
 
     Variable projection (Golub and Pereyra 1973; Kaufman 1975): at any parameters, the
     first ``o`` unknowns, the weights are solved for, as they are linear, and
@@ -212,6 +227,7 @@ def _descend(
         onto = Q[: len(B)].T @ O
         H = O.T @ O - onto.T @ onto + (1.0 + damping) * np.eye(o)
         step = -np.linalg.solve(H, O.T @ R[:, -1] + at.y[:o])
+        step *= min(1.0, FARTHEST / np.max(np.abs(step)))
         follow = -np.linalg.solve(T, onto @ step) / FREE
         there = _solved(rows, at.y + np.concatenate([step, follow]), o, count)
         gain = at.nats - there.nats
@@ -224,7 +240,7 @@ def _descend(
         if gain < SETTLED:
             break
         damping = 0.1 * damping
-    return at.y, at.rows
+    return at
 
 
 def _solved(rows: Rows, y: Float[np.ndarray, " k"], o: int, count: float) -> _Point:

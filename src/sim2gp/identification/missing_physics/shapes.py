@@ -8,8 +8,9 @@ generalised least squares,
     a = (Phi^T S^-1 Phi)^-1 Phi^T S^-1 m,    S = C + s^2 I,    cov a = W C W^T,
 
 with ``W`` the map from ``m`` to ``a`` and ``s`` a third of the band's rms sd: a basis
-has no finer detail. If the shape is the truth, the residual's ``chi^2 = r^T S^-1 r`` has
-the mean ``nu = tr(C S^-1)``, its effective degrees of freedom. A shape is the name if
+has no finer detail. If the shape is the truth, ``chi^2 = r^T S^-1 r`` of the residual
+has the mean ``nu = tr(C S^-1)``, its effective degrees of freedom. A shape is the name
+if
 
 - chi^2 is below the 99 % point of the chi-square law with ``nu``,
 - it is inside the 95 % band over 90 % of the range, and
@@ -20,7 +21,7 @@ Of several, the name is the one of highest evidence, ``-chi^2 / 2 - d / 2 log nu
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -34,7 +35,12 @@ from sim2gp.identification.words import digits
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.effects.base import AbstractEffect, AbstractJointForce
 from sim2gp.systems.effects.inputs import DeadZone
-from sim2gp.systems.effects.registry import FORCES, options_of
+from sim2gp.systems.effects.registry import FORCES, Candidate
+from sim2gp.systems.effects.tables import (
+    InputTable,
+    PositionTable,
+    VelocityTable,
+)
 from sim2gp.systems.machine import plant_of
 from sim2gp.types import in_float64
 
@@ -42,6 +48,7 @@ TWO_SIDED = 1.96  # sd of a 95 % band
 LEVEL, SHARE = 0.99, 0.9  # of the chi-square law; of the range, inside the band
 RESOLVED = 1.0 / 3.0  # of the band's rms sd
 CLEAR = 2.0  # sd of a magnitude
+ABOUT = 0.05  # of a range: where a spring still pulls to zero
 #: Of a range: velocities over which a friction's sign changes and over which it falls,
 #: widths of a dead zone.
 WIDTHS = (0.003, 0.01, 0.03, 0.1)
@@ -119,6 +126,24 @@ def name_of(curve: Curve, system: AbstractSystem) -> Name | None:
     return Name(best.effect, magnitude, sd, unit, about, curve.of_unit)
 
 
+def addition_of(curve: Curve, name: Name | None) -> Candidate:
+    """What to add to a machine: the effect of that name, or the curve as a table.
+
+    A spring of the registry pulls to zero; one about another place is a table.
+    """
+    reach = float(np.max(np.abs(curve.at)))
+    if name is not None and abs(name.about or 0.0) <= ABOUT * reach:
+        return Candidate(replace(name.effect, magnitude=abs(name.magnitude)))
+    kind: Any = PositionTable if curve.of == curve.where else VelocityTable
+    if curve.of_unit not in ("rad", "m") and curve.of == curve.where:
+        kind = InputTable
+    points = tuple(
+        (float(f"{z:.6g}"), float(f"{f:.4g}"))
+        for z, f in zip(curve.at, curve.mean, strict=True)
+    )
+    return Candidate(kind(curve.where, 1.0, points))
+
+
 def is_nothing(curve: Curve) -> bool:
     """Whether what is no force of its own is inside the band: nothing to be drawn."""
     return _fit(curve, None, None, 0).fits
@@ -126,7 +151,9 @@ def is_nothing(curve: Curve) -> bool:
 
 def _gap_sd(fits: list[Fit], best: Fit) -> float:
     """Of a dead zone's width: a step of the grid, or how far the chi-square spreads."""
-    widths = np.asarray([f.effect.magnitude for f in fits if type(f.effect) is DeadZone])
+    widths = np.asarray(
+        [f.effect.magnitude for f in fits if type(f.effect) is DeadZone]
+    )
     gain = [0.5 * (best.chi2 - f.chi2) for f in fits if type(f.effect) is DeadZone]
     weights = np.exp(gain)
     weights = weights / weights.sum()
@@ -155,13 +182,17 @@ def _shapes(
     for kind in FORCES:
         if (kind.powers[0] > 0) != by_position:
             continue
-        options = options_of(kind.what)
         made: Any = kind
+        options = [f.name for f in fields(made)]
         grids = {"width": WIDTHS, "speed": SPEEDS}
         names = [name for name in grids if name in options]
-        for values in np.stack(
-            np.meshgrid(*(grids[name] for name in names), indexing="ij"), axis=-1
-        ).reshape(-1, len(names)) if names else [()]:
+        for values in (
+            np.stack(
+                np.meshgrid(*(grids[name] for name in names), indexing="ij"), axis=-1
+            ).reshape(-1, len(names))
+            if names
+            else [()]
+        ):
             given = dict(zip(names, (float(v) * span for v in values), strict=True))
             yield made(curve.where, 1.0, **given), len(names)
 

@@ -85,9 +85,10 @@ def _details(
     name: str, force: float, box: Mapping[str, tuple[float, float]]
 ) -> list[AbstractUnknownFunction]:
     """Of a joint, by position and by velocity: a spring's play, a detent, a cusp."""
-    options = {"count": DETAILS, "reach": DETAIL_REACH, "length": DETAIL}
-    by_position = smooth(*box[name], **options)
-    by_speed = smooth(*box[f"{name}.velocity"], **options)
+    by_position, by_speed = (
+        smooth(*box[of], count=DETAILS, reach=DETAIL_REACH, length=DETAIL)
+        for of in (name, f"{name}.velocity")
+    )
     return [
         MissingForce(name, DRY * force, by_position, what="position_detail"),
         MissingForce(

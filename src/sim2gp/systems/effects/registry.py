@@ -41,6 +41,7 @@ from sim2gp.systems.effects.inputs import DeadZone
 from sim2gp.systems.effects.loads import BaseTilt, BaseTiltSide, Payload, RailTilt
 from sim2gp.systems.effects.scales import drives
 from sim2gp.systems.effects.springs import Spring
+from sim2gp.systems.effects.tables import InputTable, PositionTable, VelocityTable
 from sim2gp.systems.effects.units import joint_of
 from sim2gp.systems.machine import Machine, plant_of
 from sim2gp.systems.mechanism import AbstractMechanism
@@ -58,12 +59,12 @@ FORCES: tuple[type[AbstractJointForce], ...] = (
     Drag,
     Viscous,
 )
-_JOINT: tuple[Any, ...] = *FORCES, EncoderOffset
+_JOINT: tuple[Any, ...] = (*FORCES, EncoderOffset, PositionTable, VelocityTable)
 #: Every part by what it acts on; `possible` says which machines can have it.
 REGISTRY: dict[str, tuple[Any, ...]] = {
     "hinge": (*_JOINT, BaseTilt, BaseTiltSide, Payload, PoleGeometry, RodInertia),
     "slide": (*_JOINT, RailFriction, RailTilt),
-    "input": (DeadZone, Gain, Offset, Delay, Lag),
+    "input": (DeadZone, InputTable, Gain, Offset, Delay, Lag),
 }
 #: Names in project files that are no longer a part's own.
 ALIASES: dict[str, Any] = {"back_emf": Viscous}
@@ -81,7 +82,7 @@ OFFSET = 0.05  # rad, prior sd of a tilt or of an encoder's zero
 LONGEST = 0.04  # s, of a delay or a time constant
 
 
-def named(what: str, where: str, magnitude: float, **options: float) -> AbstractPart:
+def named(what: str, where: str, magnitude: float, **options: Any) -> AbstractPart:
     """An effect by its name in a project file; `KeyError` for an unknown one."""
     if what in ALIASES:
         made: AbstractPart = ALIASES[what](where, magnitude, what=what, **options)
