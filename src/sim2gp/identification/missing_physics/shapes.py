@@ -53,7 +53,7 @@ ABOUT = 0.05  # of a range: where a spring still pulls to zero
 #: widths of a dead zone.
 WIDTHS = (0.003, 0.01, 0.03, 0.1)
 SPEEDS = (0.03, 0.06, 0.12, 0.25)
-GAPS = tuple(0.02 * k for k in range(1, 25))
+GAPS = tuple(0.005 * k for k in range(2, 101))
 
 
 class Name(NamedTuple):
@@ -119,7 +119,10 @@ def name_of(curve: Curve, system: AbstractSystem) -> Name | None:
     plant, about = plant_of(system), None
     magnitude, sd = float(best.weights[0]), best.sd
     if isinstance(best.effect, DeadZone):
-        magnitude, sd = best.effect.magnitude, _gap_sd(fits, best)
+        magnitude, sd = (
+            best.effect.magnitude,
+            _gap_sd(fits, best, float(np.max(np.abs(curve.at)))),
+        )
     elif curve.of == curve.where:
         about = float(best.weights[1] / magnitude)
     unit = best.effect.unit(plant)
@@ -149,17 +152,14 @@ def is_nothing(curve: Curve) -> bool:
     return _fit(curve, None, None, 0).fits
 
 
-def _gap_sd(fits: list[Fit], best: Fit) -> float:
-    """Of a dead zone's width: a step of the grid, or how far the chi-square spreads."""
-    widths = np.asarray(
-        [f.effect.magnitude for f in fits if type(f.effect) is DeadZone]
-    )
-    gain = [0.5 * (best.chi2 - f.chi2) for f in fits if type(f.effect) is DeadZone]
-    weights = np.exp(gain)
+def _gap_sd(fits: list[Fit], best: Fit, reach: float) -> float:
+    """Of a dead zone's width: how far the chi-square spreads, or a step of the grid."""
+    each = [(f.effect.magnitude, f.chi2) for f in fits if f.effect is not None]
+    widths, chi2 = np.asarray(each).T
+    weights = np.exp(0.5 * (best.chi2 - chi2))
     weights = weights / weights.sum()
     spread = np.sqrt(weights @ (widths - weights @ widths) ** 2)
-    step = (GAPS[1] - GAPS[0]) * best.effect.magnitude / max(GAPS)  # type: ignore[union-attr]
-    return float(max(spread, step))
+    return float(max(spread, (GAPS[1] - GAPS[0]) * reach))
 
 
 def _fits(curve: Curve, system: AbstractSystem) -> Iterator[Fit]:

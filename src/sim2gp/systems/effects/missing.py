@@ -27,6 +27,7 @@ GAP_WIDTH = 0.12  # median of a dead zone's width, share of an input
 INPUT_REACH, INPUT_LENGTH = 1.2, 0.3  # half-widths of an input
 #: Of details: how many, and half-widths of where a machine moves.
 DETAILS, DETAIL_REACH, DETAIL = 16, 1.2, 0.15
+DETAIL_SIZE = 0.3  # of the smooth force
 
 
 def missing_forces(
@@ -84,14 +85,18 @@ def missing_forces(
 def _details(
     name: str, force: float, box: Mapping[str, tuple[float, float]]
 ) -> list[AbstractUnknownFunction]:
-    """Of a joint, by position and by velocity: a spring's play, a detent, a cusp."""
+    """Of a joint, by position and by velocity: a spring's play, a detent, a cusp.
+
+    They are of the kind of the smooth force: where that is on, its details may be.
+    """
+    size = DETAIL_SIZE * force
     by_position, by_speed = (
         smooth(*box[of], count=DETAILS, reach=DETAIL_REACH, length=DETAIL)
         for of in (name, f"{name}.velocity")
     )
     return [
-        MissingForce(name, DRY * force, by_position, what="position_detail"),
+        MissingForce(name, size, by_position, what="detail.position_force"),
         MissingForce(
-            name, DRY * force, by_speed, of_velocity=True, what="velocity_detail"
+            name, size, by_speed, of_velocity=True, what="detail.velocity_force"
         ),
     ]

@@ -40,7 +40,7 @@ class AbstractTable(AbstractEffect):
         good = 2 <= len(found) <= MOST and bool(np.all(np.isfinite(found)))
         if not (good and np.all(np.diff(found[:, 0]) > 0.0)):
             got = f"{len(found)} points"
-            raise error("points_of_table", where=self.name, got=got, most=str(MOST))
+            raise error("points_of_table", name=self.name, got=got, most=str(MOST))
 
     def parameter(self, plant: AbstractPlant) -> Parameter:
         """About the table as it is."""
