@@ -138,12 +138,33 @@ def _by_channel(system: Any, S: np.ndarray, A: np.ndarray) -> dict[str, np.ndarr
     return dict(zip(names, [*S.T, *A.T], strict=True))
 
 
-@in_float64
 def _arm_data(
     machine: str, planted: Planted | None, index: int
 ) -> tuple[WindowData, dict[str, np.ndarray]]:
-    """An arm under multisines, its encoders at 100 Hz for ten seconds."""
+    """An arm's log in windows."""
     del machine  # there is one
+    system, (log, S, torque) = UniformRodArm(), _arm_log(planted, index)
+
+    def windows(machine: Any) -> Any:
+        return cut([log], machine, window=WINDOW)[0]
+
+    count = len(windows(system))
+    second = np.arange(count) // round(1.0 / WINDOW)
+    data = WindowData(system, windows, second, np.zeros(count, int))
+    return data, _by_channel(system, S, torque)
+
+
+def arm_log_of(case: Case) -> tuple[Log, Planted]:
+    """The recording of an arm, and the force on it."""
+    seen = _arm_data(ARM, None, case.index)[1]
+    planted = planted_on(ARM, case.shape, seen)
+    assert planted is not None
+    return _arm_log(planted, case.index)[0], planted
+
+
+@in_float64
+def _arm_log(planted: Planted | None, index: int) -> tuple[Log, np.ndarray, np.ndarray]:
+    """An arm under multisines, its encoders at 100 Hz for ten seconds."""
     rng = np.random.default_rng([31, index])
     system = UniformRodArm()
     prior = system.parameters.prior()
@@ -155,7 +176,7 @@ def _arm_data(
     torque *= TORQUE / np.sqrt(np.mean(torque**2, axis=0))
     true = with_parts(system, [planted]) if planted else system
     values = system.parameters.values(jnp.asarray(tt))
-    fixed = {k: jnp.asarray(v) for k, v in true.parameters.fixed}
+    fixed = {k: jnp.asarray(v, float) for k, v in true.parameters.fixed}
     record = true.record({**fixed, **values})
 
     def step(x: Any, u: Any) -> tuple[Any, Any]:
@@ -172,14 +193,7 @@ def _arm_data(
         inputs=dict(zip(inputs, torque.T, strict=True)),
         mask={n: np.ones(len(clock), bool) for n in joints},
     )
-
-    def windows(machine: Any) -> Any:
-        return cut([log], machine, window=WINDOW)[0]
-
-    count = len(windows(system))
-    second = np.arange(count) // round(1.0 / WINDOW)
-    data = WindowData(system, windows, second, np.zeros(count, int))
-    return data, _by_channel(system, S, torque)
+    return log, S, torque
 
 
 def compared(
@@ -222,7 +236,10 @@ def cell(case: Case, pictures: Path | None = None) -> dict[str, Any]:
     true, mean, sd = compared(curve, np.asarray(planted.value(at)), at, gravity=False)
     inside = np.abs(true - mean) <= Z * sd
     result |= {
-        "true": f"{curve.name}",
+        "true": curve.name,
+        "of": curve.of,
+        "of_unit": curve.of_unit,
+        "unit": curve.unit,
         "named": curve.name in names,
         "inside": float(np.mean(inside)),
         "error": float(np.sqrt(np.mean((true - mean) ** 2))),
@@ -246,12 +263,15 @@ def _draw(
     import matplotlib.pyplot as plt
 
     folder.mkdir(parents=True, exist_ok=True)
-    _, axes = plt.subplots(figsize=(5, 3))
-    axes.fill_between(at, mean - Z * sd, mean + Z * sd, alpha=0.3)
-    axes.plot(at, mean)
-    axes.plot(at, true, "k--")
-    axes.set_title(f"{case.name} {result['inside']:.2f} {result['reported']}", size=6)
-    plt.savefig(folder / f"{case.name}.png", dpi=70)
+    _, axes = plt.subplots(figsize=(5.0, 3.0), layout="tight")
+    band = mean - Z * sd, mean + Z * sd
+    axes.fill_between(at, *band, alpha=0.3, lw=0, label="95 % band")
+    axes.plot(at, mean, label="found")
+    axes.plot(at, true, "k--", label="true")
+    axes.set_xlabel(f"{result['of']} ({result['of_unit']})")
+    axes.set_ylabel(f"force ({result['unit']})")
+    axes.legend(frameon=False)
+    plt.savefig(folder / f"{case.name}.png", dpi=120)
     plt.close()
 
 
