@@ -61,7 +61,9 @@ def missing_forces(
             found += _details(name, drive.force, box)
             if turns:
                 long = smooth(*box[name])
-                found.append(MissingForce(name, drive.force, long, what="pull"))
+                found.append(
+                    MissingForce(name, drive.force, long, what="pull.position_force")
+                )
         found += [
             MissingForce(name, drive.force, at),
             MissingForce(
