@@ -192,13 +192,15 @@ class _AtBest:
         O, B = self.root[:, :o], self.root[:, on] * D[on]
         free = np.linalg.qr(np.concatenate([B, FREE * np.eye(len(on))]))[0][: len(B)]
         rest = np.concatenate([O - free @ (free.T @ O), np.eye(o)])
-        of_own = np.linalg.inv(np.linalg.qr(rest, mode="r"))
+        of_own = np.linalg.solve(np.linalg.qr(rest, mode="r"), np.eye(o))
         Q, R = np.linalg.qr(np.concatenate([B, np.eye(len(on))]))
         onto = D[on, None] * np.linalg.solve(R, Q[: len(B)].T)
         mean, scale = np.zeros(k), np.zeros((k, k))
         mean[:o], mean[on] = self.own, onto @ (self.data - O @ self.own)
         scale[:o, :o], scale[on, :o] = of_own, -onto @ O @ of_own
-        scale[np.ix_(on, o + np.arange(len(on)))] = D[on, None] * np.linalg.inv(R)
+        scale[np.ix_(on, o + np.arange(len(on)))] = D[on, None] * np.linalg.solve(
+            R, np.eye(len(on))
+        )
         return Moments(mean, scale)
 
 
