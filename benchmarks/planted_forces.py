@@ -17,7 +17,9 @@ pendulum ``sin q``. A force ``f`` and ``f + b``, ``b`` in ``B``, with other para
 give the same trajectories: data determine the class ``f + span B`` and no member of it.
 With ``P`` the projection onto ``span B`` (least squares at the values of the range),
 ``f -> f - P f`` maps a class to one curve. So ``(I - P) f`` of the truth is compared
-with mean and covariance of ``(I - P) f`` of what was found.
+with mean and covariance of ``(I - P) f`` of what was found. A gain ``c`` multiplies all
+that arrives of an input ``u + h(u)``, so that the class is ``c (u + h) - u`` there: of
+both curves ``c`` is first chosen so that ``u + h`` has the slope one on the whole.
 """
 
 import argparse
@@ -210,9 +212,16 @@ def compared(
     def rest(f: np.ndarray) -> np.ndarray:
         return np.asarray(f - Q @ (Q.T @ f))
 
-    every = [np.interp(at, curve.at, column) for column in curve.root.T]
-    sd = np.linalg.norm(rest(np.stack(every, axis=1)), axis=1)
-    return rest(true), rest(np.interp(at, curve.at, curve.mean)), sd
+    mean = np.interp(at, curve.at, curve.mean)
+    root = np.stack([np.interp(at, curve.at, c) for c in curve.root.T], axis=1)
+    if curve.of == curve.where and curve.of_unit not in ("rad", "m"):
+        # A gain multiplies all that arrives of an input: the slope on the whole is one.
+        by = (at - at.mean()) / ((at - at.mean()) @ at)
+        gain, true_gain = by @ (at + mean), by @ (at + true)
+        root = (root - np.outer(at + mean, by @ root) / gain) / gain
+        mean, true = (at + mean) / gain - at, (at + true) / true_gain - at
+    sd = np.linalg.norm(rest(root), axis=1)
+    return rest(true), rest(mean), sd
 
 
 def values_between(seen: np.ndarray) -> Float[np.ndarray, " n"]:
