@@ -187,6 +187,11 @@ CHANGES: dict[str, Change] = {
         "[effects.x.stribeck]\nmean = 0.0\nsd = 1.0\nspeed = 0.2\n",
         machine,
     ),
+    "effects.*.*.points": (
+        "[effects.x.position_table]\npoints = [[-1.0, 0.0], [1.0, 0.0]]\n",
+        "[effects.x.position_table]\npoints = [[-1.0, 2.0], [1.0, -2.0]]\n",
+        machine,
+    ),
     "effects.*.*.smoothing": (
         "[effects.voltage.dead_zone]\nmean = 0.0\nsd = 1.0\n",
         "[effects.voltage.dead_zone]\nmean = 0.0\nsd = 1.0\nsmoothing = 0.2\n",

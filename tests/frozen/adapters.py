@@ -164,7 +164,7 @@ def gains(machine: Any, logs: Sequence[Any]) -> dict[str, float]:
     """What each effect of a library is worth, by one linearisation, nats."""
     _, places = cut(logs, machine, window=0.2)
     of = np.asarray([k for k, _ in places])
-    data = WindowData(machine, lambda m: cut(logs, m, window=0.2)[0], of)
+    data = WindowData(machine, lambda m: cut(logs, m, window=0.2)[0], of, of)
     scored = score_candidates(data, data.fit(), sy.candidates(machine, windows=True))
     names = {one.candidate.name: one.gain for one in scored}
     return {n.replace("viscous", "back_emf"): gain for n, gain in names.items()}

@@ -229,9 +229,9 @@ class Churning(CubicSpring):
 def test_a_new_law_is_a_candidate_with_its_unit_and_prior(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """One entry of `_FORCES` is enough, on machines with a mass matrix and without."""
-    more = *registry._FORCES, CubicSpring, Churning
-    monkeypatch.setattr(registry, "_FORCES", more)
+    """One entry of `FORCES` is enough, on machines with a mass matrix and without."""
+    more = *registry.FORCES, CubicSpring, Churning
+    monkeypatch.setattr(registry, "FORCES", more)
     ode = ODE(payload_arm.ode, *ABOUT)
     expected = {
         ("furuta", "theta"): ("N m/rad^3", "N m s^3/rad^4", 0.025, 10.0, 1.0),

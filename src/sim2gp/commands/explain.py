@@ -22,6 +22,7 @@ from sim2gp.commands.identification import Identification, project_of
 from sim2gp.commands.result import PROJECT, AbstractResult
 from sim2gp.data.logs import Budget, Log
 from sim2gp.errors import InputError, error
+from sim2gp.identification.missing_physics.curves import force_arrays
 from sim2gp.identification.missing_physics.data import (
     AbstractData,
     OneStepData,
@@ -32,9 +33,13 @@ from sim2gp.identification.missing_physics.explain import (
 )
 from sim2gp.identification.missing_physics.score import ScoredCandidate
 from sim2gp.identification.missing_physics.search import REFITS, FittedCandidate, refit
+from sim2gp.identification.missing_physics.shapes import addition_of
 from sim2gp.identification.missing_physics.words import (
     candidate_rows,
     candidate_table,
+    force_rows,
+    force_table,
+    forces_text,
     missing_physics_headline,
 )
 from sim2gp.identification.words import bound_warnings
@@ -47,6 +52,7 @@ from sim2gp.runs import Progress, load_run
 from sim2gp.runs.provenance import provenance
 from sim2gp.runs.workers import spread
 from sim2gp.systems.assemble import free_parts
+from sim2gp.systems.effects.registry import Candidate
 from sim2gp.systems.effects.registry import candidates as registered
 from sim2gp.types import in_float64
 
@@ -58,6 +64,7 @@ class MissingPhysics(AbstractResult):
     """What a simulator lacks: nothing, an effect of the library, or none of these."""
 
     winner: FittedCandidate | None = field(default=None)
+    curves: tuple[Candidate, ...] = field(default=())
 
     @property
     def answer(self) -> str:
@@ -78,9 +85,15 @@ class MissingPhysics(AbstractResult):
     def add_to(self, file: Path) -> "MissingPhysics":
         """Write the winner into a project file; the summary names the file.
 
-        The file is left alone where the answer names no effect.
+        Where no effect is the answer, the forces that were found are written: those
+        with a name as effects, the others as tables. The file is left alone where there
+        are none.
         """
         notes = list(self.summary["warnings"])
+        if self.winner is None and self.curves:
+            for curve in self.curves:
+                amend(file, curve, "added by sim2gp explain: a force that was found")
+            return self.with_entries(added=str(file))
         if self.winner is None:
             notes.append(f"nothing was added to {file}: {self.answer}")
             return self.with_entries(warnings=notes)
@@ -107,18 +120,20 @@ def explain(
     data, fits, project = _data(run, logs), None, run.project
     if workers > 1 and logs and project is not None and project.can_be_loaded:
         fits = partial(_fits_in_processes, project.path, logs, workers)
-    with (progress or Progress()).task("explain", 2 + REFITS) as task:
+    with (progress or Progress()).task("explain", 3 + REFITS) as task:
         found = search_missing(data, fits=fits, on_step=task.advance)
-    candidates = candidate_rows(found)
+    candidates, forces = candidate_rows(found), force_rows(found, data.system)
+    none = found.answer == "none of these"
     gains = np.asarray([s.gain for s in found.search.scored])
-    names = np.asarray([s.candidate.name for s in found.search.scored])
+    scored = np.asarray([s.candidate.name for s in found.search.scored])
     summary: dict[str, Any] = {
         "command": "explain",
         "title": f"{run.name}: what its simulator lacks",
-        "headline": missing_physics_headline(found),
+        "headline": missing_physics_headline(found) + forces_text(forces) * none,
         "answer": found.answer,
         "best": found.effect,
-        "none_of_these": found.answer == "none of these",
+        "none_of_these": none,
+        "forces": forces,
         "threshold": found.search.threshold,
         "candidates": candidates,
         "misfit": None if found.best is None else found.best.as_dict(),
@@ -129,12 +144,15 @@ def explain(
             *bound_warnings(run.summary.get("parameters") or {}),
             *(f"no fit with {name}" for name in found.search.failed),
         ],
-        "tables": [candidate_table(found, candidates)],
+        "tables": [*force_table(forces), candidate_table(found, candidates)],
     }
+    names = found.names(data.system)
+    curves = [addition_of(c, names[c.name]) for c in found.drawn if c.name in names]
     return MissingPhysics(
         summary | provenance(started),
-        {"explain/gain": gains, "explain/name": names},
+        {"explain/gain": gains, "explain/name": scored} | force_arrays(found.drawn),
         winner=found.search.best if found.effect else None,
+        curves=tuple(curves),
     )
 
 
@@ -216,7 +234,8 @@ def window_data(project: Project, logs: Sequence[Log], seed: int = 0) -> WindowD
         return cut_logs(dataclasses.replace(project, system=system), logs)[0]
 
     robust = project.spec.likelihood.robust
-    return WindowData(project.system, cut, cluster.ravel(), robust=robust, seed=seed)
+    of = cluster.ravel(), log
+    return WindowData(project.system, cut, *of, robust=robust, seed=seed)
 
 
 def _flown(run: Demonstration) -> OneStepData:

@@ -11,11 +11,15 @@ from jaxtyping import Array, Float
 from sim2gp.data.transitions import Transitions
 from sim2gp.inference import linearized
 from sim2gp.inference.arrowhead import Blocks, Noise
+from sim2gp.inference.estimate import Estimate
+from sim2gp.inference.groups import Start, estimate_groups
 from sim2gp.inference.least_squares import factor
 from sim2gp.inference.likelihood import AbstractLikelihood
+from sim2gp.inference.prior import ParameterPrior
 from sim2gp.systems.base import AbstractSystem
-from sim2gp.types import in_float64
+from sim2gp.types import Key, in_float64
 
+ROWS = 64  # that judge draws of parameters
 FLOOR = 1e-3  # prior guess of the noise, relative to each channel's rms change
 
 
@@ -84,6 +88,20 @@ class OneStepLikelihood(AbstractLikelihood):
         """The states' own change in a step."""
         d = self.floor.size
         return Noise(_rms_change(self.data, d), jnp.ones(1))
+
+
+@eqx.filter_jit
+def estimate_forces(
+    system: AbstractSystem,
+    data: Transitions,
+    dt: float,
+    prior: ParameterPrior,
+    last: Start,
+    key: Key,
+) -> Estimate:
+    """Of a machine whose forces are groups of parameters: `estimate_groups`."""
+    likelihood = OneStepLikelihood(system, data, dt)
+    return estimate_groups(likelihood, likelihood.thinned(ROWS), prior, last, key)
 
 
 def _rms_change(data: Transitions, d: int) -> Float[Array, " d"]:

@@ -16,6 +16,7 @@ from sim2gp.project.project import Project
 from sim2gp.project.replace import replace_project
 from sim2gp.project.schema import EFFECT_OPTIONS
 from sim2gp.systems import Candidate, Delay, Lag
+from sim2gp.systems.effects import tables
 
 _NOTE = "added by sim2gp"
 
@@ -23,6 +24,10 @@ _NOTE = "added by sim2gp"
 def addition(candidate: Candidate) -> tuple[tuple[str, ...], dict[str, Any]]:
     """The table that frees a candidate, and its entries (E160 for a lag)."""
     effect = candidate.effect
+    if isinstance(effect, tables.AbstractTable):
+        points = tomlkit.array()
+        points.extend([list(point) for point in effect.points])
+        return ("effects", effect.where, effect.what), {"points": points}
     if not isinstance(effect, Delay | Lag):
         entries: dict[str, Any] = {"mean": 0.0, "sd": effect.magnitude}
         for field in dataclasses.fields(effect):
@@ -75,7 +80,9 @@ def amend(path: Path, candidate: Candidate, note: str = _NOTE) -> None:
     text = amend_text(path.read_text(encoding="utf-8"), candidate, note)
 
     def freed(found: Project) -> None:
-        if candidate.name not in found.system.parameters.names:
+        known = found.system.parameters
+        fixed = isinstance(candidate.effect, tables.AbstractTable)
+        if candidate.name not in (dict(known.fixed) if fixed else known.names):
             raise error("did_not_become_free", name=candidate.name)
 
     try:

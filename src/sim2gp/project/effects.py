@@ -8,11 +8,12 @@ An effect that changes nothing of the machine's equations on its channel is an e
 """
 
 from collections.abc import Collection, Mapping
+from typing import Any
 
 from sim2gp.errors import InputError, error, nearest
 from sim2gp.inference.parameters import Parameter
-from sim2gp.project.priors import prior
-from sim2gp.project.schema import EFFECT_OPTIONS, EffectSpec
+from sim2gp.project.priors import prior, with_location
+from sim2gp.project.schema import EFFECT_OPTIONS, EffectSpec, PriorSpec
 from sim2gp.project.source import ProjectSource
 from sim2gp.project.validate import unknown
 from sim2gp.systems import AbstractPart, AbstractPlant, AbstractSystem, with_parts
@@ -23,6 +24,7 @@ from sim2gp.systems.effects.registry import (
     options_of,
     possible,
 )
+from sim2gp.systems.effects.tables import AbstractTable
 from sim2gp.systems.effects.units import joints_of
 from sim2gp.systems.machine import plant_of
 
@@ -41,10 +43,27 @@ def with_effects(
             if not possible(plant, what, where):
                 raise _impossible_effect(plant, what, where, line)
             options = effect_options(what, said, options_of(what), line)
-            part = named(what, where, 1.0, **options)
+            part = _made(what, where, options, line)
             parts.append(part)
-            stated[part.name] = prior(said, part.parameter(plant), line, own=0.0)
+            base, table = part.parameter(plant), isinstance(part, AbstractTable)
+            if table and isinstance(said, EffectSpec) and not _states_prior(said):
+                said = 1.0
+            own = 1.0 if table else 0.0
+            stated[part.name] = prior(said, base, line, own=own)
     return with_parts(system, parts, stated)
+
+
+def _made(what: str, where: str, options: Mapping[str, Any], line: str) -> AbstractPart:
+    """The effect, at a magnitude of one (E148 for points that are no table)."""
+    try:
+        return named(what, where, 1.0, **options)
+    except InputError as refused:
+        raise with_location(refused, line) from refused
+
+
+def _states_prior(said: EffectSpec) -> bool:
+    """Whether the table of an effect states more than options."""
+    return any(getattr(said, name) is not None for name in PriorSpec.model_fields)
 
 
 def _impossible_effect(
@@ -82,11 +101,13 @@ def _impossible_effect(
 
 def effect_options(
     what: str, said: EffectSpec | float, known: Collection[str], line: str
-) -> dict[str, float]:
+) -> dict[str, Any]:
     """The options of an effect next to its magnitude; E160 for one that it lacks."""
     stated = () if isinstance(said, float) else EFFECT_OPTIONS
     given = {name: getattr(said, name) for name in stated}
     options = {name: value for name, value in given.items() if value is not None}
+    if "points" in options:
+        options["points"] = tuple((float(z), float(f)) for z, f in options["points"])
     for name in options:
         if name not in known:
             raise unknown(f"option of {what}", name, known, line)

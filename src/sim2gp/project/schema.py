@@ -77,6 +77,10 @@ class EffectSpec(PriorSpec):
     """Velocity at which Stribeck friction falls."""
     smoothing: Positive | None = None
     """Width of the edge of a dead zone (the input's unit)."""
+    points: list[Pair] | None = None
+    """Of a table: pairs of the variable and of the force there, by the variable.
+    Between them the force is linear, beyond them constant. Its magnitude is 1 unless
+    stated."""
 
 
 #: What an effect has next to the prior of its magnitude.

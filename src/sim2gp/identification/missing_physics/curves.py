@@ -12,13 +12,14 @@ from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.effects.forces import AbstractUnknownFunction, MissingForce
 from sim2gp.systems.machine import Machine, plant_of
 
-POINTS = 61
+POINTS = 201
 
 
 class Curve(NamedTuple):
     """What acts on ``where`` as a function of the channel ``of``: mean and sd.
 
-    ``kinds`` are the functions that it is the sum of.
+    ``kinds`` are the functions that it is the sum of. ``root`` is a root of the
+    covariance of its values.
     """
 
     where: str
@@ -28,7 +29,12 @@ class Curve(NamedTuple):
     kinds: tuple[str, ...]
     at: Float[np.ndarray, " n"]
     mean: Float[np.ndarray, " n"]
-    sd: Float[np.ndarray, " n"]
+    root: Float[np.ndarray, "n k"]
+
+    @property
+    def sd(self) -> Float[np.ndarray, " n"]:
+        """The sd of each of its values."""
+        return np.asarray(np.linalg.norm(self.root, axis=1))
 
     def entry(self) -> dict[str, Any]:
         """What a summary says of it: where, of what, how large where it is clearest."""
@@ -73,10 +79,10 @@ def curves_of(
         Phi = np.concatenate([each for each, _ in features], axis=1)
         places = np.concatenate([each for _, each in features])
         mean = Phi @ np.asarray(virtual.mean)[places]
-        sd = np.linalg.norm(Phi @ np.asarray(virtual.scale)[places], axis=1)
+        root = Phi @ np.asarray(virtual.scale)[places]
         kinds = tuple(f.what for f in own)
         about = own[0].unit(plant), units[of], kinds
-        found.append(Curve(where, of, *about, at, mean, sd))
+        found.append(Curve(where, of, *about, at, mean, root))
     return tuple(found)
 
 

@@ -162,7 +162,8 @@ class OneStepData(AbstractData):
 class WindowData(AbstractData):
     """Windows of real logs; ``cut`` makes them for a machine (delays reach back).
 
-    ``cluster`` says which windows may share an error, such as those of one second.
+    ``cluster`` says which windows may share an error, such as those of one second,
+    ``recording`` which are of one recording.
     """
 
     def __init__(
@@ -170,12 +171,14 @@ class WindowData(AbstractData):
         system: AbstractSystem,
         cut: Callable[[AbstractSystem], Windows],
         cluster: Int[np.ndarray, " W"],
+        recording: Int[np.ndarray, " W"],
         *,
         robust: bool = False,
         seed: int = 0,
     ) -> None:
         self.system, self.period, self.seed = system, 0.0, seed
         self.cut, self.robust, self.cluster = cut, robust, cluster
+        self.recording = recording
         self.windows = cut(system)
         self.freedom = fit.FREEDOM if robust else np.inf
 

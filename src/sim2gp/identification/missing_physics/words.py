@@ -11,6 +11,9 @@ from sim2gp.identification.missing_physics.search import (
     ScoredCandidate,
 )
 from sim2gp.identification.words import digits, join_names, quantity
+from sim2gp.systems.base import AbstractSystem
+
+NO_NAME = "none of these"
 
 
 def candidate_rows(found: Explanation) -> list[dict[str, Any]]:
@@ -109,6 +112,66 @@ def missing_physics_headline(found: Explanation) -> str:
         names = join_names([r.scored.candidate.name for r in found.search.tied])
         text += f" These data cannot separate it from {names}."
     return text
+
+
+def force_rows(found: Explanation, system: AbstractSystem) -> dict[str, dict[str, Any]]:
+    """The entry "forces" of a summary: each force that is drawn, with its name."""
+    names, best = found.names(system), found.search.best
+    rows: dict[str, dict[str, Any]] = {}
+    for curve in found.drawn:
+        name = names.get(curve.name)
+        said = NO_NAME if name is None else name.text
+        if found.effect and best is not None:
+            said = _size_of(best)
+        probability = found.forces.probability(curve)
+        rows[curve.name] = curve.entry() | {"name": said, "probability": probability}
+    return rows
+
+
+def forces_text(forces: Mapping[str, Mapping[str, Any]]) -> str:
+    """One sentence of the forces that were found where no effect is the answer."""
+    if not forces:
+        return ""
+    each = [
+        f"on {x['where']} by {x['of']} "
+        f"({'of no known shape' if x['name'] == NO_NAME else x['name']})"
+        for x in forces.values()
+    ]
+    return f" Forces were found {join_names(each)}."
+
+
+def force_table(forces: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Forces where they are clearest, and their names."""
+    if not forces:
+        return []
+    rows = [
+        [
+            x["where"],
+            x["of"],
+            f"{digits(x['mean'], 2)} ± {quantity(_two(x['sd']), x['unit'])}",
+            x["name"],
+        ]
+        for x in forces.values()
+    ]
+    note = (
+        "The size is where the force is clearest. A name is a shape of the library "
+        "that lies within the 95 % band of the curve."
+    )
+    return [
+        {
+            "title": "Forces, as curves",
+            "columns": ["on", "by", "size", "name"],
+            "rows": rows,
+            "note": note,
+        }
+    ]
+
+
+def _size_of(best: FittedCandidate) -> str:
+    candidate = best.scored.candidate
+    unit = best.scored.system.parameters[candidate.name].unit
+    size = f"{quantity(best.value, '')} ± {quantity(_two(best.sd), unit)}"
+    return f"{candidate.effect.meaning} of {size}"
 
 
 def _describe_candidate(best: FittedCandidate) -> str:

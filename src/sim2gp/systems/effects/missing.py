@@ -25,6 +25,9 @@ WIDTH = 0.2
 DRY, CHANGE, GAP = 0.1, 0.1, 0.2  # prior sd, shares of the drive and of an input
 GAP_WIDTH = 0.12  # median of a dead zone's width, share of an input
 INPUT_REACH, INPUT_LENGTH = 1.2, 0.3  # half-widths of an input
+#: Of details: how many, and half-widths of where a machine moves.
+DETAILS, DETAIL_REACH, DETAIL = 16, 1.2, 0.15
+DETAIL_SIZE = 0.3  # of the smooth force
 
 
 def missing_forces(
@@ -32,12 +35,14 @@ def missing_forces(
     box: Mapping[str, tuple[float, float]],
     *,
     fine: bool = False,
+    closely: bool = False,
 ) -> list[AbstractUnknownFunction]:
     """Of each joint a force by position, by velocity and of dry friction; of each input
     a smooth change and a dead zone.
 
     ``box`` is where the machine moves, by channel. With ``fine``, of each hinge the
-    cogging of a motor as well.
+    cogging of a motor as well. ``closely``, each function by position and by velocity
+    has details too, and a joint that turns round is also pulled to where it started.
     """
     plant = plant_of(system)
     # An engine holds a force for its own step, which must not reverse the joint.
@@ -53,6 +58,13 @@ def missing_forces(
             found.append(
                 MissingForce(name, DRY * drive.force, ripple(RIPPLES), what="ripple")
             )
+        if closely:
+            found += _details(name, drive.force, box)
+            if turns:
+                long = smooth(*box[name])
+                found.append(
+                    MissingForce(name, drive.force, long, what="pull.position_force")
+                )
         found += [
             MissingForce(name, drive.force, at),
             MissingForce(
@@ -71,3 +83,23 @@ def missing_forces(
             MissingInput(name, GAP * half, Gap(GAP_WIDTH * half), what="dead_zone"),
         ]
     return found
+
+
+def _details(
+    name: str, force: float, box: Mapping[str, tuple[float, float]]
+) -> list[AbstractUnknownFunction]:
+    """Of a joint, by position and by velocity: a spring's play, a detent, a cusp.
+
+    They are of the kind of the smooth force: where that is on, its details may be.
+    """
+    size = DETAIL_SIZE * force
+    by_position, by_speed = (
+        smooth(*box[of], count=DETAILS, reach=DETAIL_REACH, length=DETAIL)
+        for of in (name, f"{name}.velocity")
+    )
+    return [
+        MissingForce(name, size, by_position, what="detail.position_force"),
+        MissingForce(
+            name, size, by_speed, of_velocity=True, what="detail.velocity_force"
+        ),
+    ]

@@ -9,7 +9,7 @@ prior around nothing, a delay, or the time constant of a low pass. Priors are a 
 what the machine itself does, so that no candidate is favoured by its unit: a force by
 the largest of its motor or weight, a stiffness and a drag by that force at a typical
 position and speed, a dead zone by the input's range. A force on a joint that is listed
-in `_FORCES` is a candidate of every machine: its powers give its unit and its prior.
+in `FORCES` is a candidate of every machine: its powers give its unit and its prior.
 """
 
 import dataclasses
@@ -41,6 +41,7 @@ from sim2gp.systems.effects.inputs import DeadZone
 from sim2gp.systems.effects.loads import BaseTilt, BaseTiltSide, Payload, RailTilt
 from sim2gp.systems.effects.scales import drives
 from sim2gp.systems.effects.springs import Spring
+from sim2gp.systems.effects.tables import InputTable, PositionTable, VelocityTable
 from sim2gp.systems.effects.units import joint_of
 from sim2gp.systems.machine import Machine, plant_of
 from sim2gp.systems.mechanism import AbstractMechanism
@@ -51,19 +52,19 @@ from sim2gp.systems.plants.two_link import TwoLink, UniformRodArm
 from sim2gp.systems.sensors import EncoderOffset
 
 #: On every joint. Each of these is a candidate too: `_force` gives it a prior.
-_FORCES: tuple[type[AbstractJointForce], ...] = (
+FORCES: tuple[type[AbstractJointForce], ...] = (
     Coulomb,
     Stribeck,
     Spring,
     Drag,
     Viscous,
 )
-_JOINT: tuple[Any, ...] = *_FORCES, EncoderOffset
+_JOINT: tuple[Any, ...] = (*FORCES, EncoderOffset, PositionTable, VelocityTable)
 #: Every part by what it acts on; `possible` says which machines can have it.
 REGISTRY: dict[str, tuple[Any, ...]] = {
     "hinge": (*_JOINT, BaseTilt, BaseTiltSide, Payload, PoleGeometry, RodInertia),
     "slide": (*_JOINT, RailFriction, RailTilt),
-    "input": (DeadZone, Gain, Offset, Delay, Lag),
+    "input": (DeadZone, InputTable, Gain, Offset, Delay, Lag),
 }
 #: Names in project files that are no longer a part's own.
 ALIASES: dict[str, Any] = {"back_emf": Viscous}
@@ -81,7 +82,7 @@ OFFSET = 0.05  # rad, prior sd of a tilt or of an encoder's zero
 LONGEST = 0.04  # s, of a delay or a time constant
 
 
-def named(what: str, where: str, magnitude: float, **options: float) -> AbstractPart:
+def named(what: str, where: str, magnitude: float, **options: Any) -> AbstractPart:
     """An effect by its name in a project file; `KeyError` for an unknown one."""
     if what in ALIASES:
         made: AbstractPart = ALIASES[what](where, magnitude, what=what, **options)
@@ -240,7 +241,7 @@ def _force(kind: type[AbstractJointForce], joint: _Joint) -> Candidate:
 
 def _other_forces(joint: _Joint) -> list[Candidate]:
     """All forces but dry friction, which comes first."""
-    return [_force(kind, joint) for kind in _FORCES if kind is not Coulomb]
+    return [_force(kind, joint) for kind in FORCES if kind is not Coulomb]
 
 
 def _of_joint(joint: _Joint) -> list[Candidate]:

@@ -1,0 +1,96 @@
+"""Forces of one-step data: their sizes against closed forms, and planted ones."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import planted_forces as study
+from sim2gp.data.one_step import OneStepLikelihood
+from sim2gp.data.transitions import Transitions
+from sim2gp.identification.missing_physics.curves import Curve
+from sim2gp.identification.missing_physics.forces import (
+    FoundForces,
+    _with_free_sizes,
+    find_forces,
+)
+from sim2gp.inference.estimate import estimate
+from sim2gp.inference.parameters import Parameter, Parameters
+from sim2gp.inference.prior import ParameterPrior
+from sim2gp.systems import ODE, Channel
+
+COUNT, SD = 12, 0.02
+SHAPE = np.random.default_rng(0).normal(size=(400, COUNT)) / 4.0
+LARGE = 1.0  # one weight of all; the others are zero
+MACHINES = Parameters(
+    (
+        Parameter("mass", "kg", "", "log", 0.0, np.inf, 0.0, 0.4),
+        *(Parameter(f"w{k}", "N", "", "identity", group="w") for k in range(COUNT)),
+    )
+)
+
+
+def pushed() -> OneStepLikelihood:
+    """A mass that twelve weights push, of which one is there.
+
+    Weights over the mass are what data determine; the mass has its prior.
+    """
+    rng = np.random.default_rng(1)
+    after = SHAPE[:, 0] * LARGE + SD * rng.normal(size=400)
+
+    def slope(k, s, a):
+        weights = jnp.stack([k[f"w{i}"] for i in range(COUNT)])
+        return jnp.stack([(a @ weights) / k["mass"]])
+
+    states = (Channel("v", "m/s"),)
+    actions = tuple(Channel(f"u{i}", "N", low=-5.0, high=5.0) for i in range(COUNT))
+    system = ODE(slope, MACHINES, states, actions, max_substep=1.0)
+    rows = Transitions.of(np.zeros((400, 1)), SHAPE, after[:, None])
+    return OneStepLikelihood(system, jax.tree.map(jnp.asarray, rows), 1.0)
+
+
+@pytest.mark.usefixtures("float64")
+def test_free_sizes_are_not_drawn_to_zero_with_the_mass() -> None:
+    """Data tell force over mass. The mass keeps its prior where sizes are free."""
+    likelihood = pushed()
+    about = ParameterPrior(MACHINES.prior(), MACHINES, jnp.ones(1))
+    zero = jnp.zeros((1, COUNT + 1))
+    best = jax.jit(lambda z: estimate(likelihood, about, starts=z))(zero)
+    scale = np.diag(best.prior.scale)[1:2]
+    assert 0.1 < float(scale[0]) < 0.5  # of twelve weights one is there
+    drawn = float(best.posterior.mean[0])
+    wide = _with_free_sizes(likelihood, best, about.scaled(jnp.asarray(scale / 0.1)))
+    mass = wide.posterior.mean[0], wide.posterior.sd()[0]
+    # log mass: prior 0 +- 0.4, drawn by twelve of its variances before.
+    assert drawn < -0.4
+    assert float(mass[0]) == pytest.approx(0.0, abs=0.05)
+    assert float(mass[1]) == pytest.approx(0.4, rel=0.05)
+    ratio = float(wide.posterior.mean[1]) / np.exp(float(mass[0]))
+    assert ratio == pytest.approx(LARGE, abs=0.02)
+    # The band of the weight has the mass's.
+    assert float(wide.posterior.sd()[1]) == pytest.approx(0.4, rel=0.1)
+
+
+def test_a_force_is_as_probable_as_the_functions_it_is_the_sum_of() -> None:
+    def curve(where: str, mean: float) -> Curve:
+        at, root = np.linspace(-1.0, 1.0, 21), 0.01 * np.eye(21)
+        kinds = ("position_force", "ripple")
+        return Curve(where, where, "N m", "rad", kinds, at, mean * np.sin(9 * at), root)
+
+    both = curve("q1", 1.0), curve("q2", 1.0), curve("q3", 0.0)
+    one = FoundForces({"": 0.1, "q1.ripple": 0.8, "q2.ripple": 0.2}, both)
+    assert [c.name for c in one.found] == ["q1 by q1"]
+    of_all = FoundForces({"": 0.1, "ripple": 0.8, "dry_friction": 0.9}, both)
+    assert [c.name for c in of_all.found] == ["q1 by q1", "q2 by q2"]
+    assert of_all.probability(both[0]) == 0.8
+
+
+@pytest.mark.nightly
+def test_a_detent_is_drawn_and_nothing_is_not() -> None:
+    """The study in small: a detent on a cart's rail, and a cart without one."""
+    found = study.cell(study.Case("cartpole", "notch", 4))
+    assert found["reported"] == ["x by x"]
+    assert found["inside"] > 0.9
+    assert found["error"] < 0.2 * found["size"]
+    data, _, _ = study.data_for(study.Case("cartpole", study.NOTHING, 4))
+    assert find_forces(data, data.fit()).found == ()
