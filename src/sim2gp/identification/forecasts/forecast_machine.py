@@ -92,7 +92,7 @@ def stored_forecast_machine(
         raise ValueError("forces of another machine")
     if min(scales.values(), default=0.0) <= 0.0:
         raise ValueError("forces without a size")
-    wider = with_forces(system, ranges, scales)
+    wider = _with_fixed_scales(free_parts(system, _of_kinds(system, ranges, scales)))
     p = len(wider.parameters)
     found = [arrays.get(f"forecast/{name}") for name in ("mean", "scale")]
     for x, shape in zip(found, ((p,), (p, p)), strict=True):
@@ -116,18 +116,21 @@ def fit_forecast_machine(
     ``recording`` numbers the windows' recordings; windows without measurements are not
     used. Without forces where none helps, or where a fit with them fails.
     """
-    box = box_of(system, windows)
+    box, plain = box_of(system, windows), ForecastMachine(system, fitted.posterior)
     scales = _helpful(system, windows, fitted, recording, box)
-    plain = ForecastMachine(system, fitted.posterior)
     if not scales:
         return plain
-    wider = with_forces(system, box, scales)
-    _, start, _ = forces_at_zero(system, fitted, _scaled(system, box, scales))
+    free, start, _ = forces_at_zero(system, fitted, _of_kinds(system, box, scales))
+    about, each = free.parameters.prior(), np.ones(len(free.parameters))
+    for kind, places in kinds_of(free.parameters.groups).items():
+        each[places] = scales[kind]
+    wider = _with_fixed_scales(free)
     try:
         found = fit_windows(
             wider,
             windows,
             key=jax.random.key(0),  # of starts that it does not draw
+            prior=Gaussian(about.mean, about.scale * each),
             robust=robust,
             starts=1,
             warm_start=start,
@@ -137,12 +140,10 @@ def fit_forecast_machine(
     return ForecastMachine(wider, found.posterior, scales, box)
 
 
-def with_forces(
-    system: AbstractSystem, box: Mapping[str, Range], scales: Mapping[str, float]
-) -> AbstractSystem:
-    """The machine with forces of some kinds, whose scales no fit changes."""
-    wider = as_machine(free_parts(system, _scaled(system, box, scales)))
-    return replace(wider, parameters=wider.parameters.with_fixed_scales())
+def _with_fixed_scales(system: AbstractSystem) -> AbstractSystem:
+    """The machine with forces whose scales no fit changes."""
+    machine = as_machine(system)
+    return replace(machine, parameters=machine.parameters.with_fixed_scales())
 
 
 def forces_sentence(kinds: Iterable[str]) -> str:
@@ -202,12 +203,8 @@ def _finite(x: Any) -> bool:
     return values.dtype.kind in "fiu" and bool(np.isfinite(values).all())
 
 
-def _scaled(
-    system: AbstractSystem, box: Mapping[str, Range], scales: Mapping[str, float]
+def _of_kinds(
+    system: AbstractSystem, box: Mapping[str, Range], kinds: Iterable[str]
 ) -> list[AbstractUnknownFunction]:
-    """Forces of these kinds with this share of their prior sd."""
-    return [
-        replace(f, magnitude=scales[f.what] * f.magnitude)
-        for f in forces_of(system, box)
-        if f.what in scales
-    ]
+    """The forces of these kinds."""
+    return [f for f in forces_of(system, box) if f.what in set(kinds)]

@@ -25,7 +25,7 @@ from scipy.special import stdtr
 LEVEL = 0.05
 WORTH = 0.01  # of the squared error: less is not worth a force
 SCALES = tuple(10.0 ** (-0.5 * k) for k in range(6))
-FEW, PARTS = 4, 6  # fewer recordings are cut, to so many parts in all or more
+FEW, PARTS = 4, 10  # fewer recordings are cut, to so many parts in all or more
 
 Places = Int[np.ndarray, " _"]
 #: Rows ``[A r]`` of one recording, or a triangular factor of them.
@@ -60,11 +60,8 @@ def helpful_kinds(
     found: dict[str, float] = {}
     if len(rows) < 2:
         return found
-    parts = [np.linalg.qr(x, mode="r") for x in rows]
-    others = [
-        np.linalg.qr(np.concatenate(parts[:k] + parts[k + 1 :]), mode="r")
-        for k in range(len(parts))
-    ]
+    parts = [_factor([x]) for x in rows]
+    others = [_factor(parts[:k] + parts[k + 1 :]) for k in range(len(parts))]
 
     def misfit(scales: Mapping[str, float]) -> Float[np.ndarray, " b"]:
         places = np.concatenate([own, *(kinds[kind] for kind in scales)])
@@ -87,6 +84,11 @@ def helpful_kinds(
         kind = max(best, key=lambda k: float(np.mean(1.0 - best[k][1] / now)))
         found[kind], now = best[kind]
     return found
+
+
+def _factor(rows: Sequence[Rows]) -> Rows:
+    """The triangular factor of rows together."""
+    return np.asarray(np.linalg.qr(np.concatenate(rows), mode="r"))
 
 
 def _left_out(
