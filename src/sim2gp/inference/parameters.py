@@ -245,11 +245,6 @@ class Parameters(eqx.Module):
         free = tuple(p for p in self.free if not p.group)
         return dataclasses.replace(self, free=free)
 
-    def with_fixed_scales(self) -> "Parameters":
-        """The table whose functions have the prior sd that is written, in every fit."""
-        free = tuple(dataclasses.replace(p, group="") for p in self.free)
-        return dataclasses.replace(self, free=free)
-
     def __getitem__(self, name: str) -> Parameter:
         return self.free[self.names.index(name)]
 

@@ -26,6 +26,7 @@ from sim2gp.identification.missing_physics.at_zero import (
     kinds_of,
 )
 from sim2gp.identification.missing_physics.held_out_gain import (
+    LeaveOneOut,
     helpful_kinds,
     recordings_or_parts,
 )
@@ -33,6 +34,7 @@ from sim2gp.identification.missing_physics.reach import Range, box_of
 from sim2gp.identification.words import digits, join_names
 from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.prior import ParameterPrior
 from sim2gp.systems.assemble import free_parts
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.effects.forces import AbstractUnknownFunction
@@ -83,9 +85,10 @@ def stored_forecast_machine(
         raise ValueError("forces without scales or a box")
     plant = plant_of(system)
     channels = {c.name for c in (*plant.physical_states, *plant.actions)}
-    numbers = [x for ends in box.values() for x in np.ravel(ends)]
-    if set(box) != channels or not _finite([*scales.values(), *numbers]):
+    if set(box) != channels or any(np.shape(x) != (2,) for x in box.values()):
         raise ValueError("forces of other channels")
+    if not all(_finite(x) for x in (*box.values(), *scales.values())):
+        raise ValueError("forces that are no numbers")
     ranges = {name: (float(low), float(high)) for name, (low, high) in box.items()}
     known = {f.what for f in forces_of(system, ranges)}
     if any(low >= high for low, high in ranges.values()) or not set(scales) <= known:
@@ -121,16 +124,16 @@ def fit_forecast_machine(
     if not scales:
         return plain
     free, start, _ = forces_at_zero(system, fitted, _of_kinds(system, box, scales))
-    about, each = free.parameters.prior(), np.ones(len(free.parameters))
-    for kind, places in kinds_of(free.parameters.groups).items():
-        each[places] = scales[kind]
+    table = free.parameters
+    each = np.asarray([scales[name.rsplit(".", 1)[-1]] for name in table.groups])
+    prior = ParameterPrior(table.prior(), table, each).as_gaussian()
     wider = _with_fixed_scales(free)
     try:
         found = fit_windows(
             wider,
             windows,
             key=jax.random.key(0),  # of starts that it does not draw
-            prior=Gaussian(about.mean, about.scale * each),
+            prior=prior,
             robust=robust,
             starts=1,
             warm_start=start,
@@ -143,7 +146,9 @@ def fit_forecast_machine(
 def _with_fixed_scales(system: AbstractSystem) -> AbstractSystem:
     """The machine with forces whose scales no fit changes."""
     machine = as_machine(system)
-    return replace(machine, parameters=machine.parameters.with_fixed_scales())
+    table = machine.parameters
+    free = tuple(replace(p, group="") for p in table.free)
+    return replace(machine, parameters=replace(table, free=free))
 
 
 def forces_sentence(kinds: Iterable[str]) -> str:
@@ -194,7 +199,8 @@ def _helpful(
     rows = without_starts(rows, windows)
     each = [rows[part == k].reshape(-1, rows.shape[-1]) for k in np.unique(part)]
     at = np.asarray(whole.prior.whitened(whole.posterior.mean))[own]
-    return helpful_kinds(each, own, kinds_of(wider.parameters.groups), at)
+    kinds = kinds_of(wider.parameters.groups)
+    return helpful_kinds(LeaveOneOut(each, own, at, kinds))
 
 
 def _finite(x: Any) -> bool:

@@ -17,6 +17,8 @@ them less is to take a smaller scale, of which there are enough.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -47,37 +49,50 @@ def recordings_or_parts(recording: Int[np.ndarray, " W"]) -> Int[np.ndarray, " W
     return found
 
 
-def helpful_kinds(
-    rows: Sequence[Rows],
-    own: Places,
-    kinds: Mapping[str, Places],
-    at: Float[np.ndarray, " p"],
-) -> dict[str, float]:
-    """The scale of each kind that lowers the error on recordings that are left out.
+@dataclass(frozen=True)
+class LeaveOneOut:
+    """Fits to all recordings but one, and what they predict of that one.
 
-    ``own`` are places of the machine's parameters, ``at`` their values at the fit.
+    ``rows`` are those of each recording, ``own`` places of the machine's parameters,
+    ``at`` their values ``z_0`` at the fit, ``kinds`` places of the forces.
     """
-    found: dict[str, float] = {}
-    if len(rows) < 2:
-        return found
-    parts = [_factor([x]) for x in rows]
-    others = [_factor(parts[:k] + parts[k + 1 :]) for k in range(len(parts))]
 
-    def misfit(scales: Mapping[str, float]) -> Float[np.ndarray, " b"]:
-        places = np.concatenate([own, *(kinds[kind] for kind in scales)])
-        each = [np.ones(len(own)), *(np.full(len(kinds[k]), scales[k]) for k in scales)]
-        prior = np.concatenate([at, np.zeros(len(places) - len(own))])
-        D = np.concatenate(each)
-        pairs = zip(parts, others, strict=True)
+    rows: Sequence[Rows]
+    own: Places
+    at: Float[np.ndarray, " o"]
+    kinds: Mapping[str, Places]
+
+    def misfit(self, scales: Mapping[str, float]) -> Float[np.ndarray, " b"]:
+        """``m_b`` with forces of these kinds at these scales, all others off."""
+        places = np.concatenate([self.own, *(self.kinds[kind] for kind in scales)])
+        each = [np.full(len(self.kinds[kind]), tau) for kind, tau in scales.items()]
+        D = np.concatenate([np.ones(len(self.own)), *each])
+        prior = np.append(self.at, np.zeros(len(D) - len(self.at)))
+        pairs = zip(self._parts, self._others, strict=True)
         return np.asarray([_left_out(x, rest, places, D, prior) for x, rest in pairs])
 
-    now = misfit(found)
-    while rest := [kind for kind in kinds if kind not in found]:
+    @cached_property
+    def _parts(self) -> list[Rows]:
+        return [_factor([x]) for x in self.rows]
+
+    @cached_property
+    def _others(self) -> list[Rows]:
+        x = self._parts
+        return [_factor(x[:k] + x[k + 1 :]) for k in range(len(x))]
+
+
+def helpful_kinds(data: LeaveOneOut) -> dict[str, float]:
+    """The scale of each kind that lowers the error on recordings that are left out."""
+    found: dict[str, float] = {}
+    if len(data.rows) < 2:
+        return found
+    now = data.misfit(found)
+    while rest := [kind for kind in data.kinds if kind not in found]:
         best = {}
         for kind in rest:
-            tried = {tau: misfit({**found, kind: tau}) for tau in SCALES}
+            tried = {tau: data.misfit({**found, kind: tau}) for tau in SCALES}
             tau = max(tried, key=lambda t: float(np.mean(1.0 - tried[t] / now)))
-            if _is_clear(1.0 - tried[tau] / now, LEVEL / len(kinds)):
+            if _is_clear(1.0 - tried[tau] / now, LEVEL / len(data.kinds)):
                 best[kind] = tau, tried[tau]
         if not best:
             break
