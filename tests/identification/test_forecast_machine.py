@@ -5,20 +5,25 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import interval_arms
+from descents import estimate_of
 from interval_arms import CONDITIONS
 from sim2gp.data.grid import Grid, evaluation_windows, steps_of
 from sim2gp.data.split_log import cut
+from sim2gp.errors import NotConverged
 from sim2gp.identification.fit import fit_windows
+from sim2gp.identification.forecasts import forecast_machine
 from sim2gp.identification.forecasts.forecast_machine import (
     ForecastMachine,
     fit_forecast_machine,
     stored_forecast_machine,
 )
 from sim2gp.identification.forecasts.prediction import forecast_grid, subset
+from sim2gp.inference.arrowhead import Noise
 from sim2gp.systems import UniformRodArm
 from sim2gp.types import in_float64
 
@@ -79,9 +84,45 @@ def test_missing_friction_is_part_of_forecasts(with_friction: Arm) -> None:
     assert all(0.008 < mean[f"{q}.dry_friction[1]"] < 0.03 for q in ("q1", "q2"))
 
 
-@pytest.mark.parametrize("condition", ["white", "ar80"])
-def test_nothing_is_added_where_nothing_is_missing(condition: str) -> None:
-    plain, machine, _ = arm(condition)
+@in_float64
+def test_scales_stay_as_chosen_and_a_fit_that_fails_is_not_used(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Each kind's prior sd has its scale, no group is left whose scale a fit learns."""
+    given = {}
+
+    def failed(system, windows, *, prior, warm_start, **how):
+        given.update(system=system, prior=prior, warm_start=warm_start)
+        raise NotConverged("E201", "no MAP")
+
+    scales = {"dry_friction": 0.1, "dead_zone": 0.3}
+    monkeypatch.setattr(forecast_machine, "_helpful", lambda *_: scales)
+    monkeypatch.setattr(forecast_machine, "fit_windows", failed)
+    system = UniformRodArm()
+    log = interval_arms.recordings(CONDITIONS["white"], 2, 0).log(0)
+    windows, _ = cut([log], system, window=0.2)
+    known, none = system.parameters.prior(), jnp.zeros(1)
+    fitted = estimate_of(known, known, Noise(none, none), none[None])
+    found = fit_forecast_machine(system, windows, fitted, np.zeros(len(windows), int))
+    assert found.system is system
+    assert found.scales == {}
+    table = given["system"].parameters
+    assert table.groups == {}
+    first = dict(zip(table.names, np.asarray(table.prior().sd()), strict=True))
+    sd = dict(zip(table.names, np.asarray(given["prior"].sd()), strict=True))
+    for name in table.names:
+        scale = scales.get(name.split(".")[-1].removesuffix("[1]"), 1.0)
+        assert sd[name] == pytest.approx(scale * first[name])
+    assert sum("dry_friction" in name for name in table.names) == 2
+    assert sum("dead_zone" in name for name in table.names) == 4  # two of them widths
+    own = [table.names.index(name) for name in system.parameters.names]
+    np.testing.assert_array_equal(
+        np.asarray(given["warm_start"].posterior.mean)[own], known.mean
+    )
+
+
+def test_nothing_is_added_where_nothing_is_missing() -> None:
+    plain, machine, _ = arm("ar80")
     assert machine.system is plain.system
     assert machine.scales == {}
     np.testing.assert_array_equal(machine.posterior.mean, plain.posterior.mean)

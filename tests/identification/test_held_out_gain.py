@@ -1,4 +1,4 @@
-"""Which forces predict recordings left out: against refits of all rows, and by level."""
+"""Forces that predict recordings left out: against refits, and by their level."""
 
 import numpy as np
 import pytest
