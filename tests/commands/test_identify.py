@@ -232,9 +232,9 @@ def stored_with_forces(run: Path, folder: Path, friction: float) -> Path:
     mean[:p], scale[:p, :p] = x["belief/mean"], x["belief/scale"]
     names = ("theta", "alpha", "theta.velocity", "alpha.velocity", "voltage")
     box = {name: [-1.0, 1.0] for name in names}
-    entry = {"scales": {"dry_friction": 1.0}, "box": box}
+    entries = {"forecast_forces": {"dry_friction": 1.0}, "forecast_box": box}
     with new_run(folder, "identify") as writer:
-        writer.write_summary(was.summary | {"forecast_forces": entry})
+        writer.write_summary(was.summary | entries)
         writer.write_arrays(
             "arrays.npz", x | {"forecast/mean": mean, "forecast/scale": scale}
         )

@@ -131,8 +131,8 @@ def test_nothing_is_added_where_nothing_is_missing() -> None:
 def test_a_run_forecasts_with_the_same_machine(with_friction: Arm) -> None:
     """Its summary is JSON, its arrays are by name."""
     plain, machine, tested = with_friction
-    entry = json.loads(json.dumps(machine.entry()))
-    again = stored_forecast_machine(plain.system, entry, machine.arrays())
+    summary = json.loads(json.dumps(machine.entries()))
+    again = stored_forecast_machine(plain.system, summary, machine.arrays())
     assert again.scales == machine.scales
     assert again.system.parameters == machine.system.parameters
     np.testing.assert_array_equal(errors(again, tested), errors(machine, tested))
@@ -140,21 +140,24 @@ def test_a_run_forecasts_with_the_same_machine(with_friction: Arm) -> None:
 
 def test_what_no_run_can_say_is_refused(with_friction: Arm) -> None:
     plain, machine, _ = with_friction
-    entry, arrays = machine.entry(), machine.arrays()
-    scales, box = entry["scales"], entry["box"]
+    entry, arrays = machine.entries(), machine.arrays()
+    scales, box = entry["forecast_forces"], entry["forecast_box"]
     p = len(machine.system.parameters)
     wrong = [
-        (entry | {"scales": {}}, arrays),
-        (entry | {"scales": ["dry_friction"]}, arrays),
-        (entry | {"scales": {"dry_friction": "1"}}, arrays),
-        (entry | {"scales": {"dry_friction": -1.0}}, arrays),
-        (entry | {"scales": {"dry_friction": float("nan")}}, arrays),
-        (entry | {"scales": {"no_such_kind": 1.0}}, arrays),
-        (entry | {"scales": scales | {"ripple": 1.0}}, arrays),  # of other arrays
-        (entry | {"box": {}}, arrays),
-        (entry | {"box": box | {"q1": [1.0, -1.0]}}, arrays),
-        (entry | {"box": box | {"q1": [1.0]}}, arrays),
-        (entry | {"box": box | {"q1": [0.0, float("inf")]}}, arrays),
+        (entry | {"forecast_forces": {}}, arrays),
+        (entry | {"forecast_forces": ["dry_friction"]}, arrays),
+        (entry | {"forecast_forces": {"dry_friction": "1"}}, arrays),
+        (entry | {"forecast_forces": {"dry_friction": -1.0}}, arrays),
+        (entry | {"forecast_forces": {"dry_friction": float("nan")}}, arrays),
+        (entry | {"forecast_forces": {"no_such_kind": 1.0}}, arrays),
+        (
+            entry | {"forecast_forces": scales | {"ripple": 1.0}},
+            arrays,
+        ),  # of other arrays
+        (entry | {"forecast_box": {}}, arrays),
+        (entry | {"forecast_box": box | {"q1": [1.0, -1.0]}}, arrays),
+        (entry | {"forecast_box": box | {"q1": [1.0]}}, arrays),
+        (entry | {"forecast_box": box | {"q1": [0.0, float("inf")]}}, arrays),
         (entry, {}),
         (entry, arrays | {"forecast/mean": np.zeros(p + 1)}),
         (entry, arrays | {"forecast/scale": np.full((p, p), np.nan)}),

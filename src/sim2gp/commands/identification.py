@@ -107,10 +107,9 @@ class Identification(AbstractResult):
 
         Forces are those that predicted recordings which were left out.
         """
-        entry = self.summary.get("forecast_forces")
-        if not entry:
+        if "forecast_forces" not in self.summary:
             return ForecastMachine(self.machine, self.plain)
-        return stored_forecast_machine(self.machine, entry, self.arrays)
+        return stored_forecast_machine(self.machine, self.summary, self.arrays)
 
     @property
     def noise(self) -> dict[str, float]:

@@ -22,6 +22,7 @@ from sim2gp.identification.forecasts.forecast import Band, fit_band
 from sim2gp.identification.forecasts.forecast_machine import (
     ForecastMachine,
     fit_forecast_machine,
+    forces_sentence,
 )
 from sim2gp.identification.forecasts.prediction import (
     Picture,
@@ -86,8 +87,8 @@ def identification_results(
     )
     arrays = _stored(table, known, honest.posterior, band, seed)
     arrays |= force_arrays(honest.found) | machine.arrays()
-    if machine.scales:
-        summary["forecast_forces"] = machine.entry()
+    summary |= machine.entries()
+    summary["trace_note"] += forces_sentence(machine.scales)
     other = (
         forecast_unseen(project, logs, windows, places, grid, known)
         if held_out

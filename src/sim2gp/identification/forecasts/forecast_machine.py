@@ -55,11 +55,12 @@ class ForecastMachine:
     scales: Mapping[str, float] = field(default_factory=dict)
     box: Mapping[str, Range] = field(default_factory=dict)
 
-    def entry(self) -> dict[str, Any]:
-        """What a summary says of its forces."""
+    def entries(self) -> dict[str, Any]:
+        """What a summary says of its forces; nothing if it has none."""
+        if not self.scales:
+            return {}
         box = {name: list(ends) for name, ends in self.box.items()}
-        text = forces_sentence(self.scales).strip()
-        return {"scales": dict(self.scales), "box": box, "text": text}
+        return {"forecast_forces": dict(self.scales), "forecast_box": box}
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Of a run: the posterior, where there are forces; else it is the run's own."""
@@ -74,13 +75,13 @@ class ForecastMachine:
 
 @in_float64
 def stored_forecast_machine(
-    system: AbstractSystem, entry: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
+    system: AbstractSystem, summary: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
 ) -> ForecastMachine:
-    """From what `ForecastMachine.entry` and `ForecastMachine.arrays` made.
+    """From what `ForecastMachine.entries` and `ForecastMachine.arrays` made.
 
     Raises ValueError, in few words, for what they cannot have made.
     """
-    scales, box = entry.get("scales"), entry.get("box")
+    scales, box = summary["forecast_forces"], summary.get("forecast_box")
     if not isinstance(scales, Mapping) or not isinstance(box, Mapping):
         raise ValueError("forces without scales or a box")
     plant = plant_of(system)
