@@ -126,7 +126,7 @@ def fit_fold(
 ) -> Fold:
     """The fit of what ``part`` may see, begun at ``warm_start``, judged by the rest.
 
-    Its forecasts have the missing forces that it has itself held out to choose.
+    Forecasts have the missing forces that predict recordings left out of the fit.
     Raises as `sim2gp.identification.fit.fit_windows` does.
     """
     rows = scored_rows(horizon)
