@@ -51,6 +51,7 @@ def test_the_last_recording_is_left_out_with_all_its_pieces() -> None:
     np.testing.assert_array_equal(part.known, grid.log == 0)
     np.testing.assert_array_equal(part.test, grid.log > 0)
     assert (part.recordings, part.words, part.until) == (1, "the log b", math.inf)
+    np.testing.assert_array_equal(part.recording, of > 0)  # pieces are one recording
 
 
 def test_the_end_of_the_only_recording_is_left_out() -> None:
@@ -85,6 +86,10 @@ def test_neither_fit_nor_band_sees_what_is_held_out(
         given["kept"] = kept
         return SimpleNamespace(posterior=None)
 
+    def machine(system: Any, kept: Any, found: Any, recording: Any, **_: Any) -> Any:
+        given["chosen_on"], given["recording"] = kept, recording
+        return SimpleNamespace(system=system, posterior=None, scales={})
+
     def forecasts(system: Any, posterior: Any, grid: Any, horizon: float) -> Any:
         rows = scored_rows(horizon)
         valid = np.asarray(grid.windows.mask)[:, rows]
@@ -97,7 +102,8 @@ def test_neither_fit_nor_band_sees_what_is_held_out(
         one = np.ones(2)
         return Band(np.ones(4), np.ones(1), one, np.array([0.0]), one[None], 1.0)
 
-    for name, stub in (("fit_windows", fitted), ("forecast_grid", forecasts)):
+    stubs = ("fit_windows", fitted), ("forecast_grid", forecasts)
+    for name, stub in (*stubs, ("fit_forecast_machine", machine)):
         monkeypatch.setattr(folds, name, stub)
     monkeypatch.setattr(folds, "fit_band", band)
     path = tmp_path / "cart.toml"
@@ -107,6 +113,8 @@ def test_neither_fit_nor_band_sees_what_is_held_out(
     found = fit_fold(
         load_project(path), windows, grid, part, 0.5, key=jax.random.key(0), starts=2
     )
+    assert given["chosen_on"] is given["kept"]  # forces as well
+    assert not given["recording"].any()
     assert len(given["kept"]) == len(windows)  # masked, not removed
     seen = np.asarray(given["kept"].mask).any(axis=(1, 2))
     np.testing.assert_array_equal(seen, part.train)

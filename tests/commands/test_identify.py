@@ -13,8 +13,10 @@ from sim2gp.commands.evaluate import evaluate
 from sim2gp.commands.identification import restore_identification
 from sim2gp.commands.longer import Longer
 from sim2gp.data.logs import Log
+from sim2gp.errors import InputError
 from sim2gp.project import load_project
 from sim2gp.runs import Progress, load_run
+from sim2gp.runs.store import new_run
 from sim2gp.systems import Furuta, Machine
 from simulated_logs import FREE, simulated
 
@@ -219,6 +221,46 @@ def test_evaluate_predicts_a_log_from_anywhere(
     assert summary["command_line"] == (
         f"sim2gp evaluate {run} --logs {log} --out {out} --quiet"
     )
+
+
+def stored_with_forces(run: Path, folder: Path, friction: float) -> Path:
+    """The run again, with dry friction on both joints in its forecasts."""
+    was = load_run(run)
+    table, x = restore_identification(run).machine.parameters, was.arrays
+    p, k = len(table), len(table) + 2
+    mean, scale = np.full(k, friction), np.zeros((k, k))
+    mean[:p], scale[:p, :p] = x["belief/mean"], x["belief/scale"]
+    names = ("theta", "alpha", "theta.velocity", "alpha.velocity", "voltage")
+    box = {name: [-1.0, 1.0] for name in names}
+    entries = {"forecast_forces": {"dry_friction": 1.0}, "forecast_box": box}
+    with new_run(folder, "identify") as writer:
+        writer.write_summary(was.summary | entries)
+        writer.write_arrays(
+            "arrays.npz", x | {"forecast/mean": mean, "forecast/scale": scale}
+        )
+        writer.write_text("project.toml", (run / "project.toml").read_text())
+    return folder
+
+
+def test_a_stored_run_is_evaluated_with_its_forces(
+    run: Path, folder: Path, tmp_path: Path
+) -> None:
+    """Of no size they change nothing, of a size they do; both are named."""
+    plain = _evaluated(run, folder, horizon=0.2)
+    assert "forecast_forces" not in plain.summary
+    for friction, same in ((0.0, True), (2e-3, False)):
+        again = stored_with_forces(run, tmp_path / f"run{friction}", friction)
+        found = _evaluated(again, folder, horizon=0.2)
+        assert found.summary["forecast_forces"] == {"dry_friction": 1.0}
+        assert "dry friction" in found.summary["headline"]
+        ratio = found.rmse["theta"] / plain.rmse["theta"]
+        assert (ratio == pytest.approx(1.0, rel=1e-9)) is same
+
+
+def test_forces_that_no_fit_has_found_are_refused(run: Path, tmp_path: Path) -> None:
+    again = stored_with_forces(run, tmp_path / "run", float("nan"))
+    with pytest.raises(InputError, match="E183"):
+        restore_identification(again)
 
 
 @pytest.mark.nightly

@@ -26,13 +26,12 @@ from sim2gp.identification.intervals.averaging import (
 )
 from sim2gp.identification.intervals.discrepancy import (
     _apart,
-    _with_forces_at_zero,
     corrected_windows,
-    forces_of,
 )
 from sim2gp.identification.intervals.pulls import Pulls
 from sim2gp.identification.intervals.scatter import CorrectedFit, correct_posterior
 from sim2gp.identification.intervals.words import interval_entry, missing_forces_table
+from sim2gp.identification.missing_physics.at_zero import forces_at_zero, forces_of
 from sim2gp.inference.arrowhead import Noise
 from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
@@ -296,7 +295,7 @@ def test_a_belief_keeps_its_parameters_among_forces() -> None:
     belief = estimate_of(prior, posterior, Noise(none, none), none[None])
     box = dict.fromkeys([*BOX, *(f"{q}.velocity" for q in BOX)], (-1.0, 1.0))
     forces = forces_of(system, box)
-    wider, whole, own = _with_forces_at_zero(system, belief, forces)
+    wider, whole, own = forces_at_zero(system, belief, forces)
     names = wider.parameters.names
     assert len(names) > p + 6
     assert tuple(names[k] for k in own) == system.parameters.names

@@ -13,7 +13,8 @@ from sim2gp.data.split_log import cut
 from sim2gp.data.windows_likelihood import WindowsLikelihood, linearise
 from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.intervals import pulls
-from sim2gp.identification.intervals.discrepancy import corrected_windows, forces_of
+from sim2gp.identification.intervals.discrepancy import corrected_windows
+from sim2gp.identification.missing_physics.at_zero import forces_of
 from sim2gp.systems import UniformRodArm, free_parts
 from sim2gp.systems.effects.forces import MissingForce, Sign
 from sim2gp.types import in_float64

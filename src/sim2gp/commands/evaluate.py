@@ -7,7 +7,7 @@ to the training logs alone.
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -28,6 +28,10 @@ from sim2gp.identification.forecasts.baselines import (
     regression_errors,
 )
 from sim2gp.identification.forecasts.calibration import calibrate_forecasts
+from sim2gp.identification.forecasts.forecast_machine import (
+    forces_sentence,
+    forces_table,
+)
 from sim2gp.identification.forecasts.prediction import (
     ScoredForecasts,
     channel_units,
@@ -112,11 +116,12 @@ def _forecast_logs(
     started = time.perf_counter()
     found = fit.project
     assert found is not None
-    system = found.system
+    machine = fit.forecast_machine
+    system = machine.system
     with progress.task("evaluate", 1) as task:
         rows, longest = scored_rows(horizon), max(horizon, CURVE[-1])
         grid = windows_for(tested, found, longest, horizon)
-        result = forecast_grid(system, fit.plain, grid, horizon)
+        result = forecast_grid(system, machine.posterior, grid, horizon)
         train = _training(fit)
         linear = np.full((len(grid.windows), len(rows), len(result.mean[0, 0])), np.nan)
         if train is not None:
@@ -133,7 +138,9 @@ def _forecast_logs(
     if train is None:
         notes.append("the training logs were not found: no regression to compare")
     title = "Forecasts over what was recorded"
-    about, moves = film(system, fit.plain, picture, grid, tested, title)
+    about, moves = film(system, machine.posterior, picture, grid, tested, title)
+    if machine.scales:
+        summary["forecast_forces"] = dict(machine.scales)
     if about:
         summary["animation"] = about
         arrays |= moves
@@ -142,7 +149,7 @@ def _forecast_logs(
         "title": f"{fit.name}: prediction of logs it was not fitted to",
         "warnings": notes,
     }
-    return _evaluation(summary, arrays, found, started)
+    return _evaluation(summary, arrays, found, started, machine.scales)
 
 
 class Cut(NamedTuple):
@@ -160,6 +167,15 @@ class EvaluateJob(NamedTuple):
     logs: tuple[Log, ...]
     horizon: float
     left: tuple[int, ...]
+
+
+class FoldResult(NamedTuple):
+    """Forecasts and traces of a fold, its parameters and the scales of its forces."""
+
+    judged: ScoredForecasts
+    traced: dict[str, np.ndarray]
+    constants: np.ndarray
+    scales: dict[str, float]
 
 
 def _leave_one_out(
@@ -190,7 +206,7 @@ def _leave_one_out(
             apart,
             lambda job: task.advance(f"without {logs[job.left[0]].name}"),
         )
-    parts, traced, constants = zip(*found, strict=True)
+    parts, traced, constants, scales = zip(*found, strict=True)
     arrays: dict[str, np.ndarray] = {}
     for each in traced:
         arrays |= each
@@ -199,14 +215,21 @@ def _leave_one_out(
     summary, curves = forecast_scores(whole, names, logs, horizon)
     summary["calibration"], shares = calibrate_forecasts(whole, names, logs, horizon)
     arrays |= shares
-    summary["tables"].append(_constants_table(project, files, logs, list(constants)))
+    names_of = {log.source: log.name for log in logs}
+    left = [names_of[file] for file in files]
+    summary["tables"].append(_constants_table(project, left, list(constants)))
+    forces = dict(zip(left, scales, strict=True))
+    if any(scales):
+        summary["tables"].append(forces_table(forces))
+        summary["forecast_forces"] = forces
     summary |= {
         "command": "evaluate",
         "title": f"{project.name}: each log predicted by a fit of the others",
         "folds": len(files),
         "warnings": note_lines(logs, _repeated(logs, files)),
     }
-    return _evaluation(summary, curves | arrays, project, started)
+    kinds = [kind for each in scales for kind in each]
+    return _evaluation(summary, curves | arrays, project, started, kinds)
 
 
 def _cut_for_fold(project: Project, job: EvaluateJob) -> Cut:
@@ -215,10 +238,8 @@ def _cut_for_fold(project: Project, job: EvaluateJob) -> Cut:
     return Cut(windows, of, windows_for(job.logs, project, longest, job.horizon))
 
 
-def _forecast_fold(
-    project: Project, cut: Cut, job: EvaluateJob
-) -> tuple[ScoredForecasts, dict[str, np.ndarray], np.ndarray]:
-    """Forecasts, traces and parameters of the fit without the logs ``job.left``."""
+def _forecast_fold(project: Project, cut: Cut, job: EvaluateJob) -> FoldResult:
+    """Of the fit without the logs ``job.left``."""
     windows, of, grid = cut
     part = leave_out(job.left, job.logs, of, grid)
     # One start: the folds are small changes of one problem.
@@ -227,12 +248,11 @@ def _forecast_fold(
     picture = forecast_traces(found.forecast, found.band, found.tested)
     names = channels(project.system, windows)
     traced = trace_arrays(picture, found.tested, job.logs, names)
-    return found.judged, traced, _constrain(project.system, found.posterior)
+    constants = _constrain(project.system, found.posterior)
+    return FoldResult(found.judged, traced, constants, dict(found.machine.scales))
 
 
-def _forecast_in_process(
-    job: EvaluateJob,
-) -> tuple[ScoredForecasts, dict[str, np.ndarray], np.ndarray]:
+def _forecast_in_process(job: EvaluateJob) -> FoldResult:
     """The same in a process of its own."""
     project = load_project(job.path)
     return _forecast_fold(project, _cut_for_fold(project, job), job)
@@ -244,19 +264,15 @@ def _constrain(system: Any, posterior: Gaussian) -> np.ndarray:
 
 
 def _constants_table(
-    project: Project,
-    files: Sequence[str],
-    logs: Sequence[Log],
-    values: list[np.ndarray],
+    project: Project, left: Sequence[str], values: list[np.ndarray]
 ) -> dict[str, Any]:
     """The parameters of every fold: one that moves between folds is not determined."""
-    names = {log.source: log.name for log in logs}
     return {
         "title": "Parameters of each fit (most probable values)",
         "columns": ["without", *project.system.parameters.names],
         "rows": [
-            [names[file], *(f"{x:.3g}" for x in row)]
-            for file, row in zip(files, values, strict=True)
+            [name, *(f"{x:.3g}" for x in row)]
+            for name, row in zip(left, values, strict=True)
         ],
         "note": "One log fewer should not move a parameter that the logs determine.",
     }
@@ -303,8 +319,9 @@ def _evaluation(
     arrays: dict[str, np.ndarray],
     project: Project,
     started: float,
+    kinds: Iterable[str],
 ) -> Evaluation:
-    """The result with its headline."""
+    """The result with its headline; forecasts have missing forces of these kinds."""
     unit = channel_units(project.system)
     summary["headline"] = forecast_sentence(
         f"Open-loop error at {summary['horizon']:g} s",
@@ -315,6 +332,7 @@ def _evaluation(
     )
     if summary["losses"]:
         summary["headline"] += f" {summary['losses']}"
+    summary["headline"] += forces_sentence(kinds)
     summary["units"] = unit
     summary["trace_note"] = (
         "Forecasts of half a second from causal starts, of logs that the fit has not "

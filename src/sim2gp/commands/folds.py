@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 
 from sim2gp.data.grid import CURVE, PERIOD, Grid, steps_of
 from sim2gp.data.logs import Log
@@ -19,6 +19,10 @@ from sim2gp.data.windows import Windows
 from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.forecasts.baselines import regression_errors
 from sim2gp.identification.forecasts.forecast import Band, Forecast, fit_band
+from sim2gp.identification.forecasts.forecast_machine import (
+    ForecastMachine,
+    fit_forecast_machine,
+)
 from sim2gp.identification.forecasts.prediction import (
     ScoredForecasts,
     forecast_grid,
@@ -38,13 +42,15 @@ LAST = 0.25  # of a single recording, the share at its end that is held out
 class Part(NamedTuple):
     """What a fit may see, and what it is judged by; of training and forecast windows.
 
-    The band is made of the windows ``known`` up to ``until`` (s, on the log's clock),
-    which lie in ``recordings`` recordings.
+    ``recording`` numbers those of the training windows. The band is made of the windows
+    ``known`` up to ``until`` (s, on the log's clock), which lie in ``recordings``
+    recordings.
     """
 
     train: Bool[np.ndarray, " W"]
     known: Bool[np.ndarray, " V"]
     test: Bool[np.ndarray, " V"]
+    recording: Int[np.ndarray, " W"]
     recordings: int
     words: str
     until: float = math.inf
@@ -53,7 +59,8 @@ class Part(NamedTuple):
 class Fold(NamedTuple):
     """A fit of a part of the windows and its forecasts of the others."""
 
-    posterior: Gaussian
+    posterior: Gaussian  # of the parameters, without missing forces
+    machine: ForecastMachine
     band: Band
     judged: ScoredForecasts
     tested: Grid
@@ -66,9 +73,17 @@ def leave_out(
     """All but the logs with these indices."""
     test = np.isin(grid.log, left)
     others = {log.source for k, log in enumerate(logs) if k not in left}
-    return Part(
-        ~np.isin(of, left), ~test, test, len(others), f"the log {logs[left[0]].name}"
-    )
+    words = f"the log {logs[left[0]].name}"
+    recording = recording_of_windows(logs, of)
+    return Part(~np.isin(of, left), ~test, test, recording, len(others), words)
+
+
+def recording_of_windows(
+    logs: Sequence[Log], of: Int[np.ndarray, " W"]
+) -> Int[np.ndarray, " W"]:
+    """The number of each window's recording, from that of its log."""
+    files = recording_names(logs)
+    return np.asarray([files.index(source) for source in files])[of]
 
 
 def split_held_out(
@@ -78,10 +93,10 @@ def split_held_out(
     grid: Grid,
 ) -> Part | None:
     """The last recording, or the last quarter of the only one; None if too short."""
-    files = recording_names(logs)
+    files, of = recording_names(logs), np.asarray([k for k, _ in places])
     if len(set(files)) > 1:
         last = [k for k, source in enumerate(files) if source == files[-1]]
-        found = leave_out(last, logs, np.asarray([k for k, _ in places]), grid)
+        found = leave_out(last, logs, of, grid)
     else:
         first, end = float(logs[0].time[0]), float(logs[-1].time[-1])
         split = end - LAST * (end - first)
@@ -89,7 +104,8 @@ def split_held_out(
         train = since + np.asarray(windows.span).sum(axis=1) <= split
         known, test = grid.since + CURVE[0] <= split, grid.since >= split
         words = f"the last {100 * LAST:.0f} % of the log {logs[0].name}"
-        found = Part(train, known, test, 1, words, split)
+        recording = recording_of_windows(logs, of)
+        found = Part(train, known, test, recording, 1, words, split)
     seen = np.asarray(windows.mask)[found.train].any()
     judged_by = np.asarray(grid.windows.mask)[
         found.test, scored_rows(CURVE[0])[0]
@@ -110,21 +126,25 @@ def fit_fold(
 ) -> Fold:
     """The fit of what ``part`` may see, begun at ``warm_start``, judged by the rest.
 
+    Forecasts have the missing forces that predict recordings left out of the fit.
     Raises as `sim2gp.identification.fit.fit_windows` does.
     """
     rows = scored_rows(horizon)
     mask = np.asarray(windows.mask) & part.train[:, None, None]
     kept = eqx.tree_at(lambda w: w.mask, windows, mask)
     robust = project.spec.likelihood.robust
-    posterior = fit_windows(
+    fitted = fit_windows(
         project.system,
         kept,
         key=key,
         robust=robust,
         starts=starts,
         warm_start=warm_start,
-    ).posterior
-    result = forecast_grid(project.system, posterior, grid, horizon)
+    )
+    machine = fit_forecast_machine(
+        project.system, kept, fitted, part.recording, robust=robust
+    )
+    result = forecast_grid(machine.system, machine.posterior, grid, horizon)
     train, tested = subset(grid, part.known), subset(grid, part.test)
     curve = np.asarray([steps_of(h) for h in CURVE])
     before = train.since[:, None] + PERIOD * curve <= part.until
@@ -134,4 +154,4 @@ def fit_fold(
     linear = regression_errors(train, tested, rows)
     result = result.of(part.test)
     found = score_forecasts(rows, tested, result, band, linear)
-    return Fold(posterior, band, found, tested, result)
+    return Fold(fitted.posterior, machine, band, found, tested, result)

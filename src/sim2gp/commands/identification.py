@@ -17,13 +17,18 @@ from sim2gp.commands.result import PROJECT, AbstractResult
 from sim2gp.data.logs import Budget, Log
 from sim2gp.errors import error
 from sim2gp.identification.forecasts.forecast import Band
+from sim2gp.identification.forecasts.forecast_machine import (
+    ForecastMachine,
+    stored_forecast_machine,
+)
 from sim2gp.identification.words import bound_warnings
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.parameters import Parameters
 from sim2gp.project import Project, load_project
 from sim2gp.project.in_memory import read_logs
 from sim2gp.runs import load_run
-from sim2gp.runs.store import Run
+from sim2gp.runs.manifest import damaged
+from sim2gp.runs.store import SUMMARY, Run
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import AnyArray, in_float64
 
@@ -95,6 +100,16 @@ class Identification(AbstractResult):
         expected information is counted from it.
         """
         return _stored_posterior(self.arrays, "plain")
+
+    @cached_property
+    def forecast_machine(self) -> ForecastMachine:
+        """What forecasts are made with: ``plain``, or a fit with missing forces.
+
+        Forces are those that predicted recordings which were left out.
+        """
+        if "forecast_forces" not in self.summary:
+            return ForecastMachine(self.machine, self.plain)
+        return stored_forecast_machine(self.machine, self.summary, self.arrays)
 
     @property
     def noise(self) -> dict[str, float]:
@@ -228,13 +243,22 @@ def project_of(
 def restore_identification(
     run: Path, machine: AbstractSystem | None = None
 ) -> Identification:
-    """What `identify` saved (E130 for another folder, E184 for other parameters)."""
+    """What `identify` saved.
+
+    E130 for another folder, E183 for forces that it cannot have found, E184 for other
+    parameters.
+    """
     stored = load_run(run)
     check_identified(run, stored)
     project = project_of(run, stored, machine=machine)
     _check_constants(run, project, stored.summary)
     _check_fitted(project.spec.system, project.system.parameters, stored.arrays)
-    return Identification(stored.summary, stored.arrays, {}, project, run)
+    found = Identification(stored.summary, stored.arrays, {}, project, run)
+    try:
+        _ = found.forecast_machine
+    except (ValueError, TypeError, AttributeError) as error:
+        raise damaged(run, SUMMARY, str(error)) from error
+    return found
 
 
 def check_identified(run: Path, stored: Run) -> None:

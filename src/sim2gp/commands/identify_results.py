@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from sim2gp.commands.folds import recording_of_windows
 from sim2gp.commands.identification import physical_mode
 from sim2gp.commands.unseen import Unseen, forecast_unseen
 from sim2gp.data.clock import clock_warnings
@@ -18,6 +19,11 @@ from sim2gp.identification.configurations import configuration_entries
 from sim2gp.identification.exact_posterior.importance import check_windows
 from sim2gp.identification.exact_posterior.nuts import sample_windows
 from sim2gp.identification.forecasts.forecast import Band, fit_band
+from sim2gp.identification.forecasts.forecast_machine import (
+    ForecastMachine,
+    fit_forecast_machine,
+    forces_sentence,
+)
 from sim2gp.identification.forecasts.prediction import (
     Picture,
     channel_units,
@@ -48,8 +54,8 @@ from sim2gp.project import Project
 from sim2gp.reports.motion import film
 from sim2gp.systems.host import simulator_of
 
-#: Forecasts to draw: of whom, and what and where they are.
-Drawn = tuple[Gaussian, Picture, Grid]
+#: Forecasts to draw: of which machine, and what and where they are.
+Drawn = tuple[ForecastMachine, Picture, Grid]
 _SHORTEST = 4  # windows: a film of fewer held-out ones is not worth watching
 
 
@@ -64,16 +70,25 @@ def identification_results(
 ) -> tuple[dict[str, Any], dict[str, np.ndarray], CorrectedFit]:
     """The run's summary and arrays, and the corrected intervals."""
     table, (windows, places) = project.system.parameters, cuts
-    band, own = _own_forecasts(project, fitted.posterior, grid, logs)
+    of = np.asarray([k for k, _ in places])
+    machine = fit_forecast_machine(
+        project.system,
+        windows,
+        fitted,
+        recording_of_windows(logs, of),
+        robust=project.spec.likelihood.robust,
+    )
+    band, own = _own_forecasts(machine, grid, logs)
     known = fitted.with_measurements(table)
     likelihood = WindowsLikelihood(project.system, windows)
-    of = np.asarray([k for k, _ in places])
     honest = corrected_windows(likelihood, known, of)
     summary = _identification_summary(
         project, logs, likelihood, known, honest, band, seed
     )
     arrays = _stored(table, known, honest.posterior, band, seed)
-    arrays |= force_arrays(honest.found)
+    arrays |= force_arrays(honest.found) | machine.arrays()
+    summary |= machine.entries()
+    summary["trace_note"] += forces_sentence(machine.scales)
     other = (
         forecast_unseen(project, logs, windows, places, grid, known)
         if held_out
@@ -84,19 +99,19 @@ def identification_results(
 
 
 def _own_forecasts(
-    project: Project, posterior: Gaussian, grid: Grid, logs: Sequence[Log]
+    machine: ForecastMachine, grid: Grid, logs: Sequence[Log]
 ) -> tuple[Band, Drawn]:
     """Of the logs that were fitted: the band made of them, and what is drawn.
 
     Windows that overlap say little more of the band, and a simulator on the host takes
     as long for them as for the fit.
     """
-    if simulator_of(project.system) is not None:
+    if simulator_of(machine.system) is not None:
         grid = thin_windows(grid)
-    found = forecast_grid(project.system, posterior, grid, CURVE[0])
+    found = forecast_grid(machine.system, machine.posterior, grid, CURVE[0])
     rows = scored_rows(CURVE[0])[1:]
     band = fit_band(found.at(rows), grid, len(set(recording_names(logs))))
-    return band, (posterior, forecast_traces(found, band, grid), grid)
+    return band, (machine, forecast_traces(found, band, grid), grid)
 
 
 def _stored(
@@ -236,7 +251,7 @@ def _drawings(
     other: Unseen | None,
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Forecasts of the fitted logs and of held-out data, and a film of the latter."""
-    posterior, picture, shown = own
+    machine, picture, shown = own
     names = channels(project.system, shown.windows)
     arrays, data = trace_arrays(picture, shown, logs, names), "fitted"
     summary: dict[str, Any] = {}
@@ -245,9 +260,9 @@ def _drawings(
         arrays |= other.arrays
         if other.fold is not None and len(other.picture["which"][0]) >= _SHORTEST:
             picture, data = other.picture, "held-out"
-            posterior, shown = other.fold.posterior, other.fold.tested
+            machine, shown = other.fold.machine, other.fold.tested
     title = f"Forecasts of {data} data over what was recorded"
-    about, moves = film(project.system, posterior, picture, shown, logs, title)
+    about, moves = film(machine.system, machine.posterior, picture, shown, logs, title)
     return summary | ({"animation": about} if about else {}), arrays | moves
 
 

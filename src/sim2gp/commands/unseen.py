@@ -17,6 +17,7 @@ from sim2gp.data.windows import Windows
 from sim2gp.errors import DeadParameters, NotConverged, NotFinite
 from sim2gp.identification.forecasts.baselines import forecast_sentence
 from sim2gp.identification.forecasts.calibration import calibrate_forecasts
+from sim2gp.identification.forecasts.forecast_machine import forces_sentence
 from sim2gp.identification.forecasts.prediction import (
     TRACE,
     Picture,
@@ -81,9 +82,12 @@ def forecast_unseen(
         summary["trivial"],
         channel_units(project.system),
     )
+    if found.machine.scales:
+        summary["forecast_forces"] = dict(found.machine.scales)
     summary["text"] = (
         f"The parameters were fitted once more without {part.words}, which that fit "
         "then forecast, knowing its inputs. The other sections rest on all of the data."
+        f"{forces_sentence(found.machine.scales)}"
     )
     if part.recordings == 1:
         summary["text"] += (

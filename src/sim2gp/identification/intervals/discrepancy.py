@@ -8,7 +8,7 @@ missing may have taken the fit far from it. The noise stays the fit's, which has
 misfit in it: that makes intervals rather too wide than too narrow.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -30,6 +30,11 @@ from sim2gp.identification.intervals.scatter import (
     CorrectedFit,
     correct_posterior,
 )
+from sim2gp.identification.missing_physics.at_zero import (
+    forces_at_zero,
+    forces_of,
+    kinds_of,
+)
 from sim2gp.identification.missing_physics.curves import curves_of
 from sim2gp.identification.missing_physics.reach import box_of
 from sim2gp.inference.estimate import Estimate
@@ -37,10 +42,6 @@ from sim2gp.inference.gaussian import Gaussian
 from sim2gp.systems.assemble import free_parts
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.effects.forces import AbstractUnknownFunction
-from sim2gp.systems.effects.missing import missing_forces
-from sim2gp.systems.machine import plant_of
-from sim2gp.systems.mechanism import takes_forces
-from sim2gp.systems.parts import AbstractPart
 from sim2gp.types import in_float64
 
 #: Sine of the angle to the parameters' span below which a force is one of them in
@@ -79,7 +80,7 @@ def corrected_windows(
     cut, system = likelihood.windows, likelihood.system
     box = box_of(system, cut)
     given = forces_of(system, box) if forces is None else tuple(forces)
-    system, whole, own = _with_forces_at_zero(system, fitted, given)
+    system, whole, own = forces_at_zero(system, fitted, given)
     wider, p = WindowsLikelihood(system, cut), len(own)
     mean, scale = (np.asarray(x) for x in (whole.prior.mean, whole.prior.scale))
     rows = rows_of(wider, whole, whole.posterior.mean)
@@ -114,19 +115,6 @@ def corrected_windows(
     )
 
 
-def forces_of(
-    system: AbstractSystem, box: Mapping[str, tuple[float, float]]
-) -> tuple[AbstractUnknownFunction, ...]:
-    """What a machine may lack where its recordings have been.
-
-    Nothing of a plant that takes no forces, whose intervals rest on the scatter of its
-    windows alone: an acceleration of one joint is no force on an arm.
-    """
-    if not takes_forces(plant_of(system)):
-        return ()
-    return tuple(missing_forces(system, box, fine=True))
-
-
 class _Onto(NamedTuple):
     """Virtual values of reduced coordinates."""
 
@@ -135,26 +123,6 @@ class _Onto(NamedTuple):
 
     def __call__(self, c: Float[np.ndarray, " k"]) -> Float[np.ndarray, " p"]:
         return self.mean + self.scale @ c
-
-
-def _with_forces_at_zero(
-    machine: AbstractSystem, fitted: Estimate, forces: Sequence[AbstractPart]
-) -> tuple[AbstractSystem, Estimate, Int[np.ndarray, " p"]]:
-    """The machine with forces, its estimate with all at nothing; its own columns."""
-    if not forces:
-        return machine, fitted, np.arange(fitted.prior.mean.size)
-    system = free_parts(machine, forces)
-    names, prior = system.parameters.names, system.parameters.prior()
-    own = np.asarray([names.index(name) for name in machine.parameters.names])
-    scale = prior.scale.at[np.ix_(own, own)].set(fitted.prior.scale)
-    whole = replace(
-        fitted,
-        prior=Gaussian(prior.mean.at[own].set(fitted.prior.mean), scale),
-        posterior=Gaussian(prior.mean.at[own].set(fitted.posterior.mean), scale),
-        information=jnp.zeros_like(scale),  # of another machine
-        scores=jnp.zeros((len(fitted.scores), len(scale))),
-    )
-    return system, whole, own
 
 
 def _identifiable(
@@ -171,11 +139,8 @@ def _identifiable(
     A = np.asarray(np.linalg.qr(np.concatenate(list(pulls.factors)), mode="r"))
     Q, R = np.linalg.qr(A[:, own])
     Q = Q[:, np.abs(np.diag(R)) > 1e-12 * np.abs(R).max(initial=0.0)]
-    of: dict[str, list[int]] = {}
-    for name, places in groups.items():
-        of.setdefault(name.rsplit(".", 1)[-1], []).extend(places.tolist())
     parts, found, start = [np.eye(A.shape[1])[:, own]], {}, len(own)
-    for kind, all_places in of.items():
+    for kind, all_places in kinds_of(groups).items():
         kept = _apart(A[:, all_places], Q)
         W = np.zeros((A.shape[1], kept.shape[1]))
         W[all_places] = kept

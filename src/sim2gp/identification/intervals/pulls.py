@@ -64,11 +64,21 @@ def pulls_of_rows(
     rows: Float[np.ndarray, "W k npr"], cut: Windows, group: Int[np.ndarray, " W"]
 ) -> Pulls:
     """Of rows `rows_of`; raises `NotFinite` E203."""
-    must_be_finite("derivatives or residuals", rows, "the intervals")
-    n = cut.start.shape[1]
-    R = np.asarray(np.linalg.qr(rows, mode="r"))[:, n:, n:]
+    R = without_starts(rows, cut)
     scores = np.einsum("wkp,wk->wp", R[..., :-1], R[..., -1])
     return Pulls(R[..., :-1], scores, np.asarray(group))
+
+
+def without_starts(
+    rows: Float[np.ndarray, "W k npr"], cut: Windows
+) -> Float[np.ndarray, "W q pr"]:
+    """Rows ``[J_z r]`` of each window from its best start, of rows `rows_of`.
+
+    Raises `NotFinite` E203.
+    """
+    must_be_finite("derivatives or residuals", rows, "the intervals")
+    n = cut.start.shape[1]
+    return np.asarray(np.linalg.qr(rows, mode="r"))[:, n:, n:]
 
 
 def cost_of_rows(rows: Float[np.ndarray, "W k npr"], cut: Windows) -> float:
