@@ -61,6 +61,16 @@ MACHINES: tuple[Case, ...] = (
         ),
         pendulum("unknown_name", "[effects.theta]\ndrag = {value = 1.0, width = 0.1}"),
         pendulum("incomplete_prior", "[effects.theta.coulomb]\nmean = 1.0"),
+        pendulum(
+            "points_of_table",
+            "[effects.theta.position_table]\npoints = [[0.0, 1.0]]",
+            "position_table",
+        ),
+        pendulum(
+            "points_of_table",
+            "[effects.voltage.input_table]\npoints = [[1.0, 0.0], [1.0, 2.0]]",
+            "2 points",
+        ),
         pendulum("E160", "[effects.theta.coulomb]\nwidth = -1.0\nvalue = 1.0", "width"),
         tied("unknown_name", '[actuators."motor*"]\ngain = 2.0', "line 2", "torque1"),
         tied(

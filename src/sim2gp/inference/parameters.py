@@ -142,12 +142,8 @@ def prior_from_moments(
         low = parameter.low if low is None else low
         high = parameter.high if high is None else high
         logarithmic = parameter.map in ("log", "log_bounded") and low > 0.0
-        boxed = dataclasses.replace(
-            parameter,
-            map="log_bounded" if logarithmic else "bounded",
-            low=low,
-            high=high,
-        )
+        kind = "log_bounded" if logarithmic else "bounded"
+        boxed = dataclasses.replace(parameter, map=kind, low=low, high=high)
         return _match_in_box(boxed, mean, sd)
     if parameter.low >= 0.0:
         if mean <= 0.0:
@@ -240,10 +236,15 @@ class Parameters(eqx.Module):
         each = np.asarray(["" if p.shape else p.group for p in self.free])
         return {name: np.flatnonzero(each == name) for name in names}
 
+    def without_groups(self) -> "Parameters":
+        """The same parameters in no group: no data choose their prior's scale."""
+        same = (dataclasses.replace(p, group="") for p in self.free)
+        return dataclasses.replace(self, free=tuple(same))
+
     def ungrouped(self) -> "Parameters":
         """The table without the parameters of functions."""
-        free = tuple(p for p in self.free if not p.group)
-        return dataclasses.replace(self, free=free)
+        own = tuple(p for p in self.free if not p.group)
+        return dataclasses.replace(self, free=own)
 
     def __getitem__(self, name: str) -> Parameter:
         return self.free[self.names.index(name)]

@@ -147,9 +147,7 @@ def fit_forecast_machine(
 def _with_fixed_scales(system: AbstractSystem) -> AbstractSystem:
     """The machine with forces whose scales no fit changes."""
     machine = as_machine(system)
-    table = machine.parameters
-    free = tuple(replace(p, group="") for p in table.free)
-    return replace(machine, parameters=replace(table, free=free))
+    return replace(machine, parameters=machine.parameters.without_groups())
 
 
 def forces_sentence(kinds: Iterable[str]) -> str:

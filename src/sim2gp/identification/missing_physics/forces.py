@@ -9,7 +9,7 @@ alone do not undo it.
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import equinox as eqx
 import jax
@@ -30,7 +30,6 @@ from sim2gp.identification.missing_physics.reach import box_of
 from sim2gp.identification.missing_physics.shapes import is_nothing
 from sim2gp.inference.estimate import Estimate, estimate
 from sim2gp.inference.groups import Start
-from sim2gp.inference.parameters import Parameters
 from sim2gp.inference.prior import ParameterPrior
 from sim2gp.inference.relevance import EARNED, OFF, ON, price
 from sim2gp.systems.assemble import free_parts
@@ -150,13 +149,10 @@ def _with_free_sizes(
     and motor are unknown, too, it draws weights to zero together with them: along that
     direction by as many variances as a function has weights.
     """
-    free = tuple(replace(p, group="") for p in prior.table.free)
-    about = prior.as_gaussian()
-    start = about.whitened(best.posterior.mean)[None]
-    table = Parameters(free, prior.table.fixed)
-    return estimate(
-        likelihood, ParameterPrior(about, table), starts=start, noise=best.noise
-    )
+    wide = prior.as_gaussian()
+    start = wide.whitened(best.posterior.mean)[None]
+    about = ParameterPrior(wide, prior.table.without_groups())
+    return estimate(likelihood, about, starts=start, noise=best.noise)
 
 
 def _visited(data: OneStepData) -> dict[str, tuple[float, float]]:
