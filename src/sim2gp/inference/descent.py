@@ -5,7 +5,7 @@ roughly, under the first noise, and no further where they go where the best one 
 the best the noise is updated after every step (generalised EM: Dempster, Laird and
 Rubin 1977, section 3), until Newton's step and the noise rest.
 
-In a curved valley a step of Gauss-Newton ends beside the floor, where the cost is more,
+In a curved valley a step of Gauss-Newton ends off the floor, where the cost is more,
 and the next one leads back to it. So a step that is refused is followed by one more
 before it is given up (the watchdog: Chamberlain et al. 1982, Mathematical Programming
 Study 16).
