@@ -29,8 +29,6 @@ def missing_forces(summary: Summary, arrays: Arrays) -> Section:
         ]
         said = f"{svg.extent(mean)}, {about['of']} {svg.extent(at, about['of_unit'])}"
         title = f"on {about['where']}, by {about['of']}"
-        if "name" in about:
-            title += f": {about['name']}"
         charts.append(
             svg.chart(axes, marks, title=title, said=said, unit=about["unit"])
         )
