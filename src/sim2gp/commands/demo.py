@@ -26,6 +26,8 @@ from sim2gp.identification.missing_physics.curves import (
     force_arrays,
     functions_of,
 )
+from sim2gp.identification.missing_physics.reach import box_of_rows
+from sim2gp.inference.prior import ParameterPrior
 from sim2gp.inference.relevance import ON
 from sim2gp.models import (
     MissingForces,
@@ -246,13 +248,12 @@ def _forces(history: History) -> tuple[Curve, ...]:
     belief, data = history.belief, history.data
     assert isinstance(belief, Sim2GPBelief)
     system, table = belief.system, belief.system.parameters
-    sd = np.asarray(belief.prior.sd())
-    on = [g for g, i in table.groups.items() if sd[i[0]] > ON * table.free[i[0]].sd]
+    scales = ParameterPrior(table.prior(), table).scales_in(belief.prior)
+    on = [g for g, tau in zip(table.groups, scales, strict=True) if tau > ON]
     known = [f for f in functions_of(system) if f.name in on]
-    x = np.concatenate([data.state, data.action], axis=1)[np.asarray(data.mask)]
-    channels = (*system.physical_states, *system.actions)
-    ends = zip(x.min(axis=0).tolist(), x.max(axis=0).tolist(), strict=True)
-    box = {c.name: end for c, end in zip(channels, ends, strict=True)}
+    there = np.asarray(data.mask)
+    rows = np.asarray(data.state)[there], np.asarray(data.action)[there]
+    box = box_of_rows(system, *rows)
     return curves_of(system, known, box, belief.posterior)
 
 

@@ -312,7 +312,7 @@ def _learned(learning: Learning, s: _State) -> _State:
 def _chosen(scales: Scales, s: _State) -> _State:
     """New scales at the best point, or at the one before that had more evidence."""
     last = s.choice
-    assert last is not None  # whoever chooses remembers
+    assert last is not None  # it is there where scales are chosen
     score = scales.score(s.best, s.noise, s.prior)
     good = score >= last.score
     old = last.at, last.noise, last.prior, last.score, last.trust * LESS

@@ -116,6 +116,12 @@ class ParameterPrior(AbstractPrior):
         about, each = self.gaussian, library(self.scales).asarray(self.each())
         return Gaussian(about.mean, about.scale * each[None])
 
+    def scales_in(self, scaled: Gaussian) -> Float[AnyArray, " g"]:
+        """The scales of a Gaussian that `as_gaussian` gave."""
+        first = np.asarray([at[0] for at in self.table.groups.values()], int)
+        xp = library(scaled.scale)
+        return (xp.diagonal(scaled.scale) / xp.diagonal(self.gaussian.scale))[first]
+
     def scaled(self, scales: Float[AnyArray, " g"]) -> "ParameterPrior":
         """The same with other scales."""
         return ParameterPrior(self.gaussian, self.table, scales)

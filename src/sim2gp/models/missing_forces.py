@@ -11,7 +11,6 @@ from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from sim2gp.belief import AbstractBelief, AbstractModel
 from sim2gp.data.one_step import estimate_forces
@@ -74,8 +73,7 @@ class MissingForces(AbstractModel):
         assert isinstance(belief, Sim2GPBelief)
         rows, about = jax.tree.map(jnp.asarray, data), self.sim.prior
         z = about.whitened(belief.posterior.mean)
-        first = np.asarray([at[0] for at in self.system.parameters.groups.values()])
-        scales = (jnp.diag(belief.prior.scale) / jnp.diag(about.scale))[first]
+        scales = self.prior(1.0).scales_in(belief.prior)
         last = Start(z, belief.noise, scales, belief.count > 0)
         found = estimate_forces(
             self.system, rows, self.sim.dt, self.prior(1.0), last, key

@@ -26,7 +26,7 @@ from sim2gp.identification.missing_physics.data import (
     OneStepData,
     WindowData,
 )
-from sim2gp.identification.missing_physics.reach import box_of
+from sim2gp.identification.missing_physics.reach import box_of, box_of_rows
 from sim2gp.identification.missing_physics.shapes import is_nothing
 from sim2gp.inference.estimate import Estimate, estimate
 from sim2gp.inference.groups import Start
@@ -81,12 +81,13 @@ def find_forces(data: AbstractData, bare: Estimate) -> FoundForces:
 @in_float64
 def _of_transitions(data: OneStepData) -> FoundForces:
     """The functions that are on in the fit of highest evidence, sizes left free."""
-    machine, box = data.system, _visited(data)
+    machine = data.system
+    states, inputs = (np.concatenate(x) for x in zip(*data.episodes, strict=True))
+    box = box_of_rows(machine, states, inputs)
     forces = missing_forces(machine, box, fine=True, closely=True)
     system = free_parts(machine, forces, period=data.period)
     table = system.parameters
     names = tuple(table.groups)
-    first = np.asarray([places[0] for places in table.groups.values()])
     rows = jax.tree.map(jnp.asarray, data.transitions(system.history))
     prior = ParameterPrior(table.prior(), table, jnp.ones(len(table.groups)))
     key, zero = jax.random.key(data.seed), jnp.zeros(len(table))
@@ -95,8 +96,7 @@ def _of_transitions(data: OneStepData) -> FoundForces:
         args = rows, data.period, prior, last, key
         found = estimate_forces(system, *args)
         found.convergence.check(table.names, "transitions")
-        scales = np.diag(found.prior.scale) / np.diag(prior.gaussian.scale)
-        return _Fit(found, scales[first])
+        return _Fit(found, np.asarray(prior.scales_in(found.prior)))
 
     def without(best: _Fit, name: str) -> _Fit:
         """The best fit from where this one is, but for one function."""
@@ -109,12 +109,14 @@ def _of_transitions(data: OneStepData) -> FoundForces:
         return fit(Start(z, noise, scales, jnp.ones((), bool)))
 
     likelihood = data.likelihood(system)
-    start = Start(zero, likelihood.first_noise().sd, zero[first], jnp.zeros((), bool))
+    start = Start(
+        zero, likelihood.first_noise().sd, jnp.zeros(len(names)), jnp.zeros((), bool)
+    )
     best, gains = fit(start), dict[str, float]()
     while True:
         on = [n for n, s in zip(names, best.scales, strict=True) if s > ON]
         tried = {name: without(best, name) for name in on}
-        gains = {name: best.nats - fit.nats for name, fit in tried.items()}
+        gains = {name: best.nats - less.nats for name, less in tried.items()}
         if not gains or min(gains.values()) >= 0.0:
             break
         best = tried[min(gains, key=gains.__getitem__)]
@@ -153,13 +155,3 @@ def _with_free_sizes(
     start = wide.whitened(best.posterior.mean)[None]
     about = ParameterPrior(wide, prior.table.without_groups())
     return estimate(likelihood, about, starts=start, noise=best.noise)
-
-
-def _visited(data: OneStepData) -> dict[str, tuple[float, float]]:
-    """The range of each channel in the episodes."""
-    d = len(data.system.physical_states)
-    S = np.concatenate([S[:, :d] for S, _ in data.episodes])
-    A = np.concatenate([A for _, A in data.episodes])
-    channels = (*data.system.physical_states, *data.system.actions)
-    ends = [(float(x.min()), float(x.max())) for x in (*S.T, *A.T)]
-    return dict(zip((c.name for c in channels), ends, strict=True))

@@ -39,6 +39,18 @@ def box_of(system: AbstractSystem, windows: Windows) -> dict[str, Range]:
     return found
 
 
+def box_of_rows(
+    system: AbstractSystem,
+    states: Float[AnyArray, "T n"],
+    inputs: Float[AnyArray, "T m"],
+) -> dict[str, Range]:
+    """The range of each channel in rows of states and inputs, as it is."""
+    channels = (*system.physical_states, *system.actions)
+    columns = *states.T[: len(system.physical_states)], *inputs.T
+    pairs = zip(channels, columns, strict=True)
+    return {c.name: (float(np.min(x)), float(np.max(x))) for c, x in pairs}
+
+
 def _inputs(windows: Windows) -> Float[np.ndarray, "W H m"]:
     """The held inputs, from the area under them."""
     area, knots = np.asarray(windows.area), np.asarray(windows.knots)

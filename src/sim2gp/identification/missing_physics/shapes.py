@@ -22,6 +22,7 @@ Of several, the name is the one of highest evidence, ``-chi^2 / 2 - d / 2 log nu
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
+from itertools import product
 from typing import Any, NamedTuple
 
 import jax
@@ -183,18 +184,11 @@ def _shapes(
         if (kind.powers[0] > 0) != by_position:
             continue
         made: Any = kind
-        options = [f.name for f in fields(made)]
-        grids = {"width": WIDTHS, "speed": SPEEDS}
-        names = [name for name in grids if name in options]
-        for values in (
-            np.stack(
-                np.meshgrid(*(grids[name] for name in names), indexing="ij"), axis=-1
-            ).reshape(-1, len(names))
-            if names
-            else [()]
-        ):
-            given = dict(zip(names, (float(v) * span for v in values), strict=True))
-            yield made(curve.where, 1.0, **given), len(names)
+        known = {"width": WIDTHS, "speed": SPEEDS}
+        grids = {f.name: known[f.name] for f in fields(made) if f.name in known}
+        for shares in product(*grids.values()):  # once, of a law without options
+            given = {k: x * span for k, x in zip(grids, shares, strict=True)}
+            yield made(curve.where, 1.0, **given), len(grids)
 
 
 def _law(effect: AbstractEffect, curve: Curve) -> Float[np.ndarray, " n"]:
