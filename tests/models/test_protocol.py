@@ -243,9 +243,12 @@ def forecast(name, model, data, before, belief):
 
 
 def export(name, model, data, before, belief, tmp_path):
-    """Of a simulator's own belief; of others one line says why not."""
+    """Of a simulator's own belief; of others one line says why not.
+
+    Where no force is on, that of `MissingForces` is one.
+    """
     out = tmp_path / "machine"
-    if name.startswith("Sim2GP"):
+    if name in ("Sim2GP", "MissingForces"):
         export_model(belief, out, SYSTEM, dt=DT, draws=3, key=KEY)
         assert (out / "arrays.npz").exists()
         return

@@ -125,7 +125,7 @@ def demo(
     forces = _forces(next(iter(runs[0].histories.values())))
     arrays |= force_arrays(forces)
     summary["forces"] = {c.name: c.entry() for c in forces}
-    summary |= {"truth": truth, "mismatch": mismatch}
+    summary |= {"truth": truth, "with_mismatch": mismatch}
     return Demonstration(summary | provenance(started), arrays)
 
 

@@ -11,6 +11,8 @@ from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Int
 
 from sim2gp.belief import AbstractBelief, AbstractModel
 from sim2gp.data.one_step import estimate_forces
@@ -18,11 +20,12 @@ from sim2gp.data.transitions import Transitions
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.groups import Start
 from sim2gp.inference.prior import ParameterPrior
-from sim2gp.inference.relevance import OFF
+from sim2gp.inference.relevance import OFF, ON
 from sim2gp.models.features import Encoding
 from sim2gp.models.sim2gp import Sim2GP, Sim2GPBelief, belief_of
 from sim2gp.systems.assemble import free_parts
 from sim2gp.systems.base import AbstractSystem
+from sim2gp.systems.effects.forces import AbstractUnknownFunction
 from sim2gp.systems.effects.missing import missing_forces
 from sim2gp.types import Action, Key, State, in_float64
 
@@ -32,35 +35,38 @@ class MissingForces(AbstractModel):
 
     ``sim`` gives the prior of its own parameters. ``reach`` gives half-widths of where
     the machine moves, for some channels by name (`Encoding.of`, whose errors it
-    raises).
+    raises). A belief is about the machine with the forces that are on: one that is off
+    costs nothing.
     """
 
+    plain: Sim2GP
     sim: Sim2GP
+    forces: tuple[AbstractUnknownFunction, ...]
 
     @in_float64
     def __init__(
         self, sim: Sim2GP, *, reach: Mapping[str, float] | None = None
     ) -> None:
         parts = missing_forces(sim.system, Encoding.of(sim.system, reach or {}).box())
+        self.forces = tuple(parts)
         system, own = free_parts(sim.system, parts), sim.prior
         more, p = system.parameters.prior(), own.mean.size
         scale = more.scale.at[:p, :p].set(own.scale)
         prior = Gaussian(more.mean.at[:p].set(own.mean), scale)
-        self.sim = Sim2GP(system, dt=sim.dt, prior=prior)
+        self.plain, self.sim = sim, Sim2GP(system, dt=sim.dt, prior=prior)
 
     @property
     def system(self) -> AbstractSystem:
-        """The machine with its forces."""
+        """The machine with all forces."""
         return self.sim.system
 
     @property
     def history(self) -> int:
         return self.sim.history
 
-    @in_float64
     def init(self, key: Key) -> Sim2GPBelief:
         """The simulator's prior; all forces are off."""
-        return self.sim.with_prior(self.prior(OFF).as_gaussian()).init(key)
+        return self.plain.init(key)
 
     @in_float64
     def fit(
@@ -71,16 +77,13 @@ class MissingForces(AbstractModel):
         Raises `NotConverged`, `NotFinite` or `DeadParameters`.
         """
         assert isinstance(belief, Sim2GPBelief)
-        rows, about = jax.tree.map(jnp.asarray, data), self.sim.prior
-        z = about.whitened(belief.posterior.mean)
-        scales = self.prior(1.0).scales_in(belief.prior)
-        last = Start(z, belief.noise, scales, belief.count > 0)
+        rows = jax.tree.map(jnp.asarray, data)
         found = estimate_forces(
-            self.system, rows, self.sim.dt, self.prior(1.0), last, key
+            self.system, rows, self.sim.dt, self._prior(), self._start(belief), key
         )
         names = self.system.parameters.names
         found.convergence.check(names, f"{data.count} transitions")
-        return belief_of(self.sim, found, rows)
+        return self._needed(belief_of(self.sim, found, rows))
 
     def update(
         self, belief: AbstractBelief, s: State, a: Action, s2: State
@@ -88,7 +91,28 @@ class MissingForces(AbstractModel):
         """Condition on one transition; scales wait for the next fit."""
         return self.sim.update(belief, s, a, s2)
 
-    def prior(self, scale: float) -> ParameterPrior:
-        """The simulator's, with all forces at one scale."""
-        table = self.system.parameters
-        return ParameterPrior(self.sim.prior, table, jnp.full(len(table.groups), scale))
+    def _prior(self) -> ParameterPrior:
+        """With all forces at the scale of their own prior."""
+        return ParameterPrior(self.sim.prior, self.system.parameters)
+
+    def _start(self, belief: Sim2GPBelief) -> Start:
+        """Where a belief is, among all forces."""
+        about, at = self.sim.prior, self._places(belief.system)
+        mean = about.mean.at[at].set(belief.posterior.mean)
+        sd = OFF * jnp.diagonal(about.scale)
+        sd = sd.at[at].set(jnp.diagonal(belief.prior.scale))
+        scales = self._prior().scales_in(Gaussian(mean, jnp.diag(sd)))
+        return Start(about.whitened(mean), belief.noise, scales, belief.count > 0)
+
+    def _needed(self, belief: Sim2GPBelief) -> Sim2GPBelief:
+        """The same about the machine with the forces that are on."""
+        scales = self._prior().scales_in(belief.prior)
+        groups = zip(self.system.parameters.groups, scales, strict=True)
+        on = [name for name, tau in groups if tau > ON]
+        system = free_parts(self.plain.system, [f for f in self.forces if f.name in on])
+        return belief.marginal(self._places(system), system)
+
+    def _places(self, system: AbstractSystem) -> Int[np.ndarray, " k"]:
+        """Those of a machine's parameters in the table with all forces."""
+        names = self.system.parameters.names
+        return np.asarray([names.index(name) for name in system.parameters.names])

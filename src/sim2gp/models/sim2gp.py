@@ -94,17 +94,28 @@ class Sim2GPBelief(AbstractBelief):
 
         It predicts nothing: its machine still has them.
         """
-        own = self._own()
-        rest = np.setdiff1d(np.arange(self.posterior.mean.size), own)
+        return self.marginal(self._own(), self.system)
+
+    @in_float64
+    def marginal(
+        self, kept: Int[np.ndarray, " k"], system: AbstractSystem
+    ) -> "Sim2GPBelief":
+        """What it says of the parameters at these places, the others averaged.
+
+        ``system`` is the machine that has these alone.
+        """
+        rest = np.setdiff1d(np.arange(self.posterior.mean.size), kept)
         A, r = self.information, len(rest)
         rows = jnp.concatenate([A, jnp.eye(A.shape[1], dtype=A.dtype)[rest]])
-        left = triangular(rows[:, np.concatenate([rest, own])])[r:, r:]
+        left = triangular(rows[:, np.concatenate([rest, kept])])[r:, r:]
         prior, posterior = (
-            Gaussian(g.mean[own], Gaussian(g.mean[own], g.scale[own]).triangular())
+            Gaussian(g.mean[kept], Gaussian(g.mean[kept], g.scale[kept]).triangular())
             for g in (self.prior, self.posterior)
         )
-        new = prior, posterior, left
-        return eqx.tree_at(lambda b: (b.prior, b.posterior, b.information), self, new)
+        new = system, prior, posterior, left
+        return eqx.tree_at(
+            lambda b: (b.system, b.prior, b.posterior, b.information), self, new
+        )
 
     def _own(self) -> Int[np.ndarray, " p"]:
         """Places of the simulator's own parameters."""

@@ -32,6 +32,7 @@ from sim2gp.inference.prior import ParameterPrior
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import in_float64
 
+FREE = 0.1  # of a prior that leaves a size free, relative to 1 / sd
 DRAWN = 2  # random starts of a one-step fit, next to the prior's mean
 
 
@@ -65,17 +66,19 @@ class AbstractData(abc.ABC):
         system: AbstractSystem,
         starts: Float[np.ndarray, "S p"],
         warm_start: Estimate,
+        prior: Gaussian | None = None,
     ) -> Estimate:
         """A changed machine, from several starts (whitened) at another fit's noise.
 
         The same descent, EM and evidence as `fit`, which would start from a noise so
         large that a start says nothing: nothing keeps a delay from the wrong side of a
-        sample then. Raises `NotConverged` or `NotFinite`.
+        sample then. ``prior`` replaces that of the machine's table. Raises
+        `NotConverged` or `NotFinite`.
         """
         likelihood, table = self.likelihood(system), system.parameters
         found = estimate(
             likelihood,
-            ParameterPrior(table.prior(), table),
+            ParameterPrior(table.prior() if prior is None else prior, table),
             starts=jnp.asarray(starts, float),
             nuisances=warm_start.nuisances,
             noise=warm_start.noise,

@@ -22,6 +22,7 @@ from sim2gp.identification.intervals.averaging import NONE, NOTHING
 from sim2gp.identification.intervals.discrepancy import corrected_windows
 from sim2gp.identification.missing_physics.curves import Curve, curves_of
 from sim2gp.identification.missing_physics.data import (
+    FREE,
     AbstractData,
     OneStepData,
     WindowData,
@@ -37,8 +38,6 @@ from sim2gp.systems.effects.missing import missing_forces
 from sim2gp.systems.machine import plant_of
 from sim2gp.systems.mechanism import takes_forces
 from sim2gp.types import in_float64
-
-FREE = 0.1  # of a prior that leaves weights free, relative to 1 / sd
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sim2gp.errors import NotConverged, NotFinite
-from sim2gp.identification.missing_physics.data import AbstractData
+from sim2gp.identification.missing_physics.data import FREE, AbstractData
 from sim2gp.identification.missing_physics.score import (
     ScoredCandidate,
     sandwich_inflation,
@@ -21,6 +21,8 @@ from sim2gp.identification.missing_physics.score import (
     tempered_gain,
 )
 from sim2gp.inference.estimate import Estimate
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.effects.registry import Candidate
 from sim2gp.systems.effects.registry import candidates as registered
 from sim2gp.types import in_float64
@@ -149,15 +151,38 @@ def _refit(
     fitted = data.refit(scored.system, scored.starts, bare)
     table, name = scored.system.parameters, scored.candidate.name
     j = table.names.index(name)
-    mean, sd = fitted.posterior.mean, float(fitted.posterior.sd()[j])
+    inflation = _inflation(data, fitted, j)
+    raw = float(fitted.log_evidence - bare.log_evidence)
+    relative = float(fitted.posterior.sd()[j]) / table[name].sd
+    gain = tempered_gain(raw, inflation, relative)
+    sized, wide = fitted, table[name].sd
+    if table[name].map == "identity":
+        sized, wide = _with_free_size(data, scored.system, fitted, j), wide / FREE
+    mean, sd = sized.posterior.mean, float(sized.posterior.sd()[j])
     middle = table[name].constrain(float(mean[j]))
     ends = [table[name].constrain(float(mean[j]) + k * sd) for k in (-1.0, 1.0)]
+    widening = sd_widening(_inflation(data, sized, j), sd / wide)
+    half = 0.5 * (ends[1] - ends[0]) * widening
+    return FittedCandidate(scored, fitted, gain, middle, half, inflation)
+
+
+def _inflation(data: AbstractData, fitted: Estimate, j: int) -> float:
+    """That of the variance of parameter ``j`` of a fit."""
     white = np.linalg.solve(fitted.prior.scale, fitted.posterior.scale)
-    inflation = sandwich_inflation(
+    return sandwich_inflation(
         np.asarray(fitted.scores), data.cluster, white @ white[j], j
     )
-    raw = float(fitted.log_evidence - bare.log_evidence)
-    relative = sd / table[name].sd
-    gain = tempered_gain(raw, inflation, relative)
-    half = 0.5 * (ends[1] - ends[0]) * sd_widening(inflation, relative)
-    return FittedCandidate(scored, fitted, gain, middle, half, inflation)
+
+
+def _with_free_size(
+    data: AbstractData, system: AbstractSystem, fitted: Estimate, j: int
+) -> Estimate:
+    """The fit where the effect may be of any size.
+
+    Evidence needs a prior of the size, and that prior draws the effect to zero. Where
+    masses and motor are unknown, too, it draws them along, and data do not resist.
+    """
+    about = fitted.prior
+    wide = Gaussian(about.mean, about.scale.at[j, j].divide(FREE))
+    start = np.asarray(wide.whitened(fitted.posterior.mean))[None]
+    return data.refit(system, start, fitted, wide)

@@ -93,10 +93,12 @@ class Sines:
     def features(self, z: Float[AnyArray, "*b"]) -> Float[AnyArray, "*b k"]:
         """Its values for each weight alone."""
         xp, (angle, _) = library(z), self._angle(z)
+        sine, cosine = xp.sin(angle), xp.cos(angle)
         half = len(self.sds) // 2 if self.cosines else len(self.sds)
-        turns = angle[..., None] * xp.arange(1, half + 1, dtype=angle.dtype)
-        cosines = [xp.cos(turns)] if self.cosines else []
-        return xp.concatenate([xp.sin(turns), *cosines], axis=-1)
+        found = _multiples(xp.zeros_like(sine), sine, cosine, half)
+        if self.cosines:
+            found += _multiples(xp.ones_like(cosine), cosine, cosine, half)
+        return xp.stack(found, axis=-1)
 
     def _angle(self, z: Points) -> tuple[Points, AnyArray]:
         """``w (z - start)``, and its derivative."""
@@ -119,6 +121,18 @@ def _clenshaw(x: Float[AnyArray, "k *b"], cosine: Points) -> tuple[Points, Point
     for k in range(len(x) - 2, -1, -1):
         first, second = x[k] + 2.0 * cosine * first - second, first
     return first, second
+
+
+def _multiples(none: Points, one: Points, cosine: Points, count: int) -> list[Points]:
+    """``sin(k a)`` or ``cos(k a)`` for ``k = 1..count``, by Chebyshev's recurrence.
+
+    From those of ``k = 0`` and ``1``: XLA takes one sine at a time, eight times as long
+    as a product.
+    """
+    found = [none, one]
+    for _ in range(count - 1):
+        found.append(2.0 * cosine * found[-1] - found[-2])
+    return found[1:]
 
 
 def smooth(
