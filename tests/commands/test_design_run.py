@@ -49,6 +49,7 @@ def rows(path: Path) -> np.ndarray:
     return np.genfromtxt(path, delimiter=",", names=True, deletechars="")
 
 
+@pytest.mark.nightly  # 30 s; the search itself is tested by day
 def test_before_any_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     project, out = project_in(tmp_path), tmp_path / "next"
     words = ["design", str(project), "--out", str(out), *SHORT, *LIMITS, "--json"]

@@ -91,6 +91,7 @@ def test_processes_find_the_same(run: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert two.winner.scored.candidate.name == "theta.spring"
 
 
+@pytest.mark.nightly  # 80 s: a run and two searches
 @pytest.mark.usefixtures("few")
 def test_a_spring_is_found_in_logs_and_added(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"

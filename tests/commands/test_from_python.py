@@ -112,6 +112,7 @@ def test_arrays_are_logs(found: Any, machine: dict[str, Any]) -> None:
         sg.identify(found.project, [])
 
 
+@pytest.mark.nightly  # 22 s
 def test_a_machine_without_a_project_file(
     found: Any, machine: dict[str, Any], tmp_path: Path
 ) -> None:

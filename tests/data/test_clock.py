@@ -1,5 +1,6 @@
 """The period of a log and the step of a model, against C MuJoCo itself."""
 
+import itertools
 from dataclasses import replace
 
 import jax.numpy as jnp
@@ -23,7 +24,13 @@ from sim2gp.types import in_float64
 
 mujoco = pytest.importorskip("mujoco", reason="the extra `mujoco` is absent")
 
-HERTZ = (100, 125, 250, 500)
+HERTZ, STEPS = (100, 125, 250, 500), (0.001, 0.002, 0.004, 0.005)
+#: By day a period that the step divides, one that it does not, and a shorter one.
+BY_DAY = ((100, 0.002), (125, 0.005), (500, 0.004))
+CLOCKS = [
+    pytest.param(*pair, marks=() if pair in BY_DAY else pytest.mark.nightly)
+    for pair in itertools.product(HERTZ, STEPS)
+]
 SERVO = (
     '<mujoco><option timestep="{step}" integrator="implicitfast"/><worldbody><body>'
     '<joint name="q" axis="0 1 0" damping="{damping}" armature=".05"/>'
@@ -52,8 +59,7 @@ def spans_of(log: Log, system: MuJoCo | Machine) -> np.ndarray:
     return np.unique(np.round(spans[spans > 0.0], 9))
 
 
-@pytest.mark.parametrize("step", [0.001, 0.002, 0.004, 0.005])
-@pytest.mark.parametrize("hertz", HERTZ)
+@pytest.mark.parametrize(("hertz", "step"), CLOCKS)
 def test_a_row_is_a_whole_number_of_the_models_steps(hertz: int, step: float) -> None:
     """The model's own where they divide the period, else the longest that do."""
     period = 1.0 / hertz

@@ -293,6 +293,7 @@ def test_delayed_inputs_of_numpy_are_those_of_jax(short: Log) -> None:
             np.testing.assert_allclose(found, by, atol=1e-7 * np.abs(by).max())
 
 
+@pytest.mark.nightly  # 10 s
 def test_a_fit_near_another_ends_where_its_own_windows_say(short: Log) -> None:
     """Begun at the MAP of all windows, a fit of half of them forgets the others."""
     system, key = pendulum(), jax.random.key(0)

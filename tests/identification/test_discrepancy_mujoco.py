@@ -70,6 +70,7 @@ def test_a_fit_has_a_free_force_on_the_host() -> None:
     assert np.all(sd < 0.5 * FRICTION.friction)
 
 
+@pytest.mark.nightly  # 12 s
 @in_float64
 def test_windows_at_a_time_say_the_same_as_all_at_once(monkeypatch: Any) -> None:
     likelihood, found, _ = fitted(mujoco_arm(), arms().log(0))

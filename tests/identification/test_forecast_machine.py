@@ -121,6 +121,7 @@ def test_scales_stay_as_chosen_and_a_fit_that_fails_is_not_used(
     )
 
 
+@pytest.mark.nightly  # 24 s
 def test_nothing_is_added_where_nothing_is_missing() -> None:
     plain, machine, _ = arm("ar80")
     assert machine.system is plain.system

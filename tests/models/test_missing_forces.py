@@ -74,6 +74,7 @@ def test_a_spring_is_found_as_a_force_of_the_arms_position(with_spring):
             assert float(got) == pytest.approx(-STIFFNESS * angle, abs=1.5e-3)
 
 
+@pytest.mark.nightly  # 15 s; the curve is compared by day
 def test_it_predicts_what_the_simulator_alone_cannot(with_spring):
     """Steps that it has not seen: the simulator alone calls the spring noise."""
     belief, data = with_spring
