@@ -22,6 +22,7 @@ from sim2gp.identification.forecasts.prediction import (
     recording_names,
 )
 from sim2gp.identification.intervals.discrepancy import corrected_windows
+from sim2gp.identification.missing_physics.at_zero import at_zero
 from sim2gp.project import load_project
 from sim2gp.project.training_windows import cut_logs
 from sim2gp.types import in_float64
@@ -44,7 +45,7 @@ def compare(path: Path) -> list[str]:
     belief = fit_windows(system, windows, key=jax.random.key(0), robust=robust)
     known = belief.with_measurements(system.parameters)
     likelihood = WindowsLikelihood(system, windows)
-    wide = corrected_windows(likelihood, known, of).posterior
+    wide = corrected_windows(at_zero(likelihood, known), of).posterior
     grid = evaluation_windows(others, system, longest=CURVE[-1])
     lines = []
     for name, posterior in (("MAP", belief.posterior), ("corrected mean", wide)):

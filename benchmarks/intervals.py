@@ -45,6 +45,7 @@ from sim2gp.identification.intervals.discrepancy import corrected_windows
 from sim2gp.identification.intervals.pulls import pulls_of_windows
 from sim2gp.identification.intervals.scatter import NOTHING, CorrectedFit
 from sim2gp.identification.misfit.residuals import misfit_of_windows
+from sim2gp.identification.missing_physics.at_zero import at_zero
 from sim2gp.runs.cells import Cells, add_options
 from sim2gp.runs.workers import cores, spread
 from sim2gp.systems import AbstractSystem, UniformRodArm
@@ -110,13 +111,13 @@ def work(job: Job) -> dict[str, Any]:
         found[SPEAK[WINDOW]].append(misfit_of_windows(likelihood, belief).alarm)
         pulls = pulls_of_windows(likelihood, belief, group)
         x = candidates.linear(likelihood, belief, pulls)
-        ours = corrected_windows(likelihood, belief, group)
+        ours = corrected_windows(at_zero(likelihood, belief), group)
         found[MISSING].append(float(f"{ours.missing:.4g}"))
         each = {
             "plain": (x.z, np.asarray(belief.posterior.sd()) / prior_sd),
             "corrected": _units(ours, prior_sd),
             "scatter": _units(
-                corrected_windows(likelihood, belief, group, ()), prior_sd
+                corrected_windows(at_zero(likelihood, belief, ()), group), prior_sd
             ),
             "clusters": candidates.clusters(x),
             "mixture": candidates.mixture(x),
@@ -149,7 +150,9 @@ def _also(
             likelihood, belief, group = _fitted(system, data.log(s), LONGER, key)
             alarm = misfit_of_windows(likelihood, belief).alarm
             found.setdefault(SPEAK[LONGER], []).append(alarm)
-            centre, sd = _units(corrected_windows(likelihood, belief, group), prior_sd)
+            centre, sd = _units(
+                corrected_windows(at_zero(likelihood, belief), group), prior_sd
+            )
         error = centre - data.truth[s] / prior_sd
         found[job.also].append([_rounded(error), _rounded(sd)])
     return found

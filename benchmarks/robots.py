@@ -30,6 +30,7 @@ from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.errors import InputError, NotConverged, NotFinite
 from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.intervals.discrepancy import corrected_windows
+from sim2gp.identification.missing_physics.at_zero import at_zero
 from sim2gp.project import Project, load_project
 from sim2gp.project.training_windows import cut_logs
 from sim2gp.runs.cells import Cells, add_options
@@ -162,7 +163,7 @@ def work(job: Job) -> dict[str, Any]:
         except (NotConverged, NotFinite) as error:
             return {"failed": str(error)}
         likelihood = WindowsLikelihood(project.system, windows)
-        mine = corrected_windows(likelihood, belief, of).posterior
+        mine = corrected_windows(at_zero(likelihood, belief), of).posterior
         seconds = time.perf_counter() - started
     found = table.values(mine.mean)
     return {

@@ -15,6 +15,7 @@ from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.intervals.discrepancy import corrected_windows
 from sim2gp.identification.intervals.scatter import CorrectedFit
 from sim2gp.identification.misfit.residuals import misfit_of_windows
+from sim2gp.identification.missing_physics.at_zero import at_zero
 from sim2gp.project import Project, load_project
 from sim2gp.project.training_windows import cut_logs
 
@@ -51,7 +52,7 @@ def fitted(folder: Path, log: Log) -> tuple[Project, list[Log], CorrectedFit]:
     belief = fit_windows(project.system, windows, key=KEY)
     likelihood = WindowsLikelihood(project.system, windows)
     assert not misfit_of_windows(likelihood, belief).alarm
-    return project, [log], corrected_windows(likelihood, belief, of)
+    return project, [log], corrected_windows(at_zero(likelihood, belief), of)
 
 
 def asked(folder: Path, log: Log, *, alarm: bool = False) -> Longer:

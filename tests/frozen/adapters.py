@@ -24,6 +24,7 @@ from sim2gp.data.windows_likelihood import (
 )
 from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.intervals.discrepancy import corrected_windows
+from sim2gp.identification.missing_physics.at_zero import at_zero
 from sim2gp.identification.missing_physics.data import WindowData
 from sim2gp.identification.missing_physics.score import score_candidates
 from sim2gp.inference.estimate import Estimate
@@ -149,7 +150,7 @@ def intervals(fitted: Fitted, windows: Any, of: np.ndarray) -> Any:
     """The corrected posterior."""
     table = fitted.likelihood.system.parameters
     known = fitted.estimate.with_measurements(table)
-    return corrected_windows(fitted.likelihood, known, of).posterior
+    return corrected_windows(at_zero(fitted.likelihood, known), of).posterior
 
 
 def slopes(fitted: Fitted, windows: Any) -> tuple[np.ndarray, np.ndarray]:

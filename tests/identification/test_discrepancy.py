@@ -31,7 +31,11 @@ from sim2gp.identification.intervals.discrepancy import (
 from sim2gp.identification.intervals.pulls import Pulls
 from sim2gp.identification.intervals.scatter import CorrectedFit, correct_posterior
 from sim2gp.identification.intervals.words import interval_entry, missing_forces_table
-from sim2gp.identification.missing_physics.at_zero import forces_at_zero, forces_of
+from sim2gp.identification.missing_physics.at_zero import (
+    at_zero,
+    forces_at_zero,
+    forces_of,
+)
 from sim2gp.inference.arrowhead import Noise
 from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
@@ -236,10 +240,10 @@ def test_friction_that_the_simulator_lacks_is_in_the_intervals(
     truth, belief, likelihood = fitted(arms, "friction20", 0)
     one = np.zeros(len(likelihood.windows), int)
     assert away(truth, belief.posterior).max() > 12.0
-    alone = corrected_windows(likelihood, belief, one, ())
+    alone = corrected_windows(at_zero(likelihood, belief, ()), one)
     assert alone.kinds == ()
     assert away(truth, alone.posterior).max() > 7.0
-    found = corrected_windows(likelihood, belief, one)
+    found = corrected_windows(at_zero(likelihood, belief), one)
     assert found.missing > 0.99
     assert found.each["dry_friction"] > 0.99
     assert found.posterior.scale.shape == (4, 4)
@@ -263,7 +267,7 @@ def test_friction_that_the_simulator_lacks_is_in_the_intervals(
         other = dataclasses.replace(
             belief, posterior=Gaussian(at, belief.posterior.scale)
         )
-    again = corrected_windows(likelihood, other, one)
+    again = corrected_windows(at_zero(likelihood, other), one)
     assert away(Plain(found.posterior).mean, again.posterior).max() < 0.4
 
 
@@ -271,8 +275,8 @@ def test_friction_that_the_simulator_lacks_is_in_the_intervals(
 def test_a_sound_simulator_is_believed(arms: ModuleType) -> None:
     truth, belief, likelihood = fitted(arms, "white", 0)
     one = np.zeros(len(likelihood.windows), int)
-    found = corrected_windows(likelihood, belief, one)
-    alone = corrected_windows(likelihood, belief, one, ())
+    found = corrected_windows(at_zero(likelihood, belief), one)
+    alone = corrected_windows(at_zero(likelihood, belief, ()), one)
     assert found.missing < 0.3
     assert missing_forces_table(found) == []
     assert interval_entry(alone, {}, 50)["missing"] is None

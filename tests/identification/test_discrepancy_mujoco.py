@@ -14,7 +14,7 @@ from sim2gp.data.windows_likelihood import WindowsLikelihood, linearise
 from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.intervals import pulls
 from sim2gp.identification.intervals.discrepancy import corrected_windows
-from sim2gp.identification.missing_physics.at_zero import forces_of
+from sim2gp.identification.missing_physics.at_zero import at_zero, forces_of
 from sim2gp.systems import UniformRodArm, free_parts
 from sim2gp.systems.effects.forces import MissingForce, Sign
 from sim2gp.types import in_float64
@@ -40,7 +40,7 @@ def test_friction_that_the_model_lacks_is_found_and_the_truth_is_inside() -> Non
     """The plain interval of a damping is tens of sd away from its truth."""
     data, system = arms(), mujoco_arm()
     likelihood, found, group = fitted(system, data.log(1))
-    corrected = corrected_windows(likelihood, found, group)
+    corrected = corrected_windows(at_zero(likelihood, found), group)
     assert max(corrected.each, key=corrected.each.__getitem__) == "dry_friction"
     apart = np.abs(corrected.posterior.mean - data.truth[1])
     assert np.all(apart < 3.0 * corrected.posterior.sd())

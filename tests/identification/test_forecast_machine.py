@@ -14,6 +14,7 @@ from descents import estimate_of
 from interval_arms import CONDITIONS
 from sim2gp.data.grid import Grid, evaluation_windows, steps_of
 from sim2gp.data.split_log import cut
+from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.errors import NotConverged
 from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.forecasts import forecast_machine
@@ -23,6 +24,7 @@ from sim2gp.identification.forecasts.forecast_machine import (
     stored_forecast_machine,
 )
 from sim2gp.identification.forecasts.prediction import forecast_grid, subset
+from sim2gp.identification.missing_physics.at_zero import at_zero
 from sim2gp.inference.arrowhead import Noise
 from sim2gp.systems import UniformRodArm
 from sim2gp.types import in_float64
@@ -51,7 +53,8 @@ def arm(condition: str) -> Arm:
     windows = eqx.tree_at(lambda w: w.mask, windows, mask)
     fitted = fit_windows(system, windows, key=jax.random.key(0), starts=1)
     recording = np.zeros(len(windows), int)
-    machine = fit_forecast_machine(system, windows, fitted, recording)
+    fit = at_zero(WindowsLikelihood(system, windows), fitted)
+    machine = fit_forecast_machine(fit, recording)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(interval_arms, "NOISE", 1e-5)
         clean = interval_arms.recordings(CONDITIONS[condition], 2, 0).log(0)
@@ -103,7 +106,8 @@ def test_scales_stay_as_chosen_and_a_fit_that_fails_is_not_used(
     windows, _ = cut([log], system, window=0.2)
     known, none = system.parameters.prior(), jnp.zeros(1)
     fitted = estimate_of(known, known, Noise(none, none), none[None])
-    found = fit_forecast_machine(system, windows, fitted, np.zeros(len(windows), int))
+    fit = at_zero(WindowsLikelihood(system, windows), fitted)
+    found = fit_forecast_machine(fit, np.zeros(len(windows), int))
     assert found.system is system
     assert found.scales == {}
     table = given["system"].parameters

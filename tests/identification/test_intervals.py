@@ -27,6 +27,7 @@ from sim2gp.identification.intervals.pulls import (
     rows_of,
 )
 from sim2gp.identification.intervals.scatter import correct_posterior
+from sim2gp.identification.missing_physics.at_zero import at_zero
 from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.parameters import Parameter, Parameters
@@ -330,7 +331,7 @@ def test_a_linear_machines_centre_is_where_the_gaussian_says(
             cost_of(likelihood, belief, jnp.asarray(x)) for x in (at + dz, at)
         )
     assert there - here == pytest.approx(told, rel=1e-6)
-    ours = corrected_windows(likelihood, belief, of)
+    ours = corrected_windows(at_zero(likelihood, belief), of)
     plain = correct_posterior(belief.prior, belief.posterior, pulls)
     np.testing.assert_allclose(ours.posterior.mean, plain.posterior.mean, atol=1e-12)
 
@@ -346,10 +347,9 @@ def test_a_constant_at_its_bound_stays_where_the_data_are() -> None:
     windows, _ = cut([recorded(system, 301, [0.7, 0.0], drift)], system, window=0.8)
     belief = fit_windows(system, windows, key=jax.random.key(0))
     likelihood = WindowsLikelihood(system, windows)
-    of = np.zeros(len(windows), int)
-    pulls = pulls_of_windows(likelihood, belief, of)
+    pulls = pulls_of_windows(likelihood, belief, of := np.zeros(len(windows), int))
     naive = correct_posterior(belief.prior, belief.posterior, pulls)
-    ours = corrected_windows(likelihood, belief, of)
+    ours = corrected_windows(at_zero(likelihood, belief), of)
     with jax.enable_x64(True):
         best, bad, good = (
             cost_of(likelihood, belief, found.posterior.mean)

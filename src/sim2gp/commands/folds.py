@@ -16,6 +16,7 @@ from jaxtyping import Bool, Int
 from sim2gp.data.grid import CURVE, PERIOD, Grid, steps_of
 from sim2gp.data.logs import Log
 from sim2gp.data.windows import Windows
+from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.forecasts.baselines import regression_errors
 from sim2gp.identification.forecasts.forecast import Band, Forecast, fit_band
@@ -31,6 +32,7 @@ from sim2gp.identification.forecasts.prediction import (
     scored_rows,
     subset,
 )
+from sim2gp.identification.missing_physics.at_zero import at_zero
 from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.project import Project
@@ -141,9 +143,9 @@ def fit_fold(
         starts=starts,
         warm_start=warm_start,
     )
-    machine = fit_forecast_machine(
-        project.system, kept, fitted, part.recording, robust=robust
-    )
+    known = fitted.with_measurements(project.system.parameters)
+    start = at_zero(WindowsLikelihood(project.system, kept), known)
+    machine = fit_forecast_machine(start, part.recording, robust=robust)
     result = forecast_grid(machine.system, machine.posterior, grid, horizon)
     train, tested = subset(grid, part.known), subset(grid, part.test)
     curve = np.asarray([steps_of(h) for h in CURVE])

@@ -45,6 +45,7 @@ from sim2gp.identification.intervals.words import (
     missing_forces_table,
 )
 from sim2gp.identification.misfit.residuals import misfit_of_windows
+from sim2gp.identification.missing_physics.at_zero import at_zero
 from sim2gp.identification.missing_physics.curves import force_arrays
 from sim2gp.identification.words import bound_warnings
 from sim2gp.inference.estimate import Estimate
@@ -71,17 +72,13 @@ def identification_results(
     """The run's summary and arrays, and the corrected intervals."""
     table, (windows, places) = project.system.parameters, cuts
     of = np.asarray([k for k, _ in places])
-    machine = fit_forecast_machine(
-        project.system,
-        windows,
-        fitted,
-        recording_of_windows(logs, of),
-        robust=project.spec.likelihood.robust,
-    )
-    band, own = _own_forecasts(machine, grid, logs)
     known = fitted.with_measurements(table)
     likelihood = WindowsLikelihood(project.system, windows)
-    honest = corrected_windows(likelihood, known, of)
+    start = at_zero(likelihood, known)
+    recording, robust = recording_of_windows(logs, of), project.spec.likelihood.robust
+    machine = fit_forecast_machine(start, recording, robust=robust)
+    band, own = _own_forecasts(machine, grid, logs)
+    honest = corrected_windows(start, of)
     summary = _identification_summary(
         project, logs, likelihood, known, honest, band, seed
     )

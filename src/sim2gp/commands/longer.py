@@ -18,6 +18,7 @@ from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.intervals.discrepancy import corrected_windows
 from sim2gp.identification.intervals.scatter import CorrectedFit
 from sim2gp.identification.misfit.residuals import misfit_of_windows
+from sim2gp.identification.missing_physics.at_zero import at_zero
 from sim2gp.identification.words import digits
 from sim2gp.project import Project
 from sim2gp.project.training_windows import cut_logs
@@ -117,7 +118,7 @@ def fit_longer_windows(
         likelihood = WindowsLikelihood(system, windows)
         alarm = misfit_of_windows(likelihood, fitted).alarm
         fitted = fitted.with_measurements(system.parameters)
-        found = corrected_windows(likelihood, fitted, of)
+        found = corrected_windows(at_zero(likelihood, fitted), of)
     except (InputError, NotConverged, NotFinite, DeadParameters) as error:
         return no(f"they cannot be fitted ({error})")
     if not found.enough:

@@ -15,12 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
-from sim2gp.data.windows import Windows
-from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.errors import DeadParameters, NotConverged, NotFinite
 from sim2gp.identification.fit import fit_windows
-from sim2gp.identification.intervals.pulls import rows_of, without_starts
+from sim2gp.identification.intervals.pulls import without_starts
 from sim2gp.identification.missing_physics.at_zero import (
+    AtZero,
     forces_at_zero,
     forces_of,
     kinds_of,
@@ -30,9 +29,8 @@ from sim2gp.identification.missing_physics.held_out_gain import (
     helpful_kinds,
     recordings_or_parts,
 )
-from sim2gp.identification.missing_physics.reach import Range, box_of
+from sim2gp.identification.missing_physics.reach import Range
 from sim2gp.identification.words import digits, join_names
-from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.prior import ParameterPrior
 from sim2gp.systems.assemble import free_parts
@@ -108,23 +106,20 @@ def stored_forecast_machine(
 
 @in_float64
 def fit_forecast_machine(
-    system: AbstractSystem,
-    windows: Windows,
-    fitted: Estimate,
-    recording: Int[np.ndarray, " W"],
-    *,
-    robust: bool = False,
+    fit: AtZero, recording: Int[np.ndarray, " W"], *, robust: bool = False
 ) -> ForecastMachine:
-    """With the forces that predict recordings left out, fitted from ``fitted`` on.
+    """With the forces that predict recordings left out, fitted from ``fit`` on.
 
     ``recording`` numbers the windows' recordings; windows without measurements are not
     used. Without forces where none helps, or where a fit with them fails.
     """
-    box, plain = box_of(system, windows), ForecastMachine(system, fitted.posterior)
-    scales = _helpful(system, windows, fitted, recording, box)
+    system, box = fit.machine, fit.box
+    plain = ForecastMachine(system, fit.alone.posterior)
+    scales = _helpful(fit, recording)
     if not scales:
         return plain
-    free, start, _ = forces_at_zero(system, fitted, _of_kinds(system, box, scales))
+    kinds = _of_kinds(system, box, scales)
+    free, start, _ = forces_at_zero(system, fit.alone, kinds)
     table = free.parameters
     each = np.asarray([scales[name.rsplit(".", 1)[-1]] for name in table.groups])
     prior = ParameterPrior(table.prior(), table, each).as_gaussian()
@@ -132,7 +127,7 @@ def fit_forecast_machine(
     try:
         found = fit_windows(
             wider,
-            windows,
+            fit.likelihood.windows,
             key=jax.random.key(0),  # of starts that it does not draw
             prior=prior,
             robust=robust,
@@ -177,28 +172,19 @@ def forces_table(forces: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
     }
 
 
-def _helpful(
-    system: AbstractSystem,
-    windows: Windows,
-    fitted: Estimate,
-    recording: Int[np.ndarray, " W"],
-    box: Mapping[str, Range],
-) -> dict[str, float]:
+def _helpful(fit: AtZero, recording: Int[np.ndarray, " W"]) -> dict[str, float]:
     """Scales of the kinds that predict recordings left out."""
-    forces = forces_of(system, box)
-    if not forces:
+    if not fit.forces:
         return {}
-    known = fitted.with_measurements(system.parameters)
-    wider, whole, own = forces_at_zero(system, known, forces)
-    rows = rows_of(WindowsLikelihood(wider, windows), whole, whole.posterior.mean)
-    if not np.isfinite(rows).all():
+    windows, whole, own = fit.likelihood.windows, fit.fitted, fit.own
+    if not np.isfinite(fit.rows).all():
         return {}
     seen = np.asarray(windows.mask).any(axis=(1, 2))
-    rows, part = rows[seen], recordings_or_parts(recording[seen])
+    rows, part = fit.rows[seen], recordings_or_parts(recording[seen])
     rows = without_starts(rows, windows)
     each = [rows[part == k].reshape(-1, rows.shape[-1]) for k in np.unique(part)]
     at = np.asarray(whole.prior.whitened(whole.posterior.mean))[own]
-    kinds = kinds_of(wider.parameters.groups)
+    kinds = kinds_of(fit.likelihood.system.parameters.groups)
     return helpful_kinds(LeaveOneOut(each, own, at, kinds))
 
 

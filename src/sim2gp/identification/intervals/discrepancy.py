@@ -8,7 +8,6 @@ missing may have taken the fit far from it. The noise stays the fit's, which has
 misfit in it: that makes intervals rather too wide than too narrow.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -31,7 +30,7 @@ from sim2gp.identification.intervals.scatter import (
     correct_posterior,
 )
 from sim2gp.identification.missing_physics.at_zero import (
-    forces_at_zero,
+    AtZero,
     forces_of,
     kinds_of,
 )
@@ -41,7 +40,6 @@ from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.systems.assemble import free_parts
 from sim2gp.systems.base import AbstractSystem
-from sim2gp.systems.effects.forces import AbstractUnknownFunction
 from sim2gp.types import in_float64
 
 #: Sine of the angle to the parameters' span below which a force is one of them in
@@ -66,24 +64,16 @@ def compile_corrected(system: AbstractSystem, cut: Windows) -> None:
 
 
 @in_float64
-def corrected_windows(
-    likelihood: WindowsLikelihood,
-    fitted: Estimate,
-    group: Int[np.ndarray, " W"],
-    forces: Sequence[AbstractUnknownFunction] | None = None,
-) -> CorrectedFit:
+def corrected_windows(start: AtZero, group: Int[np.ndarray, " W"]) -> CorrectedFit:
     """The corrected posterior of a fit's parameters, checked with the simulator itself.
 
-    ``forces`` are what it may lack, with their prior sd: None is those of `forces_of`.
-    Raises `NotFinite` E203.
+    ``start`` is the fit, with the forces that its machine may lack. Raises `NotFinite`
+    E203.
     """
-    cut, system = likelihood.windows, likelihood.system
-    box = box_of(system, cut)
-    given = forces_of(system, box) if forces is None else tuple(forces)
-    system, whole, own = forces_at_zero(system, fitted, given)
-    wider, p = WindowsLikelihood(system, cut), len(own)
+    whole, own, wider = start.fitted, start.own, start.likelihood
+    cut, system, p = wider.windows, wider.system, len(own)
     mean, scale = (np.asarray(x) for x in (whole.prior.mean, whole.prior.scale))
-    rows = rows_of(wider, whole, whole.posterior.mean)
+    rows = start.rows
     pulls = pulls_of_rows(rows, cut, group)
     T, groups = _identifiable(pulls, own, system.parameters.groups)
     k = T.shape[1]
@@ -95,7 +85,7 @@ def corrected_windows(
         now = Gaussian(jnp.asarray(at), prior.scale)
         found = correct_posterior(prior, now, pulls.onto(T), groups)
         if not found.enough:
-            return replace(found, posterior=fitted.posterior)
+            return replace(found, posterior=start.alone.posterior)
         to = np.asarray(found.posterior.mean)
         inflation = found.inflation
         to, rows = _trusted(wider, whole, rows, pulls.onto(T), onto, at, to, inflation)
@@ -111,7 +101,7 @@ def corrected_windows(
     return replace(
         found,
         posterior=Gaussian(mine.mean, mine.triangular()),
-        curves=curves_of(system, given, box, both),
+        curves=curves_of(system, start.forces, start.box, both),
     )
 
 

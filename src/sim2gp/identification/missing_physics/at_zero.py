@@ -1,12 +1,16 @@
 """A machine with the forces that it may lack, all at zero where a fit has ended."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
+from sim2gp.data.windows_likelihood import WindowsLikelihood
+from sim2gp.identification.intervals.pulls import rows_of
+from sim2gp.identification.missing_physics.reach import Range, box_of
 from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.systems.assemble import free_parts
@@ -16,8 +20,50 @@ from sim2gp.systems.effects.missing import missing_forces
 from sim2gp.systems.machine import plant_of
 from sim2gp.systems.mechanism import takes_forces
 from sim2gp.systems.parts import AbstractPart
+from sim2gp.types import in_float64
 
 Places = Int[np.ndarray, " _"]
+
+
+@dataclass(frozen=True)
+class AtZero:
+    """A fit of windows, and the same with forces at zero.
+
+    ``likelihood``, ``fitted`` and ``forces`` are those of the machine with forces,
+    ``own`` the places of the machine's parameters among its own, ``box`` where it
+    moved.
+    """
+
+    machine: AbstractSystem
+    alone: Estimate
+    likelihood: WindowsLikelihood
+    fitted: Estimate
+    own: Int[np.ndarray, " p"]
+    forces: tuple[AbstractUnknownFunction, ...]
+    box: Mapping[str, Range]
+
+    @cached_property
+    def rows(self) -> Float[np.ndarray, "W k npr"]:
+        """The windows, linearised (`rows_of`): once for all who ask."""
+        return rows_of(self.likelihood, self.fitted, self.fitted.posterior.mean)
+
+
+@in_float64
+def at_zero(
+    likelihood: WindowsLikelihood,
+    fitted: Estimate,
+    forces: Sequence[AbstractUnknownFunction] | None = None,
+) -> AtZero:
+    """A fit with what its machine may lack: None is those of `forces_of`.
+
+    Measured sums count as they do in the fit's prior (`Estimate.with_measurements`).
+    """
+    machine, cut = likelihood.system, likelihood.windows
+    box = box_of(machine, cut)
+    given = forces_of(machine, box) if forces is None else tuple(forces)
+    system, whole, own = forces_at_zero(machine, fitted, given)
+    wider = WindowsLikelihood(system, cut)
+    return AtZero(machine, fitted, wider, whole, own, given, box)
 
 
 def forces_of(

@@ -20,6 +20,7 @@ from jaxtyping import Float
 from sim2gp.data.one_step import OneStepLikelihood, estimate_forces
 from sim2gp.identification.intervals.averaging import NONE, NOTHING
 from sim2gp.identification.intervals.discrepancy import corrected_windows
+from sim2gp.identification.missing_physics.at_zero import at_zero
 from sim2gp.identification.missing_physics.curves import Curve, curves_of
 from sim2gp.identification.missing_physics.data import (
     FREE,
@@ -73,7 +74,7 @@ def find_forces(data: AbstractData, bare: Estimate) -> FoundForces:
     box = box_of(data.system, data.windows)
     forces = missing_forces(data.system, box, fine=True, closely=True)
     likelihood = data.likelihood(data.system)
-    found = corrected_windows(likelihood, bare, data.recording, tuple(forces))
+    found = corrected_windows(at_zero(likelihood, bare, forces), data.recording)
     return FoundForces(found.each, found.curves)
 
 
