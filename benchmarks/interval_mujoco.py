@@ -11,7 +11,8 @@ import numpy as np
 
 from sim2gp.systems import AbstractSystem, MuJoCo, UniformRodArm
 from sim2gp.systems.assemble import with_parts
-from sim2gp.systems.effects.forces import MissingForce, Sign, Sines
+from sim2gp.systems.effects.bases import Sign, Sines
+from sim2gp.systems.effects.forces import MissingForce
 
 if TYPE_CHECKING:
     from interval_arms import Condition

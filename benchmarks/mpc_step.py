@@ -4,7 +4,9 @@
 
 iCEM with 128 sequences, 30 steps ahead, 4 rounds, on the Furuta; the worlds take turns
 in one run, so that ratios hold on a busy machine too. Each model was fitted to five
-seconds of random input. Medians over steps, without compilation.
+seconds of random input. `MissingForces` plans with the forces that are on: with none
+it is SIM2GP, with one (of the arm's position) or with all are draws of the prior.
+Medians over steps, without compilation.
 """
 
 import argparse
@@ -18,12 +20,12 @@ import numpy as np
 from one_step import EPISODES, STEPS, random_episode
 from sim2gp.commands.compare import MODELS
 from sim2gp.data.transitions import Transitions
-from sim2gp.models import Sim2GP
+from sim2gp.models import MissingForces, Sim2GP
 from sim2gp.planning import MPC, MarkovObjective, World
 from sim2gp.planning.episode import oracle_world, world_of
 from sim2gp.planning.icem import ICEM
 from sim2gp.planning.tasks import Task, furuta_swingup
-from sim2gp.systems import Furuta
+from sim2gp.systems import Furuta, free_parts
 
 SIMULATOR, LINEAR = "plain simulator", "SIM2GP"
 PLANNER = MPC(update=ICEM(samples=128, iterations=4), horizon=30)
@@ -46,6 +48,11 @@ def worlds(task: Task) -> dict[str, World]:
     for name, learner in MODELS.items():
         model = learner.make(sim, {})
         belief = model.fit(model.init(key), data, key=key)
+        objective = MarkovObjective(task.reward)
+        found[name] = world_of(task, belief.sample(key), objective, history=0)
+    forces = MissingForces(sim).forces
+    for name, some in (("one force", forces[:1]), ("all forces", forces)):
+        belief = Sim2GP(free_parts(Furuta(), some)).init(key)
         objective = MarkovObjective(task.reward)
         found[name] = world_of(task, belief.sample(key), objective, history=0)
     return found

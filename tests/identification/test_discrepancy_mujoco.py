@@ -16,7 +16,8 @@ from sim2gp.identification.intervals import pulls
 from sim2gp.identification.intervals.discrepancy import corrected_windows
 from sim2gp.identification.missing_physics.at_zero import at_zero, forces_of
 from sim2gp.systems import UniformRodArm, free_parts
-from sim2gp.systems.effects.forces import MissingForce, Sign
+from sim2gp.systems.effects.bases import Sign
+from sim2gp.systems.effects.forces import MissingForce
 from sim2gp.types import in_float64
 
 pytest.importorskip("mujoco", reason="the extra `mujoco` is not installed")

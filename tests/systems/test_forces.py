@@ -9,14 +9,8 @@ import pytest
 
 from rail_mass import DT, rail_mass
 from sim2gp.systems import Furuta, free_parts
-from sim2gp.systems.effects.forces import (
-    Gap,
-    MissingForce,
-    MissingInput,
-    Sign,
-    periodic,
-    smooth,
-)
+from sim2gp.systems.effects.bases import Gap, Sign, periodic, smooth
+from sim2gp.systems.effects.forces import MissingForce, MissingInput
 from sim2gp.systems.effects.missing import missing_forces
 from sim2gp.systems.effects.scales import drives
 from sim2gp.systems.machine import Machine
@@ -133,6 +127,25 @@ def test_derivatives_are_those_of_differences():
         slope = (f(step) - f(-step)) / 2e-6
         np.testing.assert_allclose(J[:, k], slope, atol=1e-7, rtol=1e-5)
     np.testing.assert_allclose(jax.jacrev(f)(zero), J, atol=1e-11)
+
+
+def test_a_draw_of_float32_follows_its_direction_as_in_float64():
+    """Planning takes one direction of all weights, by a rule for that alone."""
+    machine = free_parts(Furuta(), missing_forces(Furuta(), BOX))
+    prior = machine.parameters.prior()
+    tt = prior.mean + prior.scale @ (0.3 * RNG.normal(size=prior.mean.size))
+    delta = prior.scale @ (0.1 * RNG.normal(size=tt.size))
+    s, a = jnp.asarray([0.4, -1.1, 2.0, -3.0]), jnp.asarray([1.3])
+
+    def along(tt, delta, s, a):
+        f = lambda tt: machine.transition(tt, s, a, 0.02)  # noqa: E731
+        return jax.jvp(f, (tt,), (delta,))[1]
+
+    exact = along(tt, delta, s, a)
+    single = along(*(x.astype(jnp.float32) for x in (tt, delta, s, a)))
+    assert single.dtype == jnp.float32
+    size = float(jnp.max(jnp.abs(exact)))
+    np.testing.assert_allclose(single, exact, atol=1e-4 * size)
 
 
 def test_a_function_is_pushed_as_if_the_force_were_its_own():

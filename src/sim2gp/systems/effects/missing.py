@@ -4,15 +4,11 @@ import math
 from collections.abc import Mapping
 
 from sim2gp.systems.base import LONGEST_MEAN, AbstractSystem
+from sim2gp.systems.effects.bases import Gap, Sign, periodic, ripple, smooth
 from sim2gp.systems.effects.forces import (
     AbstractUnknownFunction,
-    Gap,
     MissingForce,
     MissingInput,
-    Sign,
-    periodic,
-    ripple,
-    smooth,
 )
 from sim2gp.systems.effects.scales import drives
 from sim2gp.systems.effects.units import joint_of
