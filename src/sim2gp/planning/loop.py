@@ -110,41 +110,102 @@ def posterior_sampling(
     raises, `NotFinite`, and E148 for an impossible count.
     """
     _check_counts(episodes, history, update_every)
-    m = task.actions.low.size
-    data = Transitions.empty(episodes * task.horizon, task.size + history * m, m)
-    belief = model.init(key_for(key, 0, Purpose.INIT))
-    summaries, trajectories = [_parameters(belief)], []
-    planner_state = None
+    run = Learning(task, model, planner, objective, episodes, key, history, world)
     for e in range(1, episodes + 1):
-
-        def world_in(belief: AbstractBelief, e: int = e) -> World:
-            dynamics = world(belief, key_for(key, e, Purpose.DRAW))
-            return world_of(task, dynamics, objective(belief), history=history)
-
-        start = world_in(belief)
-        if planner_state is None:
-            planner_state = planner.init(start, key=key_for(key, 0, Purpose.PREPARE))
-        planner_state = planner.prepare(
-            planner_state, start, data, key=key_for(key, e, Purpose.PREPARE)
-        )
-        key_e, fitting = key_for(key, e, Purpose.EPISODE), key_for(key, e, Purpose.FIT)
+        start = run.begin()
         trajectory, planner_state = episode(
             task,
             planner,
-            planner_state,
+            run.planner_state,
             start,
-            key=key_e,
+            key=run.key_for(Purpose.EPISODE),
             part=update_every,
-            world_at=within(model, belief, data, history, world_in, key=fitting),
+            world_at=within(
+                model,
+                run.belief,
+                run.data,
+                history,
+                run.world_in,
+                key=run.key_for(Purpose.FIT),
+            ),
         )
-        data = data.extend(*trajectory.transitions(history))
-        if final_fit or e < episodes:
-            belief = model.fit(belief, data, key=fitting)
-        trajectories.append(trajectory)
-        summaries.append(_parameters(belief))
+        run.learn(trajectory, planner_state, fit=final_fit or e < episodes)
         if on_episode is not None:
-            on_episode(Episode(e, trajectory, belief))
-    return _history(trajectories, summaries, belief, data, planner_state)
+            on_episode(Episode(e, trajectory, run.belief))
+    return run.flown()
+
+
+class Learning:
+    """A run of posterior sampling between its episodes: what is known, and what next.
+
+    Before an episode `begin` gives the world to plan in, after it `learn` takes what
+    was seen. ``episode`` counts from 1, 0 before the first.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        model: AbstractModel,
+        planner: AbstractPlanner,
+        objective: Callable[[AbstractBelief], AbstractObjective],
+        episodes: int,
+        key: Key,
+        history: int = 0,
+        world: Callable[[AbstractBelief, Key], Dynamics] = drawn,
+    ) -> None:
+        """Arguments as those of `posterior_sampling`."""
+        self.task, self.model, self.planner, self.key = task, model, planner, key
+        self.objective, self.history, self.world = objective, history, world
+        m = task.actions.low.size
+        self.data = Transitions.empty(
+            episodes * task.horizon, task.size + history * m, m
+        )
+        self.episode, self.planner_state = 0, None
+        self.belief = model.init(key_for(key, 0, Purpose.INIT))
+        self.summaries = [_parameters(self.belief)]
+        self.trajectories: list[Trajectory] = []
+
+    def key_for(self, purpose: Purpose) -> Key:
+        """The key of one purpose in this episode."""
+        return key_for(self.key, self.episode, purpose)
+
+    def world_in(self, belief: AbstractBelief) -> World:
+        """This episode's world, by a belief."""
+        dynamics = self.world(belief, self.key_for(Purpose.DRAW))
+        objective = self.objective(belief)
+        return world_of(self.task, dynamics, objective, history=self.history)
+
+    def begin(self) -> World:
+        """The next episode's world; the planner is ready for it."""
+        self.episode += 1
+        start, planner = self.world_in(self.belief), self.planner
+        if self.planner_state is None:
+            first = key_for(self.key, 0, Purpose.PREPARE)
+            self.planner_state = planner.init(start, key=first)
+        self.planner_state = planner.prepare(
+            self.planner_state, start, self.data, key=self.key_for(Purpose.PREPARE)
+        )
+        return start
+
+    def learn(self, flown: Trajectory, planner_state: Any, *, fit: bool) -> None:
+        """Keep what was seen; with ``fit``, fit all of it. Raises what a fit raises."""
+        self.planner_state = planner_state
+        self.data = self.data.extend(*flown.transitions(self.history))
+        if fit:
+            key = self.key_for(Purpose.FIT)
+            self.belief = self.model.fit(self.belief, self.data, key=key)
+        self.trajectories.append(flown)
+        self.summaries.append(_parameters(self.belief))
+
+    def flown(self) -> History:
+        """All episodes so far."""
+        return _history(
+            self.trajectories,
+            self.summaries,
+            self.belief,
+            self.data,
+            self.planner_state,
+        )
 
 
 def within(
