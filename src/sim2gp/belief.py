@@ -124,3 +124,10 @@ class AbstractModel(eqx.Module):
         self, belief: AbstractBelief, s: State, a: Action, s2: State
     ) -> AbstractBelief:
         """One more transition: pure and shape-stable, for use inside scans."""
+
+    def shared(self, draw: Dynamics) -> Dynamics:
+        """The same draw, in a form that the draws of all beliefs of this model have.
+
+        Runs that are planned in one program ask for it.
+        """
+        return draw

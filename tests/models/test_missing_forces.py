@@ -137,3 +137,16 @@ def test_of_the_simulator_alone_the_forces_are_averaged(with_spring):
     precision = np.linalg.inv((C @ C.T)[own, own]) - np.eye(8)
     A = np.asarray(alone.information)
     np.testing.assert_allclose(A.T @ A, precision, rtol=1e-4, atol=1e-6)
+
+
+def test_a_draw_is_the_same_with_all_forces(with_spring):
+    """Of the machine with one force, and of the one with all: the same function."""
+    belief, _ = with_spring
+    draw = belief.sample(KEY)
+    shared = MODEL.shared(draw)
+    assert len(shared.tt) > len(draw.tt)
+    assert shared.system is MODEL.system
+    s, a = jnp.asarray([1.0, 0.2, 1.0, -2.0]), jnp.asarray([1.0])
+    np.testing.assert_allclose(shared(s, a), draw(s, a), rtol=1e-5)
+    plain = MODEL.init(KEY).sample(KEY)
+    assert jax.tree.structure(MODEL.shared(plain)) == jax.tree.structure(shared)

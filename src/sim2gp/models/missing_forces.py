@@ -21,13 +21,14 @@ from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.groups import Start
 from sim2gp.inference.prior import ParameterPrior
 from sim2gp.inference.relevance import OFF, ON
+from sim2gp.models.draws import LinearizedDraw
 from sim2gp.models.features import Encoding
 from sim2gp.models.sim2gp import Sim2GP, Sim2GPBelief, belief_of
 from sim2gp.systems.assemble import free_parts
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.effects.forces import AbstractUnknownFunction
 from sim2gp.systems.effects.missing import missing_forces
-from sim2gp.types import Action, Key, State, in_float64
+from sim2gp.types import Action, Dynamics, Key, State, in_float64
 
 
 class MissingForces(AbstractModel):
@@ -90,6 +91,19 @@ class MissingForces(AbstractModel):
     ) -> Sim2GPBelief:
         """Condition on one transition; scales wait for the next fit."""
         return self.sim.update(belief, s, a, s2)
+
+    def shared(self, draw: Dynamics) -> Dynamics:
+        """The draw as one of the machine with all forces: those that are off are zero.
+
+        Slower, but every set of forces is one program.
+        """
+        assert isinstance(draw, LinearizedDraw)
+        at, mean = self._places(draw.system), self.sim.prior.mean.astype(jnp.float32)
+        tt, delta = (
+            mean.at[at].set(draw.tt),
+            jnp.zeros_like(mean).at[at].set(draw.delta),
+        )
+        return LinearizedDraw(self.system, tt, delta, draw.dt)
 
     def _prior(self) -> ParameterPrior:
         """With all forces at the scale of their own prior."""

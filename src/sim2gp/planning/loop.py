@@ -139,7 +139,8 @@ class Learning:
     """A run of posterior sampling between its episodes: what is known, and what next.
 
     Before an episode `begin` gives the world to plan in, after it `learn` takes what
-    was seen. ``episode`` counts from 1, 0 before the first.
+    was seen. ``episode`` counts from 1, 0 before the first. Of a run that is flown with
+    others draws are `shared`.
     """
 
     def __init__(
@@ -160,7 +161,7 @@ class Learning:
         self.data = Transitions.empty(
             episodes * task.horizon, task.size + history * m, m
         )
-        self.episode, self.planner_state = 0, None
+        self.episode, self.planner_state, self.shared = 0, None, False
         self.belief = model.init(key_for(key, 0, Purpose.INIT))
         self.summaries = [_parameters(self.belief)]
         self.trajectories: list[Trajectory] = []
@@ -172,6 +173,8 @@ class Learning:
     def world_in(self, belief: AbstractBelief) -> World:
         """This episode's world, by a belief."""
         dynamics = self.world(belief, self.key_for(Purpose.DRAW))
+        if self.shared:
+            dynamics = self.model.shared(dynamics)
         objective = self.objective(belief)
         return world_of(self.task, dynamics, objective, history=self.history)
 

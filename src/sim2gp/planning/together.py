@@ -30,6 +30,8 @@ def learn_together(runs: Sequence[Learning], episodes: int) -> list[Ended]:
     The last episode is not fitted.
     """
     failed = [""] * len(runs)
+    for run in runs:
+        run.shared = True
     for e in range(1, episodes + 1):
         left = [k for k, why in enumerate(failed) if not why]
         worlds = {k: runs[k].begin() for k in left}
