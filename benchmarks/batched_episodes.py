@@ -1,9 +1,9 @@
-"""Many seeds in one program: seconds of an episode, by how many fly at once.
+"""Many seeds in one program: seconds of an episode, by how many run at once.
 
     python benchmarks/batched_episodes.py [--seeds N...] [--out FILE]
 
 Each seed plans in a draw of its own (`MPC()`, five seconds of the Furuta): of SIM2GP,
-and with all missing forces. Times are without compilation, which is told apart; the
+and with all missing forces. Times are without compilation, which is given apart; the
 device is JAX's default one.
 """
 
@@ -25,27 +25,24 @@ from sim2gp.systems import Furuta, free_parts
 
 
 def timed(sim: Sim2GP, count: int) -> dict[str, Any]:
-    """Seconds to compile and to fly an episode of each of so many draws."""
+    """Seconds to compile and to run an episode of each of so many draws."""
     task, planner, belief = furuta_swingup(), MPC(), sim.init(jax.random.key(0))
     keys = jax.random.split(jax.random.key(1), count)
     draws = [belief.sample(key) for key in keys]
-    first, tt, delta = (
-        draws[0],
-        *(jnp.stack([getattr(d, name) for d in draws]) for name in ("tt", "delta")),
-    )
+    tt, delta = (jnp.stack([getattr(d, x) for d in draws]) for x in ("tt", "delta"))
 
-    def flown(tt: jax.Array, delta: jax.Array, key: jax.Array) -> jax.Array:
-        draw = eqx.tree_at(lambda d: (d.tt, d.delta), first, (tt, delta))
+    def one(tt: jax.Array, delta: jax.Array, key: jax.Array) -> jax.Array:
+        draw = eqx.tree_at(lambda d: (d.tt, d.delta), draws[0], (tt, delta))
         world = world_of(task, draw, MarkovObjective(task.reward))
         state = planner.init(world, key=key)
         return run_episode(task, planner, state, world, key=key)[0].total
 
     started = time.perf_counter()
-    fly = jax.jit(jax.vmap(flown)).lower(tt, delta, keys).compile()
+    run = jax.jit(jax.vmap(one)).lower(tt, delta, keys).compile()
     compiled = time.perf_counter()
-    jax.block_until_ready(fly(tt, delta, keys))
+    jax.block_until_ready(run(tt, delta, keys))
     warm = time.perf_counter()
-    returns = jax.block_until_ready(fly(tt, delta, keys))
+    returns = jax.block_until_ready(run(tt, delta, keys))
     seconds = time.perf_counter() - warm
     return {
         "seeds": count,

@@ -89,18 +89,20 @@ class ShapedForce(AbstractForce):
         by_speed = SHAPES[self.shape].of == "velocity"
         return f"{self.where}.velocity" if by_speed else self.where
 
+    def law(self, z: Any) -> Any:
+        """The curve for a magnitude of one."""
+        return SHAPES[self.shape].law((z - self.centre) / self.reach)
+
     def value(self, z: Any) -> Any:
         """The curve at the magnitude."""
-        law = SHAPES[self.shape].law
-        return self.magnitude * law((z - self.centre) / self.reach)
+        return self.magnitude * self.law(z)
 
     def force(
         self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
     ) -> Pair:
         i = system.joint(self.where)
         z = v[i] if SHAPES[self.shape].of == "velocity" else q[i]
-        law = SHAPES[self.shape].law
-        return on_joint(i, x * law((z - self.centre) / self.reach))
+        return on_joint(i, x * self.law(z))
 
 
 class ShapedInput(AbstractInputEffect):
@@ -119,12 +121,16 @@ class ShapedInput(AbstractInputEffect):
         """The channel that it is a function of."""
         return self.where
 
+    def law(self, z: Any) -> Any:
+        """What is added, for a magnitude of one."""
+        return SHAPES[self.shape].law(z / self.reach)
+
     def value(self, z: Any) -> Any:
         """What is added, at the magnitude."""
-        return self.magnitude * SHAPES[self.shape].law(z / self.reach)
+        return self.magnitude * self.law(z)
 
     def through(self, x: Scalar, u: Scalar) -> Scalar:
-        return u + x * SHAPES[self.shape].law(u / self.reach)
+        return u + x * self.law(u)
 
 
 Planted = ShapedForce | ShapedInput

@@ -44,18 +44,18 @@ def random_data(task: Task) -> Transitions:
 def worlds(task: Task) -> dict[str, World]:
     """A draw of each fitted model as a world, beside the simulator itself."""
     sim, data, key = Sim2GP(Furuta()), random_data(task), jax.random.key(1)
-    found = {SIMULATOR: oracle_world(task)}
+    beliefs = {}
     for name, learner in MODELS.items():
         model = learner.make(sim, {})
-        belief = model.fit(model.init(key), data, key=key)
-        objective = MarkovObjective(task.reward)
-        found[name] = world_of(task, belief.sample(key), objective, history=0)
+        beliefs[name] = model.fit(model.init(key), data, key=key)
     forces = MissingForces(sim).forces
     for name, some in (("one force", forces[:1]), ("all forces", forces)):
-        belief = Sim2GP(free_parts(Furuta(), some)).init(key)
-        objective = MarkovObjective(task.reward)
-        found[name] = world_of(task, belief.sample(key), objective, history=0)
-    return found
+        beliefs[name] = Sim2GP(free_parts(Furuta(), some)).init(key)
+    objective = MarkovObjective(task.reward)
+    return {SIMULATOR: oracle_world(task)} | {
+        name: world_of(task, belief.sample(key), objective, history=0)
+        for name, belief in beliefs.items()
+    }
 
 
 def measured(found: Mapping[str, World], task: Task, steps: int) -> dict[str, list]:

@@ -8,7 +8,7 @@ import pytest
 from sim2gp.cli import main
 
 
-@pytest.mark.nightly  # 40 s: it compiles and flies an oracle and a learner
+@pytest.mark.nightly  # 40 s: it compiles and runs an oracle and a learner
 def test_a_mismatched_demo_ends_with_a_report(tmp_path: Path) -> None:
     out = tmp_path / "demo"
     assert main(["demo", "--mismatch", "--episodes", "1", "--out", str(out)]) == 0

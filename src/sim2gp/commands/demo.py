@@ -27,8 +27,6 @@ from sim2gp.identification.missing_physics.curves import (
     functions_of,
 )
 from sim2gp.identification.missing_physics.reach import box_of_rows
-from sim2gp.inference.prior import ParameterPrior
-from sim2gp.inference.relevance import ON
 from sim2gp.models import (
     MissingForces,
     PointEstimate,
@@ -247,14 +245,11 @@ def _forces(history: History) -> tuple[Curve, ...]:
     """Forces that the data have turned on, over where the machine has been."""
     belief, data = history.belief, history.data
     assert isinstance(belief, Sim2GPBelief)
-    system, table = belief.system, belief.system.parameters
-    scales = ParameterPrior(table.prior(), table).scales_in(belief.prior)
-    on = [g for g, tau in zip(table.groups, scales, strict=True) if tau > ON]
-    known = [f for f in functions_of(system) if f.name in on]
+    system = belief.system
     there = np.asarray(data.mask)
     rows = np.asarray(data.state)[there], np.asarray(data.action)[there]
     box = box_of_rows(system, *rows)
-    return curves_of(system, known, box, belief.posterior)
+    return curves_of(system, functions_of(system), box, belief.posterior)
 
 
 def _animation(task: Task, machine: str, scores: np.ndarray) -> dict[str, Any]:

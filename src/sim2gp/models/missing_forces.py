@@ -99,11 +99,8 @@ class MissingForces(AbstractModel):
         """
         assert isinstance(draw, LinearizedDraw)
         at, mean = self._places(draw.system), self.sim.prior.mean.astype(jnp.float32)
-        tt, delta = (
-            mean.at[at].set(draw.tt),
-            jnp.zeros_like(mean).at[at].set(draw.delta),
-        )
-        return LinearizedDraw(self.system, tt, delta, draw.dt)
+        delta = jnp.zeros_like(mean).at[at].set(draw.delta)
+        return LinearizedDraw(self.system, mean.at[at].set(draw.tt), delta, draw.dt)
 
     def _prior(self) -> ParameterPrior:
         """With all forces at the scale of their own prior."""

@@ -110,7 +110,7 @@ def posterior_sampling(
     raises, `NotFinite`, and E148 for an impossible count.
     """
     _check_counts(episodes, history, update_every)
-    run = Learning(task, model, planner, objective, episodes, key, history, world)
+    run = SamplingRun(task, model, planner, objective, episodes, key, history, world)
     for e in range(1, episodes + 1):
         start = run.begin()
         trajectory, planner_state = episode(
@@ -132,15 +132,14 @@ def posterior_sampling(
         run.learn(trajectory, planner_state, fit=final_fit or e < episodes)
         if on_episode is not None:
             on_episode(Episode(e, trajectory, run.belief))
-    return run.flown()
+    return run.result()
 
 
-class Learning:
+class SamplingRun:
     """A run of posterior sampling between its episodes: what is known, and what next.
 
     Before an episode `begin` gives the world to plan in, after it `learn` takes what
-    was seen. ``episode`` counts from 1, 0 before the first. Of a run that is flown with
-    others draws are `shared`.
+    was seen. ``episode`` counts from 1, 0 before the first.
     """
 
     def __init__(
@@ -161,7 +160,7 @@ class Learning:
         self.data = Transitions.empty(
             episodes * task.horizon, task.size + history * m, m
         )
-        self.episode, self.planner_state, self.shared = 0, None, False
+        self.episode, self.planner_state = 0, None
         self.belief = model.init(key_for(key, 0, Purpose.INIT))
         self.summaries = [_parameters(self.belief)]
         self.trajectories: list[Trajectory] = []
@@ -170,18 +169,18 @@ class Learning:
         """The key of one purpose in this episode."""
         return key_for(self.key, self.episode, purpose)
 
-    def world_in(self, belief: AbstractBelief) -> World:
-        """This episode's world, by a belief."""
+    def world_in(self, belief: AbstractBelief, shared: bool = False) -> World:
+        """This episode's world, by a belief; ``shared`` as `AbstractModel.shared`."""
         dynamics = self.world(belief, self.key_for(Purpose.DRAW))
-        if self.shared:
+        if shared:
             dynamics = self.model.shared(dynamics)
         objective = self.objective(belief)
         return world_of(self.task, dynamics, objective, history=self.history)
 
-    def begin(self) -> World:
+    def begin(self, *, shared: bool = False) -> World:
         """The next episode's world; the planner is ready for it."""
         self.episode += 1
-        start, planner = self.world_in(self.belief), self.planner
+        start, planner = self.world_in(self.belief, shared), self.planner
         if self.planner_state is None:
             first = key_for(self.key, 0, Purpose.PREPARE)
             self.planner_state = planner.init(start, key=first)
@@ -190,17 +189,17 @@ class Learning:
         )
         return start
 
-    def learn(self, flown: Trajectory, planner_state: Any, *, fit: bool) -> None:
+    def learn(self, seen: Trajectory, planner_state: Any, *, fit: bool) -> None:
         """Keep what was seen; with ``fit``, fit all of it. Raises what a fit raises."""
         self.planner_state = planner_state
-        self.data = self.data.extend(*flown.transitions(self.history))
+        self.trajectories.append(seen)
+        self.data = self.data.extend(*seen.transitions(self.history))
         if fit:
             key = self.key_for(Purpose.FIT)
             self.belief = self.model.fit(self.belief, self.data, key=key)
-        self.trajectories.append(flown)
         self.summaries.append(_parameters(self.belief))
 
-    def flown(self) -> History:
+    def result(self) -> History:
         """All episodes so far."""
         return _history(
             self.trajectories,

@@ -16,7 +16,7 @@ import numpy as np
 
 from sim2gp.errors import NotConverged, NotFinite
 from sim2gp.planning.episode import Purpose, Trajectory, check_finite, run_episode
-from sim2gp.planning.loop import Learning
+from sim2gp.planning.loop import SamplingRun
 from sim2gp.planning.world import World
 from sim2gp.types import Key
 
@@ -24,40 +24,34 @@ from sim2gp.types import Key
 Ended = tuple[list[Trajectory], str]
 
 
-def learn_together(runs: Sequence[Learning], episodes: int) -> list[Ended]:
+def learn_together(runs: Sequence[SamplingRun], episodes: int) -> list[Ended]:
     """So many episodes of each run; one whose fit fails goes on no more.
 
     The last episode is not fitted.
     """
     failed = [""] * len(runs)
-    for run in runs:
-        run.shared = True
     for e in range(1, episodes + 1):
         left = [k for k, why in enumerate(failed) if not why]
-        worlds = {k: runs[k].begin() for k in left}
+        worlds = {k: runs[k].begin(shared=True) for k in left}
         for group in _alike(runs, worlds):
             members = [(runs[k], worlds[k]) for k in group]
-            for k, found in zip(group, _flown(members), strict=True):
+            for k, found in zip(group, _episodes(members), strict=True):
                 failed[k] = _learned(runs[k], *found, fit=e < episodes)
     return [(run.trajectories, why) for run, why in zip(runs, failed, strict=True)]
 
 
-def _learned(run: Learning, flown: Trajectory, state: Any, *, fit: bool) -> str:
-    """Why a run ends here; empty if it does not. Its episode counts in either case."""
+def _learned(run: SamplingRun, seen: Trajectory, state: Any, *, fit: bool) -> str:
+    """Why a run ends here; empty if it does not. Its episode counts if it is finite."""
     try:
-        check_finite(flown, run.task.name)
-    except NotFinite as error:
+        check_finite(seen, run.task.name)
+        with jax.default_device(jax.devices("cpu")[0]):
+            run.learn(seen, state, fit=fit)
+    except (NotConverged, NotFinite) as error:
         return str(error)
-    with jax.default_device(jax.devices("cpu")[0]):
-        try:
-            run.learn(flown, state, fit=fit)
-        except (NotConverged, NotFinite) as error:
-            run.trajectories.append(flown)
-            return str(error)
     return ""
 
 
-def _alike(runs: Sequence[Learning], worlds: dict[int, World]) -> list[list[int]]:
+def _alike(runs: Sequence[SamplingRun], worlds: dict[int, World]) -> list[list[int]]:
     """Runs that share a program, by their numbers."""
     groups: dict[Any, list[int]] = {}
     for k, world in worlds.items():
@@ -68,29 +62,24 @@ def _alike(runs: Sequence[Learning], worlds: dict[int, World]) -> list[list[int]
     return list(groups.values())
 
 
-def _flown(
-    members: Sequence[tuple[Learning, World]],
+def _episodes(
+    members: Sequence[tuple[SamplingRun, World]],
 ) -> list[tuple[Trajectory, Any]]:
-    """An episode of each, in one program."""
-    first, planner = members[0][0], members[0][0].planner
+    """An episode of each, in one program, and the planner's state after it."""
     parts = [(run.task, run.planner_state, world) for run, world in members]
-    arrays = [eqx.filter(x, eqx.is_array) for x in parts]
-    _, rest = eqx.partition((first.task, *parts[0][1:]), eqx.is_array)
-    stacked = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(y) for y in x]), *arrays)
+    arrays, rest = eqx.partition(parts[0], eqx.is_array)
+    arrays = [arrays, *(eqx.filter(x, eqx.is_array) for x in parts[1:])]
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *arrays)
     keys = jnp.stack([run.key_for(Purpose.EPISODE) for run, _ in members])
-    found, states = _fly_all(planner, stacked, rest, keys)
-    host = jax.tree.map(np.asarray, found)
+    found, states = _run_all(members[0][0].planner, stacked, rest, keys)
+    found = jax.tree.map(np.asarray, found)
     return [
-        (
-            jax.tree.map(lambda x, k=k: x[k], host),
-            jax.tree.map(lambda x, k=k: x[k] if eqx.is_array(x) else x, states),
-        )
-        for k in range(len(members))
+        jax.tree.map(lambda x, k=k: x[k], (found, states)) for k in range(len(members))
     ]
 
 
 @eqx.filter_jit
-def _fly_all(planner: Any, stacked: Any, rest: Any, keys: Any) -> Any:
+def _run_all(planner: Any, stacked: Any, rest: Any, keys: Any) -> Any:
     def one(arrays: Any, key: Key) -> Any:
         task, state, world = eqx.combine(arrays, rest)
         return run_episode(task, planner, state, world, key=key)
