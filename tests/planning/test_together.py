@@ -1,14 +1,23 @@
 """Runs of one program are the runs that they are alone."""
 
-import jax
-import numpy as np
+import dataclasses
+from typing import Any
 
-from mass_task import SMALL, GainModel, mass_task
-from sim2gp.errors import NotConverged
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mass_task import SMALL, GainModel, Mass, mass_task
+from sim2gp.errors import NotConverged, Sim2GPError
 from sim2gp.planning import MarkovObjective
 from sim2gp.planning import loop as loops
 from sim2gp.planning.loop import SamplingRun
-from sim2gp.planning.together import learn_together
+from sim2gp.planning.oracle import accept_truth
+from sim2gp.planning.tasks import Task
+from sim2gp.planning.together import accept_together, learn_together
+from sim2gp.systems import Furuta
 
 KEYS = [jax.random.key(k) for k in range(3)]
 
@@ -48,3 +57,33 @@ def test_a_run_whose_fit_fails_ends_and_the_others_go_on() -> None:
     assert [len(episodes) for episodes, _ in together] == [3, 1, 3]
     assert [bool(why) for _, why in together] == [False, True, False]
     assert "no MAP" in together[1][1]
+
+
+class Near(eqx.Module):
+    """The mass has come close to where it should be."""
+
+    def __call__(self, s: jax.Array) -> jax.Array:
+        return s[0] > 0.75
+
+
+def heavy(record: Any) -> Task:
+    """A mass that only some motors move far enough, in time."""
+    gain = jnp.where(record.pendulum_mass < 0.024, jnp.nan, 20.0 * record.arm_mass)
+    task = mass_task(dynamics=Mass(gain.astype(jnp.float32)))
+    return dataclasses.replace(task, goal=Near())
+
+
+def test_truths_are_accepted_as_they_are_alone() -> None:
+    """Those that their oracle fails on, and those that diverge, are drawn again."""
+    keys = [jax.random.key(k) for k in range(6)]
+    together = accept_together([heavy] * 6, Furuta(), SMALL, keys=keys)
+    alone = [accept_truth(heavy, Furuta(), SMALL, key=key) for key in keys]
+    redrawn = [found.redrawn for found in together]
+    assert redrawn == [found.redrawn for found in alone]
+    assert min(redrawn) == 0
+    assert max(redrawn) > 1
+    for one, other in zip(together, alone, strict=True):
+        returns = one.oracle.returns
+        np.testing.assert_allclose(returns, other.oracle.returns, rtol=1e-4)
+    with pytest.raises(Sim2GPError, match=r"E204 .* got 1 draws"):
+        accept_together([heavy] * 6, Furuta(), SMALL, keys=keys, attempts=1)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim2gp.errors import InputError
+from sim2gp.errors import InputError, NotConverged
 from sim2gp.planning import MPC, SAC
 from sim2gp.planning.tasks import MACHINES
 from sim2gp.reports import figure2 as drawn
@@ -140,7 +140,7 @@ def test_a_finished_cell_is_not_flown_again(tmp_path: Path, monkeypatch):
     monkeypatch.setattr(swingup, "oracle_cell", lambda cell: ORACLE)
     more = dataclasses.replace(cell, episodes=4)
     flown = run_cell(more, tmp_path / "fig2")
-    assert flown == {"returns": []}
+    assert flown == {"returns": [], "device": "cpu"}
     for other in (MPC(horizon=7), MPC(lengths=(0.5, 1.0))):
         monkeypatch.setitem(learners.PLANNERS, "mpc", other)
         with pytest.raises(InputError, match=r"E186 .* 1 with other arguments"):
@@ -168,11 +168,12 @@ def test_a_quick_look_has_a_planner_and_cells_of_its_own(monkeypatch):
     used = []
     trained = []
 
-    def run_episode(task, model, planner, **rest):
+    def begun(task, model, planner, *rest):
         used.append(planner)
         trained.append((model.steps, model.refit_steps))
+        raise NotConverged("E201", "not begun")
 
-    monkeypatch.setattr(swingup, "psrl", run_episode)
+    monkeypatch.setattr(swingup, "SamplingRun", begun)
     swingup.learner_cell(quick, 0)
     swingup.learner_cell(full, 0)
     assert trained[0] == tuple(quick.arguments["training"].values()) < trained[1]

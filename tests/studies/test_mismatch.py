@@ -14,7 +14,7 @@ from sim2gp.planning.tasks import MACHINES, furuta_swingup
 from sim2gp.runs import Progress
 from sim2gp.studies import learners, mismatch, swingup
 from sim2gp.studies.learners import CONDITIONS, METHODS, WITH_TERM
-from sim2gp.studies.mismatch import MismatchMap
+from sim2gp.studies.mismatch import EXPRESSIBLE, MismatchMap
 from sim2gp.studies.swingup import Cell
 from sim2gp.systems import Delay, Furuta
 from sim2gp.systems.effects.strengths import effect
@@ -24,11 +24,18 @@ ORACLE = {"hang_return": 50.0, "oracle_return": 150.0, "redrawn": 0, "returns": 
 
 
 def test_the_map_is_the_registered_catalogue():
-    assert mismatch.EFFECTS == ("coulomb", "dead_zone", "spring", "delay", "drag")
-    for name in mismatch.EFFECTS:
-        for strength in ("mild", "middle", "strong"):
-            (found,) = learners.effects_of("furuta", f"{name} {strength}")
-            assert found == effect("furuta", name, strength)
+    """27 settings that a force can be; the others are a delay and a geometry."""
+    study = MismatchMap("mismatch")
+    rows = study.rows()
+    for machine in MACHINES:
+        for condition in study.conditions(machine)[1:]:
+            (found,) = learners.effects_of(machine, condition)
+            assert found == effect(machine, *condition.split())
+    forces = [m for m, c, w in rows if w == "RES" and c.split()[0] in EXPRESSIBLE]
+    assert len(forces) == 27
+    assert len(rows) == 4 * (1 + 15 + 1 + 21) + 6 * 15
+    assert len(rows["cartpole", "tilt mild", "RES"]) == 10
+    assert len(rows["furuta", "spring mild", "FS"]) == 5
     (none,) = learners.effects_of("furuta", "nominal")
     assert none == dataclasses.replace(learners.MISSING["furuta"], magnitude=0.0)
     with pytest.raises(InputError, match="did you mean spring"):
@@ -75,9 +82,26 @@ def test_the_box_of_a_learner_is_the_tasks():
 
 
 def test_regret_by_hand():
-    score = np.asarray([[0.0, 0.5, 1.2], [np.nan, np.nan, 0.75]])
-    table = {("spring mild", "SIM2GP"): score, ("drag mild", "SIM2GP"): score}
-    assert mismatch.regrets(table) == {"SIM2GP": pytest.approx(2 * (1.5 + 2.25))}
+    """Seeds that both have met, of conditions that both have met."""
+    score = np.asarray([[0.0, 0.5, 1.2], [np.nan, np.nan, 0.75], [0.0, 0.0, 0.0]])
+    conditions = ("spring mild", "drag mild", "nominal")
+    table = {("furuta", c, "RES"): score for c in conditions}
+    table |= {("furuta", c, "NLM"): 0.0 * score[:2] for c in conditions[:1]}
+    both = mismatch.regrets(table, ("RES", "NLM"))
+    assert both == {"RES": pytest.approx(1.5 + 2.25), "NLM": 6.0}
+    assert mismatch.regrets(table, ("RES",)) == {"RES": pytest.approx(2 * 6.75)}
+
+
+def ratio(table, *, most=1.1, rng=None):
+    """Auto's regret against that of RES."""
+    return mismatch.regret_ratio(
+        {("furuta", *key): score for key, score in table.items()},
+        "Auto",
+        "RES",
+        (tuple(METHODS), most),
+        rng or np.random.default_rng(0),
+        "",
+    )
 
 
 @pytest.mark.parametrize(("auto", "holds"), [(1.05, True), (1.2, False)])
@@ -85,13 +109,21 @@ def test_auto_is_held_against_the_best_fixed_model(auto, holds):
     """The simulator with the right term does not count: it knows the answer."""
     lost = dict.fromkeys(METHODS, 0.5) | {"RES": 0.2, WITH_TERM: 0.01}
     lost["Auto"] = 0.2 * auto
-    table = {("spring mild", m): np.full((2, 3), 1.0 - x) for m, x in lost.items()}
-    claim = mismatch.mismatch_claims(table, np.random.default_rng(0))[
+    claim = mismatch.claims(planted(lost), np.random.default_rng(0))[
         "choosing_costs_little"
     ]
     assert claim["holds"] is holds
     same = f"[{auto:.2f}, {auto:.2f}]"  # both seeds lost alike
     assert claim["figure"] == f"{auto:.2f} {same} times the regret of RES"
+
+
+def planted(lost, better=()):
+    """A whole map on which every learner loses as much in each episode."""
+    rows = MismatchMap("mismatch", seeds=2).rows()
+    return {
+        key: np.full((len(cells), 3), 1.0 - (0.0 if key in better else lost[key[2]]))
+        for key, cells in rows.items()
+    }
 
 
 def test_the_ratio_of_regrets_knows_its_seeds():
@@ -101,26 +133,58 @@ def test_the_ratio_of_regrets_knows_its_seeds():
     noisy = bad * rng.uniform(0.7, 1.3, (30, 1))
     table = {("drag mild", m): 1.0 - bad for m in METHODS}
     table["drag mild", "Auto"] = 1.0 - noisy
-    figure = mismatch.mismatch_claims(table, rng)["choosing_costs_little"]["figure"]
+    figure = ratio(table, rng=rng)["figure"]
     low, high = map(float, figure[figure.index("[") + 1 : figure.index("]")].split(","))
-    ratio = noisy[:, 0] / bad[:, 0]
+    each = noisy[:, 0] / bad[:, 0]
     # The delta method, for the ratio of two means.
     total = bad[:, 0].sum()
     expected = noisy[:, 0].sum() / total
     residual = noisy[:, 0] - expected * bad[:, 0]
     sd = np.sqrt(np.sum(residual**2)) / total
-    assert ratio.std() > 0.1
+    assert each.std() > 0.1
     assert high - low == pytest.approx(2 * 1.96 * sd, rel=0.2)
 
 
 def test_sampling_is_looked_for_all_over_the_map():
-    table = {(c, m): np.full((5, 3), 0.5) for c in ("drag mild", "x") for m in METHODS}
     name = "sampling_beats_the_point_estimate_somewhere"
-    assert not mismatch.mismatch_claims(table, np.random.default_rng(0))[name]["holds"]
-    table["drag mild", "SIM2GP"] = np.full((5, 3), 0.6)
-    claim = mismatch.mismatch_claims(table, np.random.default_rng(0))[name]
+    lost = dict.fromkeys(METHODS, 0.5)
+    assert not mismatch.claims(planted(lost), np.random.default_rng(0))[name]["holds"]
+    table = planted(lost, {("furuta", "drag mild", "SIM2GP")})
+    claim = mismatch.claims(table, np.random.default_rng(0))[name]
     assert claim["holds"]
-    assert claim["figure"].startswith("drag mild: +0.100")
+    assert claim["figure"].startswith("drag mild: +0.500")
+
+
+@pytest.mark.parametrize(("unsolved", "holds"), [(3, True), (4, False)])
+def test_settings_that_missing_forces_solve_are_counted(unsolved, holds):
+    """By the second episode; a delay does not count, nor the third episode."""
+    lost = dict.fromkeys(METHODS, 0.0) | {WITH_TERM: 0.04}
+    table = planted(lost)
+    keys = [
+        k for k in table if k[2] == "MissingForces" and k[1].split()[0] != "nominal"
+    ]
+    forces = [k for k in keys if k[1].split()[0] in EXPRESSIBLE]
+    for key in forces[:unsolved]:
+        table[key] = np.asarray([[0.2, 0.9, 1.0], [np.nan, 0.94, 1.0]])
+    for key in keys:
+        if key not in forces:
+            table[key] = np.zeros((2, 3))
+    found = mismatch.claims(table, np.random.default_rng(0))
+    claim = found["missing_forces_solve_in_two_episodes"]
+    assert claim["holds"] is holds
+    assert claim["figure"].startswith(f"{27 - unsolved} of 27; not {forces[0][0]}, ")
+    assert "(0.92)" in claim["figure"]
+    assert not found["missing_forces_cost_little_more_than_the_right_term"]["holds"]
+
+
+def test_what_missing_forces_cost_where_nothing_is_missing():
+    table = planted(dict.fromkeys(METHODS, 0.1))
+    name = "missing_forces_cost_nothing_where_nothing_is_missing"
+    for machine, score in (("furuta", 0.9), ("cartpole", 0.87)):
+        table[machine, "nominal", "MissingForces"] = np.full((2, 3), score)
+    found = mismatch.claims(table, np.random.default_rng(0))[name]
+    assert not found["holds"]
+    assert found["figure"].startswith("-0.015")
 
 
 def test_the_map_is_written_whole(tmp_path: Path, monkeypatch):
@@ -133,10 +197,10 @@ def test_the_map_is_written_whole(tmp_path: Path, monkeypatch):
     study = MismatchMap("mismatch", seeds=2)
     summary = study.run(tmp_path / "map", workers=1, progress=Progress(quiet=True))
     rows = summary["tables"][0]["rows"]
-    assert len(rows) == 15
-    assert all(row[1] == "0.30 (0/2)" for row in rows)
-    assert len(summary["returns"]) == 15 * (2 * len(METHODS) + 2)
+    assert len(rows) == 38
+    assert all(row[1] == "0.20 [0.20, 0.21] (0/2)" for row in rows)
+    assert rows[-1][5] == ""
     stored = json.loads((tmp_path / "map" / "summary.json").read_text())
-    assert stored["regret"]["RES"] == pytest.approx(15 * (2.40 + 2.37))
+    assert stored["regret"]["RES"] == pytest.approx(36 * (2.40 + 2.37))
     assert (tmp_path / "map" / "mismatch.png").stat().st_size > 10_000
     assert "Mismatch map" in (tmp_path / "map" / "report.html").read_text()

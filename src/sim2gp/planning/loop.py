@@ -112,24 +112,9 @@ def posterior_sampling(
     _check_counts(episodes, history, update_every)
     run = SamplingRun(task, model, planner, objective, episodes, key, history, world)
     for e in range(1, episodes + 1):
-        start = run.begin()
-        trajectory, planner_state = episode(
-            task,
-            planner,
-            run.planner_state,
-            start,
-            key=run.key_for(Purpose.EPISODE),
-            part=update_every,
-            world_at=within(
-                model,
-                run.belief,
-                run.data,
-                history,
-                run.world_in,
-                key=run.key_for(Purpose.FIT),
-            ),
-        )
-        run.learn(trajectory, planner_state, fit=final_fit or e < episodes)
+        trajectory = run.next(update_every)
+        if final_fit or e < episodes:
+            run.fit()
         if on_episode is not None:
             on_episode(Episode(e, trajectory, run.belief))
     return run.result()
@@ -138,8 +123,8 @@ def posterior_sampling(
 class SamplingRun:
     """A run of posterior sampling between its episodes: what is known, and what next.
 
-    Before an episode `begin` gives the world to plan in, after it `learn` takes what
-    was seen. ``episode`` counts from 1, 0 before the first.
+    Before an episode `begin` gives the world to plan in, after it `keep` takes what
+    was seen, and `fit` learns from it. ``episode`` counts from 1, 0 before the first.
     """
 
     def __init__(
@@ -162,7 +147,7 @@ class SamplingRun:
         )
         self.episode, self.planner_state = 0, None
         self.belief = model.init(key_for(key, 0, Purpose.INIT))
-        self.summaries = [_parameters(self.belief)]
+        self.summaries: list[tuple[np.ndarray, np.ndarray]] = []
         self.trajectories: list[Trajectory] = []
 
     def key_for(self, purpose: Purpose) -> Key:
@@ -180,6 +165,7 @@ class SamplingRun:
     def begin(self, *, shared: bool = False) -> World:
         """The next episode's world; the planner is ready for it."""
         self.episode += 1
+        self.summaries.append(_parameters(self.belief))
         start, planner = self.world_in(self.belief, shared), self.planner
         if self.planner_state is None:
             first = key_for(self.key, 0, Purpose.PREPARE)
@@ -189,21 +175,45 @@ class SamplingRun:
         )
         return start
 
-    def learn(self, seen: Trajectory, planner_state: Any, *, fit: bool) -> None:
-        """Keep what was seen; with ``fit``, fit all of it. Raises what a fit raises."""
+    def next(self, update_every: int | None = None) -> Trajectory:
+        """One episode, which is kept and not yet fitted."""
+        start = self.begin()
+        world_at = within(
+            self.model,
+            self.belief,
+            self.data,
+            self.history,
+            self.world_in,
+            key=self.key_for(Purpose.FIT),
+        )
+        seen, planner_state = episode(
+            self.task,
+            self.planner,
+            self.planner_state,
+            start,
+            key=self.key_for(Purpose.EPISODE),
+            part=update_every,
+            world_at=world_at,
+        )
+        self.keep(seen, planner_state)
+        return seen
+
+    def keep(self, seen: Trajectory, planner_state: Any) -> None:
+        """What an episode was, and the planner after it."""
         self.planner_state = planner_state
         self.trajectories.append(seen)
         self.data = self.data.extend(*seen.transitions(self.history))
-        if fit:
-            key = self.key_for(Purpose.FIT)
-            self.belief = self.model.fit(self.belief, self.data, key=key)
-        self.summaries.append(_parameters(self.belief))
+
+    def fit(self) -> None:
+        """Learn from all episodes. Raises what a fit raises."""
+        key = self.key_for(Purpose.FIT)
+        self.belief = self.model.fit(self.belief, self.data, key=key)
 
     def result(self) -> History:
         """All episodes so far."""
         return _history(
             self.trajectories,
-            self.summaries,
+            [*self.summaries, _parameters(self.belief)],
             self.belief,
             self.data,
             self.planner_state,

@@ -105,7 +105,12 @@ def accept_truth(
             continue
         if oracle.reached:
             return AcceptedTruth(task, oracle, attempt)
-    got = f"{attempts} draws ({truth}), {diverged} of them not finite"
-    raise error(
-        "no_truth_swung_up", Sim2GPError, got=got, planner=type(planner).__name__
+    raise no_truth(
+        f"{attempts} draws ({truth}), {diverged} of them not finite", planner
     )
+
+
+def no_truth(got: str, planner: AbstractPlanner) -> Sim2GPError:
+    """E204: what was tried without success."""
+    name = type(planner).__name__
+    return error("no_truth_swung_up", Sim2GPError, got=got, planner=name)

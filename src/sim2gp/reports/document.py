@@ -159,7 +159,7 @@ def _figure_section(summary: Summary, arrays: Arrays) -> Section:
         )
     elif summary.get("mismatch"):
         name, drawn = "Mismatch map", mismatch_map(arrays, summary)
-        words = "score of the last episode, for every effect and learner"
+        words = "best score of two episodes, for every effect and learner"
         more = (
             "Medians over seeds; 1 is the oracle's score, 0 that of a pole left "
             "hanging."

@@ -1,23 +1,26 @@
-"""The mismatch map: every learner under five effects at three strengths (Furuta).
+"""The mismatch map: learners on machines that have what their simulator lacks.
 
-Registered before it is run: the effects and strengths of the catalogue
-(`sim2gp.systems.effects.strengths`), scores of the third episode, and the cumulative
-regret of the model that chooses, against the best model that was fixed beforehand.
+Registered before it is run: the effects and strengths of the catalogue on both machines
+(`sim2gp.systems.effects.strengths`) and nothing missing, best scores of two episodes,
+and regrets over three. Four learners meet all of it; the others the Furuta's effects,
+on the first half of the seeds.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 
-from sim2gp.planning.tasks import SOLVED
+from sim2gp.planning.tasks import MACHINES, SOLVED
 from sim2gp.studies.claims import (
     SAMPLING_PAYS,
     better_somewhere,
+    bootstrap_interval,
     bootstrap_weights,
     central,
     claim,
+    difference_in_words,
 )
 from sim2gp.studies.learners import METHODS, WITH_TERM
 from sim2gp.studies.study import AbstractCell, Arrays, Key, Study, Values
@@ -34,9 +37,19 @@ from sim2gp.systems.effects.strengths import STRENGTHS, graded
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MACHINE = "furuta"
-EFFECTS = graded(MACHINE)
-QUICK_EFFECTS = ("spring",)
+NOMINAL = "nominal"
+QUICK_EFFECTS = {"furuta": ("spring",), "cartpole": ()}
+#: Learners of the whole map; the others meet the effects of `OTHERS_ON`.
+EVERYWHERE = ("SIM2GP", "RES", "MissingForces", WITH_TERM)
+OTHERS_ON = "furuta"
+COLUMNS = (*EVERYWHERE, *(m for m in METHODS if m not in EVERYWHERE))
+#: What a force or a function of an input can be; a delay and a geometry are neither.
+EXPRESSIBLE = ("coulomb", "dead_zone", "spring", "drag", "tilt")
+#: MissingForces is asked to solve so many settings of all that a force can be, in so
+#: many episodes, and at most so many times the regret of the right term.
+SETTINGS, EPISODES, FORCES_REGRET = 24 / 27, 2, 1.05
+#: Of the plain simulator's mean score, where nothing is missing.
+LOSS = 0.01
 #: Auto's regret is asked to be at most this many times that of the best fixed model.
 REGRET = 1.1
 #: Fixed models that know no more than Auto does.
@@ -44,25 +57,39 @@ FIXED = tuple(m for m in METHODS if m not in ("Auto", WITH_TERM))
 
 
 class MismatchMap(Study):
-    """Every learner under every effect; a quick look has one effect and one seed."""
+    """Learners under every effect; a quick look has one effect and one seed."""
 
-    size = (5, 3)
+    size = (10, 3)
     quick_size = (1, 3)
 
     def rows(self) -> dict[Key, list[Cell]]:
-        """A row for each effect with its strength, and each learner."""
+        """A row for each machine, effect with its strength, and learner."""
         return {
-            (condition, method): [
-                Cell(MACHINE, condition, method, seed, self.episodes)
-                for seed in self.seeds
+            (machine, condition, method): [
+                Cell(machine, condition, method, seed, self.episodes) for seed in seeds
             ]
-            for effect in (QUICK_EFFECTS if self.quick else EFFECTS)
-            for condition in (f"{effect} {strength}" for strength in STRENGTHS)
-            for method in METHODS
+            for machine in MACHINES
+            for condition in self.conditions(machine)
+            for method, seeds in self.compared(machine, condition).items()
         }
 
+    def conditions(self, machine: str) -> list[str]:
+        """Nothing missing, then each effect at each strength."""
+        effects = QUICK_EFFECTS[machine] if self.quick else graded(machine)
+        return [
+            NOMINAL,
+            *(f"{e} {strength}" for e in effects for strength in STRENGTHS),
+        ]
+
+    def compared(self, machine: str, condition: str) -> dict[str, Sequence[int]]:
+        """The learners of a condition, and their seeds."""
+        if machine != OTHERS_ON or condition == NOMINAL:
+            return dict.fromkeys(EVERYWHERE, self.seeds)
+        half = self.seeds[: (self.count + 1) // 2]
+        return {m: self.seeds if m in EVERYWHERE else half for m in METHODS}
+
     def arrays(self, values: Mapping[AbstractCell, Values]) -> Arrays:
-        """Scores ``mismatch/EFFECT/LEARNER``."""
+        """Scores ``mismatch/MACHINE/EFFECT/LEARNER``."""
         table = scores_of(self.rows(), values)
         return {f"mismatch/{'/'.join(key)}": score for key, score in table.items()}
 
@@ -75,11 +102,12 @@ class MismatchMap(Study):
             "title": "Mismatch map: every learner under what its simulator lacks",
             "episodes": self.episodes,
             "mismatch": {
-                "conditions": list(dict.fromkeys(c for c, _ in table)),
-                "methods": list(METHODS),
+                "conditions": {m: self.conditions(m) for m in MACHINES},
+                "methods": list(COLUMNS),
+                "episodes": EPISODES,
             },
-            "regret": regrets(table),
-            "claims": mismatch_claims(table, self.rng),
+            "regret": regrets(table, EVERYWHERE),
+            "claims": claims(table, self.rng),
             **returns_of(values),
             "tables": tables(table),
         }
@@ -87,50 +115,70 @@ class MismatchMap(Study):
     def pictures(
         self, arrays: Mapping[str, np.ndarray], summary: Mapping[str, Any]
     ) -> "dict[str, Figure]":
-        """Scores of the last episode, by effect and learner."""
+        """Best scores of two episodes, by effect and learner."""
         from sim2gp.reports import mismatch_map
 
         return {"mismatch": mismatch_map(arrays, summary)}
 
 
-def regret_by_seed(table: Table) -> dict[str, Float[np.ndarray, " seeds"]]:
-    """Regret of each learner and seed: lost score, summed over the map's episodes.
+def regret_by_seed(
+    table: Table, methods: Sequence[str]
+) -> dict[str, Float[np.ndarray, " seeds"]]:
+    """Regret of each learner and seed: lost score, summed over effects and episodes.
 
-    An episode that was not run lost all of it; better than the oracle is no gain.
+    Over the conditions that all ``methods`` have met, and the seeds that they share. An
+    episode that was not run lost all of it; better than the oracle is no gain.
     """
     out: dict[str, Float[np.ndarray, " seeds"]] = {}
-    for (_, method), score in table.items():
-        each = 1.0 - np.minimum(np.where(np.isfinite(score), score, 0.0), 1.0)
-        out[method] = out.get(method, 0.0) + each.sum(axis=1)
+    for place in dict.fromkeys(key[:2] for key in table):
+        if place[1] == NOMINAL or not all((*place, m) in table for m in methods):
+            continue
+        shared = min(len(table[*place, m]) for m in methods)
+        for method in methods:
+            score = table[*place, method][:shared]
+            each = 1.0 - np.minimum(np.where(np.isfinite(score), score, 0.0), 1.0)
+            out[method] = out.get(method, 0.0) + each.sum(axis=1)
     return out
 
 
-def regrets(table: Table) -> dict[str, float]:
-    """Cumulative regret of each learner, over all seeds."""
-    return {method: float(each.sum()) for method, each in regret_by_seed(table).items()}
+def regrets(table: Table, methods: Sequence[str]) -> dict[str, float]:
+    """Cumulative regret of each learner, over all seeds that they share."""
+    each = regret_by_seed(table, methods)
+    return {method: float(regret.sum()) for method, regret in each.items()}
 
 
-def mismatch_claims(
-    table: Table, rng: np.random.Generator
-) -> dict[str, dict[str, Any]]:
-    """Whether choosing costs more than having known the best model in advance.
-
-    And whether sampling pays anywhere, by the mean score of the episodes.
-    """
-    each, regret = regret_by_seed(table), regrets(table)
+def claims(table: Table, rng: np.random.Generator) -> dict[str, dict[str, Any]]:
+    """What was asked of missing forces, of choosing, and of sampling."""
+    fair = {k: v for k, v in table.items() if k[0] == OTHERS_ON and k[1] != NOMINAL}
+    regret = regrets(fair, tuple(METHODS))
     best = min(FIXED, key=lambda m: regret[m])
-    weights = bootstrap_weights(len(each[best]), rng)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = regret["Auto"] / np.float64(regret[best])
-        low, high = central((weights @ each["Auto"]) / (weights @ each[best]))
     mean = {key: best_seen(score).mean(axis=1) for key, score in table.items()}
-    pairs = {c: (mean[c, "SIM2GP"], mean[c, "point estimate"]) for c, _ in table}
+    places = dict.fromkeys(key[:2] for key in fair)
+    pairs = {
+        c: (mean[m, c, "SIM2GP"][: len(point)], point)
+        for m, c in places
+        for point in [mean[m, c, "point estimate"]]
+    }
     return {
-        "choosing_costs_little": claim(
-            bool(ratio <= REGRET),
-            f"{ratio:.2f} [{low:.2f}, {high:.2f}] times the regret of {best}",
-            f"over the whole map Auto's cumulative regret is at most {REGRET} times "
-            "that of the best fixed model",
+        "missing_forces_solve_in_two_episodes": solved_early(table),
+        "missing_forces_cost_little_more_than_the_right_term": regret_ratio(
+            table,
+            "MissingForces",
+            WITH_TERM,
+            (EVERYWHERE, FORCES_REGRET),
+            rng,
+            "over all effects of both machines MissingForces' cumulative regret is at "
+            f"most {FORCES_REGRET} times that of the simulator with the right term",
+        ),
+        "missing_forces_cost_nothing_where_nothing_is_missing": nothing_lost(mean, rng),
+        "choosing_costs_little": regret_ratio(
+            fair,
+            "Auto",
+            best,
+            (tuple(METHODS), REGRET),
+            rng,
+            f"over the {OTHERS_ON}'s effects Auto's cumulative regret is at most "
+            f"{REGRET} times that of the best fixed model",
         ),
         "sampling_beats_the_point_estimate_somewhere": better_somewhere(
             pairs, rng, SAMPLING_PAYS
@@ -138,30 +186,102 @@ def mismatch_claims(
     }
 
 
+def solved_early(table: Table) -> dict[str, Any]:
+    """In how many settings that a force can be, and which are left."""
+    reached = {
+        f"{machine}, {condition}": float(np.median(best_seen(score)[:, EPISODES - 1]))
+        for (machine, condition, method), score in table.items()
+        if method == "MissingForces" and condition.split()[0] in EXPRESSIBLE
+    }
+    left = [f"{where} ({x:.2f})" for where, x in reached.items() if x < SOLVED]
+    solved = len(reached) - len(left)
+    figure = f"{solved} of {len(reached)}" + (
+        f"; not {', '.join(left)}" if left else ""
+    )
+    return claim(
+        solved >= SETTINGS * len(reached),
+        figure,
+        f"MissingForces reaches {SOLVED:.0%} of the oracle within {EPISODES} episodes "
+        "(median of the best score) in at least 24 of 27 settings that a force or a "
+        "function of an input can be",
+    )
+
+
+def nothing_lost(
+    mean: Mapping[Key, Float[np.ndarray, " seeds"]], rng: np.random.Generator
+) -> dict[str, Any]:
+    """Mean best-seen scores without mismatch, against the plain simulator's."""
+    each = [
+        mean[machine, NOMINAL, "MissingForces"] - mean[machine, NOMINAL, "SIM2GP"]
+        for machine in MACHINES
+    ]
+    difference = np.mean(each, axis=0)
+    low, high = bootstrap_interval(difference, rng)
+    return claim(
+        bool(difference.mean() >= -LOSS),
+        difference_in_words(difference, low, high),
+        "where nothing is missing, MissingForces' mean best-seen score is at most "
+        f"{LOSS} below the plain simulator's",
+    )
+
+
+def regret_ratio(
+    table: Table,
+    name: str,
+    other: str,
+    asked: tuple[Sequence[str], float],
+    rng: np.random.Generator,
+    text: str,
+) -> dict[str, Any]:
+    """Whether one's regret is at most so many times another's.
+
+    ``asked``: the learners whose conditions and seeds count, and how many times.
+    """
+    each = regret_by_seed(table, asked[0])
+    weights = bootstrap_weights(len(each[other]), rng)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = each[name].sum() / each[other].sum()
+        low, high = central((weights @ each[name]) / (weights @ each[other]))
+    figure = f"{ratio:.2f} [{low:.2f}, {high:.2f}] times the regret of {other}"
+    return claim(bool(ratio <= asked[1]), figure, text)
+
+
 def tables(table: Table) -> list[dict[str, Any]]:
-    """The last episode's median score, how many seeds were solved, and the regrets."""
-    conditions = list(dict.fromkeys(c for c, _ in table))
+    """Best scores of two episodes, how many seeds were solved, and the regrets."""
     rows = []
-    for condition in conditions:
-        row = [condition]
-        for method in METHODS:
-            score = table[condition, method]
-            last = np.where(np.isfinite(score[:, -1]), score[:, -1], 0.0)
-            solved = int(np.sum(np.isfinite(first_at(score, SOLVED))))
-            row.append(f"{np.median(last):.2f} ({solved}/{len(score)})")
+    for machine, condition in dict.fromkeys(key[:2] for key in table):
+        row = [f"{machine}, {condition}"]
+        for method in COLUMNS:
+            score = table.get((machine, condition, method))
+            row.append("" if score is None else _in_words(score))
         rows.append(row)
-    total = regrets(table)
+    total = {m: regrets(table, m) for m in (EVERYWHERE, COLUMNS)}
     return [
         {
-            "title": "Score of the last episode (and seeds that reached 95 % in any)",
-            "columns": ["effect", *METHODS],
+            "title": f"Best score of {EPISODES} episodes (and seeds that reached 95 %)",
+            "columns": ["effect", *COLUMNS],
             "rows": rows,
-            "note": "Medians over seeds; 1 is the oracle, 0 a pole left hanging.",
+            "note": "Medians and quartiles over seeds; 1 is the oracle, 0 a pole left "
+            "hanging.",
         },
-        {
-            "title": "Cumulative regret over the map",
-            "columns": list(METHODS),
-            "rows": [[f"{total[m]:.1f}" for m in METHODS]],
-            "note": "Lost score, summed over effects, strengths, seeds and episodes.",
-        },
+        *(
+            {
+                "title": f"Cumulative regret over {where}",
+                "columns": list(regret),
+                "rows": [[f"{x:.1f}" for x in regret.values()]],
+                "note": "Lost score, summed over effects, strengths, episodes and the "
+                "seeds that all have met.",
+            }
+            for where, regret in zip(
+                ("both machines", f"the {OTHERS_ON}"), total.values(), strict=True
+            )
+        ),
     ]
+
+
+def _in_words(score: Float[np.ndarray, "seeds E"]) -> str:
+    """Median, quartiles, and how many of the seeds were solved by then."""
+    best = best_seen(score)[:, :EPISODES][:, -1]
+    low, middle, high = np.quantile(best, (0.25, 0.5, 0.75))
+    solved = int(np.sum(first_at(score, SOLVED) <= EPISODES))
+    return f"{middle:.2f} [{low:.2f}, {high:.2f}] ({solved}/{len(score)})"

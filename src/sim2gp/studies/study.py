@@ -7,13 +7,16 @@ claims compare learners seed by seed (`sim2gp.studies.claims`).
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import fields, is_dataclass
 from functools import partial
 from pathlib import Path
 from sys import modules
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import jax
 import numpy as np
 
 from sim2gp.errors import error
@@ -65,6 +68,18 @@ class AbstractCell(ABC):
     @abstractmethod
     def compute(self, needed: Values | None) -> Values:
         """Its values; ``needed`` are those of the cell that it needs."""
+
+    @property
+    def batch(self) -> Hashable:
+        """Cells that an accelerator computes as one have the same; else the cell."""
+        return self
+
+    @classmethod
+    def compute_batch(
+        cls, cells: Sequence[Any], needed: Sequence[Values | None]
+    ) -> list[Values]:
+        """Values of cells of one `batch`."""
+        return [cell.compute(x) for cell, x in zip(cells, needed, strict=True)]
 
 
 class Study(ABC):
@@ -192,23 +207,86 @@ def run_cells(
     named = [(cell.name, cell.arguments) for cell in every]
     stored.check(named)
     values: dict[AbstractCell, Values] = {}
-    work = partial(run_cell, out=out, old=old)
+    compute = _in_processes if jax.default_backend() == "cpu" else _in_batches
     with progress.task("cells", len(every)) as task:
         for stage in stages:
-            for cell, value in spread(work, _by_program(stage, workers), workers):
+            for cell, value in compute(stage, out, old, workers):
                 values[cell] = value
                 task.advance(cell.name.replace("_", ", "))
     return values, _about(values) | stored.summary(named)
 
 
+#: Cells with their values, as they get done.
+Done = Iterator[tuple[AbstractCell, Values]]
+
+
+def _in_processes(
+    cells: Sequence[AbstractCell], out: Path, old: Old, workers: int
+) -> Done:
+    """A cell at a time in each process, which owns one core."""
+    work = partial(run_cell, out=out, old=old)
+    yield from spread(work, _by_program(cells, workers), workers)
+
+
+def _in_batches(
+    cells: Sequence[AbstractCell], out: Path, old: Old, workers: int
+) -> Done:
+    """A batch at a time in each thread: others are fitted while one is planned."""
+    batches: dict[Hashable, list[AbstractCell]] = {}
+    for cell in cells:
+        batches.setdefault(cell.batch, []).append(cell)
+    with ThreadPoolExecutor(workers) as pool:
+        work = partial(run_batch, out=out, old=old)
+        running = [pool.submit(work, batch) for batch in batches.values()]
+        try:
+            for done in as_completed(running):
+                yield from done.result().items()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def run_batch(
+    cells: Sequence[AbstractCell], out: Path, old: Old = "refuse"
+) -> dict[AbstractCell, Values]:
+    """`run_cell` of cells of one batch; those not stored are computed as one."""
+    cells = list(cells)
+    stored = Cells(out, _code(cells[0]), old)
+    found = {cell: _stored(cell, stored) for cell in cells}
+    left = [cell for cell in cells if found[cell] is None]
+    if left:
+        needed = [
+            None if cell.needs is None else run_cell(cell.needs, out, old)
+            for cell in left
+        ]
+        computed = type(left[0]).compute_batch(left, needed)
+        for cell, values in zip(left, computed, strict=True):
+            found[cell] = _saved(cell, stored, values)
+    return {cell: values for cell, values in found.items() if values is not None}
+
+
 def run_cell(cell: AbstractCell, out: Path, old: Old = "refuse") -> Values:
     """A cell's values, from the disk if there are enough of them (E186)."""
     cells = Cells(out, _code(cell), old)
-    stored = cells.load(cell.name, cell.arguments)
-    if stored is not None and (cell.enough(stored) or stored.get("failure")):
+    stored = _stored(cell, cells)
+    if stored is not None:
         return stored
     needed = None if cell.needs is None else run_cell(cell.needs, out, old)
-    return cells.save(cell.name, cell.arguments, cell.compute(needed))
+    return _saved(cell, cells, cell.compute(needed))
+
+
+def _stored(cell: AbstractCell, cells: Cells) -> Values | None:
+    """Values on the disk; None if there are not enough of them."""
+    stored = cells.load(cell.name, cell.arguments)
+    if stored is None or not (cell.enough(stored) or stored.get("failure")):
+        return None
+    return stored
+
+
+def _saved(cell: AbstractCell, cells: Cells, values: Values) -> Values:
+    """Stored with the device that computed them: another one rounds otherwise."""
+    device = {"device": jax.default_backend()}
+    return cells.save(cell.name, cell.arguments, values | device)
 
 
 def _code(cell: AbstractCell) -> str:
@@ -244,6 +322,7 @@ def _about(values: Mapping[AbstractCell, Values]) -> dict[str, Any]:
             for cell, value in values.items()
             if value.get("failure")
         ],
+        "devices_of_cells": Counter(v.get("device", "cpu") for v in values.values()),
         "seconds_of_cells": {name: time for name, time in spent.items() if time},
     }
 

@@ -5,8 +5,9 @@ an oracle that knows the truth: 1 is its return, 0 that of a pole left hanging.
 """
 
 import time
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -14,12 +15,14 @@ import numpy as np
 from jaxtyping import Float
 
 from sim2gp.errors import NotConverged, NotFinite
-from sim2gp.planning import AbstractPlanner
+from sim2gp.planning import MPC, AbstractPlanner, MarkovObjective
 from sim2gp.planning.episode import Trajectory
-from sim2gp.planning.loop import psrl
-from sim2gp.planning.oracle import accept_truth, episodes_in
+from sim2gp.planning.loop import SamplingRun
+from sim2gp.planning.oracle import AcceptedTruth, accept_truth, episodes_in
 from sim2gp.planning.tasks import MACHINES, hanging_return, score
+from sim2gp.planning.together import accept_together, learn_together
 from sim2gp.studies.learners import (
+    CONDITIONS,
     QUICK_TRAINING,
     TRAINED,
     HiddenMachine,
@@ -29,7 +32,8 @@ from sim2gp.studies.learners import (
 )
 from sim2gp.studies.study import AbstractCell, Key, Values, described
 
-Table = dict[Key, Float[np.ndarray, "seeds E"]]
+#: Scores by row; a row has seeds of its own.
+Table = dict[Key, Float[np.ndarray, "_ E"]]
 
 
 @dataclass(frozen=True)
@@ -79,10 +83,22 @@ class Cell(AbstractCell):
         return given | {"training": QUICK_TRAINING}
 
     @property
+    def kind(self) -> str:
+        """What the real machine has, at any strength."""
+        return "figure 2" if self.condition in CONDITIONS else self.condition.split()[0]
+
+    @property
     def program(self) -> tuple[Hashable, ...]:
-        """An oracle plans in the effect itself, at any strength."""
-        kind = self.condition.split()[0] if self.method == "oracle" else ""
+        """An oracle plans in the effect itself."""
+        kind = self.kind if self.method == "oracle" else ""
         return self.machine, self.method, self.update_every, kind
+
+    @property
+    def batch(self) -> Hashable:
+        """All seeds and strengths, where MPC plans in one draw for a whole episode."""
+        if self.planning != "mpc" or self.update_every or self.method in TRAINED:
+            return self
+        return self.machine, self.method, self.kind, self.episodes, self.quick
 
     @property
     def needs(self) -> "Cell | None":
@@ -98,6 +114,16 @@ class Cell(AbstractCell):
         if needed is None:
             return oracle_cell(self)
         return learner_cell(self, int(needed["redrawn"]))
+
+    @classmethod
+    def compute_batch(
+        cls, cells: Sequence[Any], needed: Sequence[Values | None]
+    ) -> list[Values]:
+        """As one program: each as alone, up to the rounding of float32."""
+        redrawn = [int(x["redrawn"]) for x in needed if x is not None]
+        if cells[0].batch == cells[0]:
+            return super().compute_batch(cells, needed)
+        return learner_cells(cells, redrawn) if redrawn else oracle_cells(cells)
 
 
 def reference(cell: Cell) -> Cell:
@@ -115,6 +141,25 @@ def oracle_cell(cell: HiddenMachine) -> Values:
         planner_of(cell.quick),
         key=jax.random.key(cell.seed),
     )
+    return _accepted(found)
+
+
+def oracle_cells(cells: Sequence[HiddenMachine]) -> list[Values]:
+    """`oracle_cell` of each, on one machine."""
+    make, preset = MACHINES[cells[0].machine]
+    lacking = [effects_of(cell.machine, cell.condition) for cell in cells]
+    planner = planner_of(cells[0].quick)
+    assert isinstance(planner, MPC)
+    found = accept_together(
+        [partial(preset, effects=effects) for effects in lacking],
+        make(),
+        planner,
+        keys=[jax.random.key(cell.seed) for cell in cells],
+    )
+    return [_accepted(each) for each in found]
+
+
+def _accepted(found: AcceptedTruth) -> Values:
     return {
         "returns": found.oracle.returns.tolist(),
         "oracle_return": found.oracle.oracle_return,
@@ -125,38 +170,57 @@ def oracle_cell(cell: HiddenMachine) -> Values:
 
 def learner_cell(cell: Cell, redrawn: int) -> Values:
     """Returns of one learner; episodes after a fit that failed are not run."""
-    returns: list[float] = []
-    started, failure = time.perf_counter(), None
+    started, failure, seen = time.perf_counter(), "", []
     try:
-        _run_episodes(cell, redrawn, lambda done: returns.append(float(done.total)))
+        for trajectory in _episodes(cell, redrawn):
+            seen.append(trajectory)
     except (NotConverged, NotFinite) as error:
         failure = str(error)
-    seconds = time.perf_counter() - started
-    return {"returns": returns, "failure": failure, "seconds": seconds}
+    return _learned(seen, failure, time.perf_counter() - started)
 
 
-def _run_episodes(cell: Cell, redrawn: int, note: Callable[[Trajectory], None]) -> None:
-    """The episodes of a learner, or of a policy that is trained elsewhere."""
-    key = jax.random.key(cell.seed)
-    if cell.method in TRAINED:
-        task, _ = task_and_model(cell, "SIM2GP", redrawn)
-        world = TRAINED[cell.method](task, MACHINES[cell.machine][0]())
-        planner, episodes = cell.planner, cell.episodes
-        for done in episodes_in(task, world, planner, key=key, episodes=episodes):
-            note(done)
-        return
+def learner_cells(cells: Sequence[Cell], redrawn: Sequence[int]) -> list[Values]:
+    """`learner_cell` of each, all with one learner; seconds are shared out."""
+    started = time.perf_counter()
+    runs = [_sampling(*pair) for pair in zip(cells, redrawn, strict=True)]
+    ended = learn_together(runs, cells[0].episodes)
+    seconds = (time.perf_counter() - started) / len(cells)
+    return [_learned(seen, failure, seconds) for seen, failure in ended]
+
+
+def _learned(seen: Sequence[Trajectory], failure: str, seconds: float) -> Values:
+    returns = [float(trajectory.total) for trajectory in seen]
+    return {"returns": returns, "failure": failure or None, "seconds": seconds}
+
+
+def _sampling(cell: Cell, redrawn: int) -> SamplingRun:
+    """A cell's learner before its first episode."""
     task, model = task_and_model(cell, cell.method, redrawn)
-    psrl(
+    objective = MarkovObjective(task.reward)
+    return SamplingRun(
         task,
         model,
         cell.planner,
-        episodes=cell.episodes,
-        key=key,
-        history=model.history,
-        update_every=cell.update_every,
-        final_fit=False,
-        on_episode=lambda episode: note(episode.trajectory),
+        lambda _: objective,
+        cell.episodes,
+        jax.random.key(cell.seed),
+        model.history,
     )
+
+
+def _episodes(cell: Cell, redrawn: int) -> Iterator[Trajectory]:
+    """Those of a learner, each before its fit, or of a policy trained elsewhere."""
+    if cell.method in TRAINED:
+        task, _ = task_and_model(cell, "SIM2GP", redrawn)
+        world = TRAINED[cell.method](task, MACHINES[cell.machine][0]())
+        key, planner = jax.random.key(cell.seed), cell.planner
+        yield from episodes_in(task, world, planner, key=key, episodes=cell.episodes)
+        return
+    run = _sampling(cell, redrawn)
+    for _ in range(cell.episodes):
+        if run.trajectories:
+            run.fit()
+        yield run.next(cell.update_every)
 
 
 def scores_of(
