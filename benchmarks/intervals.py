@@ -39,13 +39,16 @@ from interval_arms import (
 from interval_sysid import intervals
 from sim2gp.data.logs import Log
 from sim2gp.data.split_log import cut
+from sim2gp.data.windows import Windows
 from sim2gp.data.windows_likelihood import WindowsLikelihood
+from sim2gp.errors import NotConverged
 from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.intervals.discrepancy import corrected_windows
 from sim2gp.identification.intervals.pulls import pulls_of_windows
 from sim2gp.identification.intervals.scatter import NOTHING, CorrectedFit
 from sim2gp.identification.misfit.residuals import misfit_of_windows
 from sim2gp.identification.missing_physics.at_zero import at_zero
+from sim2gp.inference.estimate import Estimate
 from sim2gp.runs.cells import Cells, add_options
 from sim2gp.runs.workers import cores, spread
 from sim2gp.systems import AbstractSystem, UniformRodArm
@@ -126,7 +129,7 @@ def work(job: Job) -> dict[str, Any]:
         if condition.friction or condition.cogging:
             knows = with_what_is_missing(condition)
             again, _ = cut([data.log(s)], knows, window=WINDOW)
-            best = fit_windows(knows, again, key=key).posterior
+            best = _nearest(knows, again, key).posterior
             each["oracle"] = tuple(
                 np.asarray(v)[: len(NAMES)] / prior_sd for v in (best.mean, best.sd())
             )
@@ -165,6 +168,15 @@ def _fitted(
     windows, of = cut([log], system, window=window)
     belief = fit_windows(system, windows, key=key)
     return WindowsLikelihood(system, windows), belief, np.asarray([k for k, _ in of])
+
+
+def _nearest(system: AbstractSystem, windows: Windows, key: Any) -> Estimate:
+    """The fit, or where it ended: sharp friction has steps that no slope tells."""
+    try:
+        return fit_windows(system, windows, key=key)
+    except NotConverged as error:
+        assert isinstance(error.known, Estimate)
+        return error.known
 
 
 def _units(found: CorrectedFit, prior_sd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -45,6 +45,13 @@ class Sim2GPError(Exception):
         self.key = key
         super().__init__(str(self))
 
+    @property
+    def arguments(self) -> dict[str, str]:
+        """In words: what makes the same error in another process."""
+        names = ("code", "what", "where", "got", "expected", "fix", "key")
+        given = {name: getattr(self, name) for name in names}
+        return {name: str(x) for name, x in given.items() if x is not None}
+
     def __str__(self) -> str:
         text = f"{self.code} {self.what}"
         if self.where:

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import jax
 import pytest
 
 from sim2gp.cli import main
@@ -51,34 +50,6 @@ def draw(out: Path, *old: str) -> dict[str, Any]:
     quiet = Progress(quiet=True)
     more = dict(zip(("old",), old, strict=False))
     return run_cells(rows, out, workers=1, progress=quiet, **more)[1]
-
-
-def test_an_accelerator_computes_a_row_as_one(
-    names: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The same cells as alone; what is stored is not computed again."""
-    out, batches = tmp_path / "fig2", []
-
-    def learners(cells: list[Cell], redrawn: list[int]) -> list[dict[str, Any]]:
-        batches.append([cell.name for cell in cells])
-        return [
-            swingup.learner_cell(*pair) for pair in zip(cells, redrawn, strict=True)
-        ]
-
-    monkeypatch.setattr(swingup, "learner_cells", learners)
-    monkeypatch.setattr(swingup, "oracle_cells", lambda cells: [ORACLE] * len(cells))
-    run_cell(Cell("furuta", "nominal", "SIM2GP", 0, 2), out)
-    alone = draw(tmp_path / "other")
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    names.clear()
-    about = draw(out)
-    assert sorted(map(len, batches)) == [1, 2, 2]
-    assert about["devices_of_cells"] == {"cpu": 2, "gpu": 6}
-    assert alone["devices_of_cells"] == {"cpu": 8}
-    del about["devices_of_cells"], alone["devices_of_cells"]
-    assert about == alone
-    draw(out)
-    assert len(names) == len(set(names)) == 5
 
 
 def flips(good: bytes, every: int = 1) -> Iterator[bytes]:

@@ -10,9 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim2gp.errors import InputError, Sim2GPError
+from sim2gp.errors import InputError, NotConverged, Sim2GPError
 from sim2gp.runs import workers
 from sim2gp.runs.workers import in_order, spread
+
+
+def unfinished() -> NotConverged:
+    """With all that it may carry."""
+    error = NotConverged("E201", "no MAP", where="a fit", got=3.0, key="not_converged")
+    error.known = np.zeros(3)
+    return error
 
 
 def square(job: int) -> tuple[int, int]:
@@ -20,6 +27,8 @@ def square(job: int) -> tuple[int, int]:
         raise InputError("E103", "unlucky", got=job, fix="another number")
     if job == 14:
         os._exit(3)
+    if job == 15:
+        raise unfinished()
     return job**2, os.getpid()
 
 
@@ -80,6 +89,15 @@ def test_an_error_arrives_whole(count: int) -> None:
         list(spread(square, [[13], [1]], count))
     assert e.value.code == "E103"
     assert str(e.value.got) == "13"
+
+
+def test_the_error_of_a_worker_is_the_same_error() -> None:
+    """What is known where it ended stays in the process."""
+    with pytest.raises(NotConverged) as e:
+        list(spread(square, [[15], [1]], 2))
+    assert str(e.value) == str(unfinished())
+    assert e.value.key == "not_converged"
+    assert e.value.known is None
 
 
 def test_a_process_that_dies_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -33,6 +33,7 @@ from sim2gp.experiment_design import (
     prediction_rows,
 )
 from sim2gp.experiment_design import optimise_commands as search
+from sim2gp.experiment_design.forces import forces_shown, forces_table, not_excited
 from sim2gp.experiment_design.limits import SLOW, servo_rates
 from sim2gp.experiment_design.verdict import (
     DesignOptions,
@@ -124,7 +125,7 @@ def design(
         seconds, kind, tuple(about), predict, within, limits or Limits(),
         start or {}, period, starts, configuration,
     )  # fmt: skip
-    with (progress or Progress()).task("design", 2) as task:
+    with (progress or Progress()).task("design", 3) as task:
         project, experiment, notes = setting(source, asked)
         box = _limit_box(project, experiment, asked.limits, notes)
         key = jax.random.key(seed)
@@ -133,11 +134,15 @@ def design(
         task.advance("limits and goal")
         found = search(experiment, goal, box, signal, key=key, starts=asked.starts)
         task.advance(f"{found.nats:.1f} nats")
+        shown = forces_shown(experiment, box, signal, found)
+        task.advance("forces that may be missing")
     name = source.name
     summary = _design_summary(name, asked, experiment, goal, found, seed)
     if isinstance(source, Identification):
         summary |= widths(source)
-    summary["warnings"] = [*notes, *summary.get("warnings", ())]
+    summary |= {"forces_shown": shown}
+    summary["tables"] += [forces_table(shown)] if shown else []
+    summary["warnings"] = [*notes, *not_excited(shown), *summary.get("warnings", ())]
     return NextExperiment(
         summary | provenance(began),
         _design_arrays(experiment, box, found),

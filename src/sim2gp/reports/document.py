@@ -157,7 +157,7 @@ def _figure_section(summary: Summary, arrays: Arrays) -> Section:
             "On the swing-up of a planner that knows the truth, which no learner is "
             "shown. Lines are medians over seeds, shades quartiles."
         )
-    elif summary.get("mismatch"):
+    elif summary.get("mismatch_map"):
         name, drawn = "Mismatch map", mismatch_map(arrays, summary)
         words = "best score of two episodes, for every effect and learner"
         more = (

@@ -20,7 +20,7 @@ def mismatch_map(
     import matplotlib as mpl
     from matplotlib.figure import Figure
 
-    about = summary["mismatch"]
+    about = summary["mismatch_map"]
     conditions, methods = about["conditions"], about["methods"]
     heights = [len(rows) for rows in conditions.values()]
     with mpl.rc_context(STYLE):

@@ -130,10 +130,8 @@ def _next(results: Any, processes: Sequence[Any]) -> Any:
                 raise error("worker_died", Sim2GPError, got=got) from None
             continue
         if failure is not None:
-            kind, fields = failure
-            raise getattr(errors, kind)(
-                fields.pop("code"), fields.pop("what"), **fields
-            )
+            kind, arguments = failure
+            raise getattr(errors, kind)(**arguments)
         return number, result
 
 
@@ -147,8 +145,8 @@ def _serve(work: Callable[[Any], Any], jobs: Any, results: Any) -> None:
             try:
                 results.put((number, work(job), None))
             except Sim2GPError as caught:
-                fields = {name: str(value) for name, value in vars(caught).items()}
-                results.put((number, None, (type(caught).__name__, fields)))
+                failure = type(caught).__name__, caught.arguments
+                results.put((number, None, failure))
                 return
 
 

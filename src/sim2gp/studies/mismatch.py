@@ -101,7 +101,7 @@ class MismatchMap(Study):
         return {
             "title": "Mismatch map: every learner under what its simulator lacks",
             "episodes": self.episodes,
-            "mismatch": {
+            "mismatch_map": {
                 "conditions": {m: self.conditions(m) for m in MACHINES},
                 "methods": list(COLUMNS),
                 "episodes": EPISODES,

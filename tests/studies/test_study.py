@@ -1,0 +1,57 @@
+"""Cells of a study on an accelerator: in batches, and the same as alone."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import pytest
+
+from sim2gp.runs import Progress
+from sim2gp.studies import swingup
+from sim2gp.studies.study import run_cell, run_cells
+from sim2gp.studies.swingup import Cell
+
+ORACLE = {"hang_return": 50.0, "oracle_return": 150.0, "redrawn": 0, "returns": [150.0]}
+
+
+def draw(out: Path, workers: int = 2) -> dict[str, Any]:
+    """What a study of three learners and two seeds says of its cells."""
+    rows = {
+        (m,): [Cell("furuta", "nominal", m, seed, 2) for seed in (0, 1)]
+        for m in ("SIM2GP", "RES", "NLM")
+    }
+    return run_cells(rows, out, workers=workers, progress=Progress(quiet=True))[1]
+
+
+def test_an_accelerator_computes_a_row_as_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same cells as alone; what is stored is not computed again."""
+    out, batches, names = tmp_path / "fig2", [], []
+
+    def learner(cell: Cell, redrawn: int) -> dict[str, Any]:
+        names.append(cell.name)
+        return {"returns": [1.0, 2.0], "failure": None, "seconds": 1.0}
+
+    def learners(cells: list[Cell], redrawn: list[int]) -> list[dict[str, Any]]:
+        batches.append([cell.name for cell in cells])
+        return [
+            swingup.learner_cell(*pair) for pair in zip(cells, redrawn, strict=True)
+        ]
+
+    monkeypatch.setattr(swingup, "learner_cell", learner)
+    monkeypatch.setattr(swingup, "learner_cells", learners)
+    monkeypatch.setattr(swingup, "oracle_cell", lambda cell: ORACLE)
+    monkeypatch.setattr(swingup, "oracle_cells", lambda cells: [ORACLE] * len(cells))
+    run_cell(Cell("furuta", "nominal", "SIM2GP", 0, 2), out)
+    alone = draw(tmp_path / "other", 1)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    names.clear()
+    about = draw(out)
+    assert sorted(map(len, batches)) == [1, 2, 2]
+    assert about["devices_of_cells"] == {"cpu": 2, "gpu": 6}
+    assert alone["devices_of_cells"] == {"cpu": 8}
+    del about["devices_of_cells"], alone["devices_of_cells"]
+    assert about == alone
+    draw(out)
+    assert len(names) == len(set(names)) == 5
