@@ -21,7 +21,7 @@ import argparse
 import json
 import sys
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import numpy as np
@@ -174,9 +174,8 @@ def _nearest(system: AbstractSystem, windows: Windows, key: Any) -> Estimate:
     """The fit, or where it ended: sharp friction has steps that no slope tells."""
     try:
         return fit_windows(system, windows, key=key)
-    except NotConverged as error:
-        assert isinstance(error.known, Estimate)
-        return error.known
+    except NotConverged as ended:
+        return cast(Estimate, ended.known)
 
 
 def _units(found: CorrectedFit, prior_sd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
