@@ -11,8 +11,11 @@ import pytest
 import sim2gp.experiment_design as d
 from sim2gp.experiment_design import by_samples, search
 from sim2gp.experiment_design.experiment import sensitivity_at
+from sim2gp.experiment_design.forces import forces_shown
 from sim2gp.experiment_design.limits import excess, servo_rates
+from sim2gp.experiment_design.search import DesignResult
 from sim2gp.inference.prior import ParameterPrior
+from sim2gp.inference.relevance import EARNED
 from sim2gp.systems import Delay, Machine, MuJoCo, Spring
 from sim2gp.systems.assemble import free_parts
 
@@ -77,6 +80,23 @@ def test_worth_is_that_of_the_definition() -> None:
     expected = sensitivity_at(experiment, U, 12)
     size = float(jnp.abs(expected).max())
     np.testing.assert_allclose(ahead, expected, rtol=0.0, atol=1e-6 * size)
+
+
+def test_forces_that_its_motion_shows() -> None:
+    """Counted by the engine's own slopes: of a motion, and at rest."""
+    experiment = experiment_with()
+    for size, shows in ((3.0, True), (0.0, False)):
+        U = np.asarray(size * commands(experiment))
+        mean = np.asarray(experiment.belief.mean)
+        states = by_samples.states_of(experiment, U, mean[None])[0]
+        scale = np.eye(mean.size)
+        found = DesignResult(U, 0.0, scale, states, states, states, 0.0, 1)
+        shown = forces_shown(experiment, found)
+        entry = shown["hinge by hinge.velocity"]
+        assert entry["unit"] == "N m"
+        assert (entry["nats"] > EARNED) is shows
+        # Of a turn, half a second covers too little.
+        assert shown["hinge by hinge"]["nats"] == 0.0
 
 
 @pytest.mark.nightly

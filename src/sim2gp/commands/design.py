@@ -134,7 +134,7 @@ def design(
         task.advance("limits and goal")
         found = search(experiment, goal, box, signal, key=key, starts=asked.starts)
         task.advance(f"{found.nats:.1f} nats")
-        shown = forces_shown(experiment, box, signal, found)
+        shown = forces_shown(experiment, found)
         task.advance("forces that may be missing")
     name = source.name
     summary = _design_summary(name, asked, experiment, goal, found, seed)

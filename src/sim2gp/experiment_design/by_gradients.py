@@ -223,3 +223,12 @@ def _plausible_states(
 
 
 sensitivity = eqx.filter_jit(sensitivity_at)
+
+
+@eqx.filter_jit
+def scale_after(experiment: Experiment, U: Array) -> Float[Array, "p p"]:
+    """Square root of the covariance that commands leave, at the belief's mean."""
+    belief = experiment.belief
+    states = trajectory(experiment, belief.mean, U)
+    A = information(experiment, jnp.zeros_like(belief.mean), U, states)
+    return posterior_scale(belief, A)

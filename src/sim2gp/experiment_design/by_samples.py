@@ -85,18 +85,36 @@ def worth_at(
     experiment: Experiment, goal: AbstractGoal, z: np.ndarray, U: np.ndarray
 ) -> tuple[float, Float[Array, "p p"]]:
     """Nats of the goal at one machine of the belief, and the belief's scale after."""
+    scale = _scale_at(experiment, z, U)
+    if scale is None:
+        return -np.inf, experiment.belief.scale
+    return float(goal.nats(experiment.belief.scale, scale)), scale
+
+
+def scale_after(
+    experiment: Experiment, commands: Float[Array, "T m"]
+) -> Float[Array, "p p"]:
+    """Square root of the covariance that commands leave, at the belief's mean."""
+    mean = np.zeros(experiment.belief.mean.size)
+    scale = _scale_at(experiment, mean, np.asarray(commands))
+    return experiment.belief.scale if scale is None else scale
+
+
+def _scale_at(
+    experiment: Experiment, z: np.ndarray, U: np.ndarray
+) -> Float[Array, "p p"] | None:
+    """The belief's scale after commands, at one machine; None if that diverges."""
     tt = experiment.belief.at(jnp.asarray(z))
     states = states_of(experiment, U, np.asarray(tt)[None])[0]
     if not np.isfinite(states).all():
-        return -np.inf, experiment.belief.scale
+        return None
     count, p = experiment.window, z.size
     first = np.arange(0, experiment.steps - count + 2, count)
     scale, n = experiment.belief.scale, states.shape[1]
     asked = about(tt, states[first], scale, experiment.start_sd)
     J = _sensitivity_rows(experiment, asked, U, first, count - 1)
     A = _about_constants(jnp.asarray(J.reshape(len(first), -1, n + p)), n)
-    scale = posterior_scale(experiment.belief, A.reshape(-1, p))
-    return float(goal.nats(experiment.belief.scale, scale)), scale
+    return posterior_scale(experiment.belief, A.reshape(-1, p))
 
 
 def worth(

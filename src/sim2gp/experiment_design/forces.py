@@ -9,14 +9,11 @@ would the experiment say so?
 from dataclasses import replace
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from sim2gp.experiment_design.experiment import Experiment
-from sim2gp.experiment_design.limits import LimitBox
 from sim2gp.experiment_design.search import DesignResult, scale_after
-from sim2gp.experiment_design.signals import AbstractCommandSignal
 from sim2gp.identification.missing_physics.curves import curves_of
 from sim2gp.identification.missing_physics.reach import box_of_rows
 from sim2gp.identification.words import digits, join_names
@@ -35,22 +32,19 @@ COVERED = 0.1
 
 @in_float64
 def forces_shown(
-    experiment: Experiment,
-    limits: LimitBox,
-    signal: AbstractCommandSignal,
-    found: DesignResult,
+    experiment: Experiment, found: DesignResult
 ) -> dict[str, dict[str, Any]]:
-    """Of each force, by joint and variable: ``nats`` for it, prior and expected sd.
+    """Of each force, by joint and variable: ``nats`` for it, and the prior's sd.
 
     ``nats`` is what the evidence for the force is expected to be where it is there: the
     ratio of prior and posterior density at no force. A variable that hardly moves gives
-    none. Sd are root mean squares over where the motion goes, in ``unit``. Empty for a
-    plant that takes no forces.
+    none. The sd is a root mean square over where the motion goes, in ``unit``. Empty
+    for a plant that takes no forces.
     """
     system = experiment.system
     if not takes_forces(plant_of(system)):
         return {}
-    where = box_of_rows(system, found.states, found.commands)
+    where = box_of_rows(system, found.states[:-1], found.commands)
     reach = Encoding.of(system, {}).box()
     moves = {k: b - a >= COVERED * np.diff(reach[k])[0] for k, (a, b) in where.items()}
     box = {name: where[name] if moves[name] else reach[name] for name in where}
@@ -58,23 +52,17 @@ def forces_shown(
     wide = free_parts(system, forces, period=experiment.period)
     belief = _with_forces(experiment.belief, wide.parameters.prior())
     asked = replace(experiment, system=wide, belief=belief, corrected=None)
-    after = scale_after(asked, limits, signal, found.commands)
+    after = np.asarray(scale_after(asked, found.commands))
     root = np.asarray(asked.belief.scale)
     left = np.linalg.solve(root, after)  # a root of the covariance, in prior sd
-    now, then = (
-        curves_of(wide, forces, box, Gaussian(belief.mean, jnp.asarray(scale)))
-        for scale in (root, after)
-    )
     shown = {}
-    for before, later in zip(now, then, strict=True):
-        names = [f"{before.where}.{kind}" for kind in before.kinds]
+    for curve in curves_of(wide, forces, box, belief):
+        names = [f"{curve.where}.{kind}" for kind in curve.kinds]
         places = np.concatenate([wide.parameters.groups[name] for name in names])
-        sd, expected = (float(np.sqrt(np.mean(c.sd**2))) for c in (before, later))
-        shown[before.name] = {
-            "unit": before.unit,
-            "nats": evidence_if_there(left[places]) if moves[before.of] else 0.0,
-            "sd": sd,
-            "expected_sd": expected if moves[before.of] else sd,
+        shown[curve.name] = {
+            "unit": curve.unit,
+            "nats": evidence_if_there(left[places]) if moves[curve.of] else 0.0,
+            "sd": float(np.sqrt(np.mean(curve.sd**2))),
         }
     return shown
 
@@ -101,20 +89,15 @@ def not_excited(shown: dict[str, dict[str, Any]]) -> list[str]:
 def forces_table(shown: dict[str, dict[str, Any]]) -> dict[str, Any]:
     """The same as a table of the summary."""
     rows = [
-        [
-            name,
-            digits(e["nats"], 2),
-            f"{digits(e['sd'], 2)} {e['unit']}",
-            digits(e["expected_sd"], 2),
-        ]
+        [name, digits(e["nats"], 2), f"{digits(e['sd'], 2)} {e['unit']}"]
         for name, e in shown.items()
     ]
     return {
         "title": "Forces that may be missing: would the experiment show them?",
-        "columns": ["force", "evidence if there", "prior sd", "sd after"],
+        "columns": ["force", "evidence", "if it is about"],
         "rows": rows,
-        "note": f"Evidence in nats, on average; below {EARNED:g} the experiment does "
-        "not exclude the force. Sd are root mean squares over where the motion goes.",
+        "note": "Nats that the experiment is expected to give for a force of that size "
+        f"(the prior's sd). Below {EARNED:g} it does not exclude the force.",
     }
 
 

@@ -19,7 +19,7 @@ from sim2gp import checks
 from sim2gp.errors import InputError, NotFinite, error
 from sim2gp.experiment_design import by_gradients, by_samples
 from sim2gp.experiment_design.experiment import Experiment
-from sim2gp.experiment_design.goals import AbstractGoal, DOptimal
+from sim2gp.experiment_design.goals import AbstractGoal
 from sim2gp.experiment_design.limits import LimitBox
 from sim2gp.experiment_design.search_method import SearchMethod, SearchProblem
 from sim2gp.experiment_design.signals import AbstractCommandSignal, MultisineCommands
@@ -160,17 +160,11 @@ def prediction_rows(
 
 @in_float64
 def scale_after(
-    experiment: Experiment,
-    limits: LimitBox,
-    signal: AbstractCommandSignal,
-    commands: Float[AnyArray, "T m"],
+    experiment: Experiment, commands: Float[AnyArray, "T m"]
 ) -> Float[AnyArray, "p p"]:
     """Square root of the covariance that commands leave, at the belief's mean."""
-    experiment, limits = jax.tree.map(jnp.asarray, (experiment, limits))
-    mean = jnp.zeros((1, experiment.belief.mean.size))
-    problem = SearchProblem(experiment, signal, DOptimal(), limits, mean, mean, mean)
-    information = _by(experiment).search_programs(problem).information
-    return information(jnp.asarray(commands))[1]
+    experiment = jax.tree.map(jnp.asarray, experiment)
+    return _by(experiment).scale_after(experiment, jnp.asarray(commands))
 
 
 def _by(experiment: Experiment) -> SearchMethod:

@@ -56,3 +56,8 @@ class SearchMethod(Protocol):
         self, experiment: Experiment, U: Float[Array, "T m"], periods: int
     ) -> Float[AnyArray, "k p"]:
         """How predictions of so many periods move with the virtual parameters."""
+
+    def scale_after(
+        self, experiment: Experiment, U: Float[Array, "T m"]
+    ) -> Float[AnyArray, "p p"]:
+        """Square root of the covariance that commands leave, at the belief's mean."""
