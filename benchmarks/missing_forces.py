@@ -1,19 +1,29 @@
 """Which forces are found, and how soon: scores by episode, on seeds of their own.
 
     python benchmarks/missing_forces.py [--machine M] [--settings S...]
-        [--learners L...] [--seeds N...] [--episodes N] [--every STEPS] [--out FILE]
+        [--learners L...] [--seeds N...] [--episodes N] [--every STEPS] [--quick]
+        [--workers N] [--out DIR] [--refresh | --keep-old]
 
-Each setting is an effect of the mismatch map with its strength ("spring strong"), or
-``nominal`` or ``mismatch`` of figure 2. Scores are those of the study's own cells.
+Each setting is an effect of the mismatch map with its strength ("spring strong"),
+``nominal`` or ``mismatch`` of figure 2, or physics that no force of one variable is;
+learners are those of the studies, and the controls (`controls.py`). Cells are stored
+next to ``--out`` and not computed again; on a GPU those of a learner are one program.
 """
 
 import argparse
 import json
-import sys
 from pathlib import Path
 
+import numpy as np
+
+from controls import ControlCell
+from sim2gp.planning.tasks import SOLVED
+from sim2gp.runs import Progress
+from sim2gp.runs.cells import add_options
+from sim2gp.runs.workers import cores
 from sim2gp.studies.learners import WITH_TERM
-from sim2gp.studies.swingup import Cell, learner_cell, oracle_cell, reference, scores
+from sim2gp.studies.study import run_cells
+from sim2gp.studies.swingup import best_seen, scores_of
 
 LEARNERS = ("MissingForces", WITH_TERM, "SIM2GP")
 SEEDS = (100, 101, 102)
@@ -27,33 +37,51 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=SEEDS)
     parser.add_argument("--episodes", type=int, default=3)
     parser.add_argument("--every", type=int)
-    parser.add_argument("--out", type=Path)
+    parser.add_argument(
+        "--quick", action="store_true", help="fewer plans, less training"
+    )
+    parser.add_argument("--workers", type=int, default=cores())
+    parser.add_argument("--out", type=Path, default=Path("runs/missing_forces"))
+    add_options(parser)
     asked = parser.parse_args()
-    rows = []
-    for setting in asked.settings:
-        for seed in asked.seeds:
-            about = asked.machine, setting
-            first = Cell(*about, "SIM2GP", seed, asked.episodes)
-            oracle = oracle_cell(reference(first))
-            for learner in asked.learners:
-                cell = Cell(*about, learner, seed, asked.episodes, asked.every)
-                found = learner_cell(cell, int(oracle["redrawn"]))
-                each = scores([found], [oracle], asked.episodes)[0]
-                row = {
-                    "setting": setting,
-                    "learner": learner,
-                    "seed": seed,
-                    "scores": [round(float(x), 3) for x in each],
-                    "seconds": round(found["seconds"], 1),
-                    "failure": found["failure"],
-                }
-                rows.append(row)
-                told = " ".join(f"{x:5.2f}" for x in each)
-                print(f"{setting:20} {learner:20} {seed} {told}", flush=True)
-    if asked.out is not None:
-        command = " ".join(["python", *sys.argv])
-        text = json.dumps({"command": command, "rows": rows}, indent=1)
-        asked.out.write_text(text + "\n")
+    rows = {
+        (asked.machine, setting, learner): [
+            ControlCell(
+                asked.machine,
+                setting,
+                learner,
+                seed,
+                asked.episodes,
+                asked.every,
+                asked.quick,
+            )
+            for seed in asked.seeds
+        ]
+        for setting in asked.settings
+        for learner in asked.learners
+    }
+    values, about = run_cells(
+        rows, asked.out, workers=asked.workers, progress=Progress(), old=asked.old
+    )
+    found = []
+    for (_, setting, learner), score in scores_of(rows, values).items():
+        best = best_seen(score)
+        middle = np.median(best, axis=0)
+        solved = int(np.sum(best[:, min(1, asked.episodes - 1)] >= SOLVED))
+        found.append(
+            {
+                "setting": setting,
+                "learner": learner,
+                "solved_in_two": solved,
+                "median_best": [round(float(x), 3) for x in middle],
+                "scores": np.round(score, 3).tolist(),
+            }
+        )
+        each = " ".join(f"{x:5.2f}" for x in middle)
+        print(f"{setting:20} {learner:20} {solved}/{len(score)} {each}", flush=True)
+    asked.out.mkdir(parents=True, exist_ok=True)
+    text = json.dumps({"seeds": list(asked.seeds), "rows": found, **about}, indent=1)
+    (asked.out / "summary.json").write_text(text + "\n")
 
 
 if __name__ == "__main__":

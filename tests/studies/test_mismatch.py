@@ -19,8 +19,15 @@ from sim2gp.studies.swingup import Cell
 from sim2gp.systems import Delay, Furuta
 from sim2gp.systems.effects.strengths import effect
 from sim2gp.systems.machine import Machine
+from sim2gp.systems.parts import AbstractPart
 
 ORACLE = {"hang_return": 50.0, "oracle_return": 150.0, "redrawn": 0, "returns": [150.0]}
+
+
+def lacking(machine: str, condition: str) -> AbstractPart:
+    """What the real machine has and the simulator lacks."""
+    (part,) = learners.effects_of(Cell(machine, condition, "SIM2GP", 0, 1))
+    return part
 
 
 def test_the_map_is_the_registered_catalogue():
@@ -29,22 +36,22 @@ def test_the_map_is_the_registered_catalogue():
     rows = study.rows()
     for machine in MACHINES:
         for condition in study.conditions(machine)[1:]:
-            (found,) = learners.effects_of(machine, condition)
+            found = lacking(machine, condition)
             assert found == effect(machine, *condition.split())
     forces = [m for m, c, w in rows if w == "RES" and c.split()[0] in EXPRESSIBLE]
     assert len(forces) == 27
     assert len(rows) == 4 * (1 + 15 + 1 + 21) + 6 * 15
     assert len(rows["cartpole", "tilt mild", "RES"]) == 10
     assert len(rows["furuta", "spring mild", "FS"]) == 5
-    (none,) = learners.effects_of("furuta", "nominal")
+    none = lacking("furuta", "nominal")
     assert none == dataclasses.replace(learners.MISSING["furuta"], magnitude=0.0)
     with pytest.raises(InputError, match="did you mean spring"):
-        learners.effects_of("furuta", "sprong mild")
+        learners.missing("furuta", "sprong mild")
 
 
 def test_conditions_of_a_figure_are_one_program():
     for machine, (_, preset) in MACHINES.items():
-        tasks = [preset(None, learners.effects_of(machine, c)) for c in CONDITIONS]
+        tasks = [preset(None, (lacking(machine, c),)) for c in CONDITIONS]
         nominal, mismatched = map(jax.tree.structure, tasks)
         assert nominal == mismatched
         s, a = tasks[0].start + 0.3, tasks[0].actions.high

@@ -41,7 +41,7 @@ from sim2gp.planning.tasks import MACHINES, Task, episodes_to_95, hanging_return
 from sim2gp.runs import Progress
 from sim2gp.runs.provenance import provenance
 from sim2gp.runs.sinks import Nowhere, Sink, each_episode
-from sim2gp.studies.learners import effects_of, reach_of
+from sim2gp.studies.learners import MISSING, reach_of
 from sim2gp.systems.base import AbstractPlant, AbstractSystem
 from sim2gp.types import Key, in_float64
 
@@ -104,7 +104,7 @@ def demo(
     started = time.perf_counter()
     make, make_task = MACHINES[machine]
     system = make()
-    effects = effects_of(machine, "mismatch") if mismatch else ()
+    effects = (MISSING[machine],) if mismatch else ()
     preset = partial(make_task, effects=effects)
     learners = _learners(system, preset(), mismatch)
     parts, runs = 1 + len(learners) * episodes, []

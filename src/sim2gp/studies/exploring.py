@@ -33,8 +33,14 @@ from sim2gp.planning.episode import Purpose, episode, key_for, oracle_world
 from sim2gp.planning.loop import Episode, drawn, expected, psal
 from sim2gp.planning.tasks import Task
 from sim2gp.studies import swingup
-from sim2gp.studies.learners import QUICK_TRAINING, planner_of, task_and_model
+from sim2gp.studies.learners import (
+    QUICK_TRAINING,
+    missing,
+    planner_of,
+    task_and_model,
+)
 from sim2gp.studies.study import AbstractCell, Values, described
+from sim2gp.systems.parts import AbstractPart
 from sim2gp.types import Dynamics, Key, in_float64
 
 #: Information hardly depends on the last digits of a plan: fewer sequences than a
@@ -90,6 +96,11 @@ class Cell(AbstractCell):
     seed: int
     episodes: int
     quick: bool = False
+
+    @property
+    def lacking(self) -> AbstractPart:
+        """The physics that the condition is about."""
+        return missing(self.machine, self.condition)
 
     @property
     def planner(self) -> AbstractPlanner:

@@ -126,6 +126,8 @@ class HiddenMachine(Protocol):
     @property
     def condition(self) -> str: ...
     @property
+    def lacking(self) -> AbstractPart: ...
+    @property
     def seed(self) -> int: ...
     @property
     def quick(self) -> bool: ...
@@ -139,15 +141,14 @@ def missing(machine: str, condition: str) -> AbstractPart:
     return effect(machine, name, strength)
 
 
-def effects_of(machine: str, condition: str) -> tuple[AbstractPart, ...]:
+def effects_of(cell: HiddenMachine) -> tuple[AbstractPart, ...]:
     """What the real machine has and its simulator lacks.
 
     Nominal is figure 2's effect of no magnitude: both conditions are one program.
     """
-    lacking = missing(machine, condition)
-    if condition == "nominal":
-        lacking = replace(lacking, magnitude=0.0)
-    return (lacking,)
+    if cell.condition == "nominal":
+        return (replace(cell.lacking, magnitude=0.0),)
+    return (cell.lacking,)
 
 
 def task_and_model(
@@ -157,8 +158,7 @@ def task_and_model(
     make, preset = MACHINES[cell.machine]
     system, key = make(), jax.random.key(cell.seed)
     record = draw_truth(system, key_for(key, redrawn, Purpose.TRUTH))
-    task = preset(record, effects_of(cell.machine, cell.condition))
-    lacking = missing(cell.machine, cell.condition)
+    task = preset(record, effects_of(cell))
     options: dict[str, Any] = {"reach": reach_of(task, system)}
     options |= QUICK_TRAINING if cell.quick else {}
-    return task, METHODS[method](system, lacking, options)
+    return task, METHODS[method](system, cell.lacking, options)

@@ -27,10 +27,12 @@ from sim2gp.studies.learners import (
     TRAINED,
     HiddenMachine,
     effects_of,
+    missing,
     planner_of,
     task_and_model,
 )
 from sim2gp.studies.study import AbstractCell, Key, Values, described
+from sim2gp.systems.parts import AbstractPart
 
 #: Scores by row; a row has seeds of its own.
 Table = dict[Key, Float[np.ndarray, "_ E"]]
@@ -55,6 +57,11 @@ class Cell(AbstractCell):
     update_every: int | None = None
     quick: bool = False
     planning: str = "mpc"
+
+    @property
+    def lacking(self) -> AbstractPart:
+        """The physics that the condition is about."""
+        return missing(self.machine, self.condition)
 
     @property
     def planner(self) -> AbstractPlanner:
@@ -134,7 +141,7 @@ def reference(cell: Cell) -> Cell:
 def oracle_cell(cell: HiddenMachine) -> Values:
     """Find the seed's truth, the first that its oracle swings up, and its returns."""
     make, preset = MACHINES[cell.machine]
-    effects = effects_of(cell.machine, cell.condition)
+    effects = effects_of(cell)
     found = accept_truth(
         lambda record: preset(record, effects),
         make(),
@@ -147,7 +154,7 @@ def oracle_cell(cell: HiddenMachine) -> Values:
 def oracle_cells(cells: Sequence[HiddenMachine]) -> list[Values]:
     """`oracle_cell` of each, on one machine."""
     make, preset = MACHINES[cells[0].machine]
-    lacking = [effects_of(cell.machine, cell.condition) for cell in cells]
+    lacking = [effects_of(cell) for cell in cells]
     planner = planner_of(cells[0].quick)
     assert isinstance(planner, MPC)
     found = accept_together(
