@@ -21,6 +21,7 @@ import numpy as np
 from sim2gp.belief import AbstractModel
 from sim2gp.commands.compare_setup import Setup, prepare_comparison
 from sim2gp.commands.compare_summary import FoldForecasts, summarise
+from sim2gp.commands.folds import recording_of_windows
 from sim2gp.commands.result import AbstractResult
 from sim2gp.data.logs import Log, note_lines
 from sim2gp.data.one_step_log import (
@@ -28,12 +29,16 @@ from sim2gp.data.one_step_log import (
     stride_of,
     transitions,
 )
+from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.forecasts import scoring
 from sim2gp.identification.forecasts.baselines import regression_errors
 from sim2gp.identification.forecasts.forecast import new_log_inflation
+from sim2gp.identification.forecasts.forecast_machine import fit_forecast_machine
 from sim2gp.identification.forecasts.prediction import channels, recording_names, subset
+from sim2gp.identification.missing_physics.at_zero import at_zero
 from sim2gp.inference.estimate import Estimate
+from sim2gp.inference.gaussian import Gaussian
 from sim2gp.models import NLM, FunctionSpace, Residual, ResidualFunctionSpace, Sim2GP
 from sim2gp.models.auto import log_scores
 from sim2gp.models.ensemble import ensemble
@@ -43,6 +48,7 @@ from sim2gp.runs import Progress
 from sim2gp.runs.progress import Task
 from sim2gp.runs.provenance import provenance
 from sim2gp.runs.workers import in_order
+from sim2gp.systems.assemble import carrying_inputs
 from sim2gp.systems.base import AbstractSystem
 
 HORIZONS = (0.2, 0.5)  # s
@@ -50,10 +56,15 @@ DRAWS = 32
 
 
 class ModelFactory(NamedTuple):
-    """How a model is made of the simulator and a reach, and what it is in words."""
+    """How a model is made of the simulator and a reach, and what it is in words.
+
+    With ``forces`` the simulator has those that predict recordings left out of its fit
+    (`fit_forecast_machine`), if there are any.
+    """
 
     make: Callable[[Sim2GP, dict[str, float]], AbstractModel]
     what: str
+    forces: bool = False
 
 
 Learners = Mapping[str, ModelFactory]
@@ -61,6 +72,9 @@ WITH_RESIDUAL = "the simulator plus a learned residual"
 #: From simple to complex; each from the simulator with its parameters given.
 MODELS: Learners = {
     "SIM2GP": ModelFactory(lambda sim, reach: sim, "the simulator alone"),
+    "MissingForces": ModelFactory(
+        lambda sim, reach: sim, "the simulator plus missing forces", forces=True
+    ),
     "RES": ModelFactory(lambda sim, reach: Residual(sim, reach=reach), WITH_RESIDUAL),
     "RES-FS": ModelFactory(
         lambda sim, reach: ResidualFunctionSpace(sim, reach=reach), WITH_RESIDUAL
@@ -124,7 +138,7 @@ def compare(
             parts = _folds_in_processes(jobs, workers, task)
         else:
             parts = [_run_fold(setup, job, models, task.advance) for job in jobs]
-        whole = _fit_without(setup, [], _fold_key(seed, len(folds)))
+        _, whole = _fit_without(setup, [], _fold_key(seed, len(folds)))
         task.advance("evidence")
     names = channels(project.system, setup.windows)
     units = {c.name: c.unit for c in project.system.physical_states}
@@ -203,7 +217,7 @@ def compare_fold(
     What is left out is masked, not removed, so that folds share their compilations.
     """
     first, *keys = jax.random.split(key, 1 + len(models))
-    belief = _fit_without(setup, left, first)
+    likelihood, belief = _fit_without(setup, left, first)
     out = np.isin(setup.samples.step_log(), left)
     test = np.isin(setup.steps.log, left)
     tt = belief.posterior.mean
@@ -212,7 +226,15 @@ def compare_fold(
     )
     train = eqx.tree_at(lambda t: t.mask, rows, ~out)
     held = eqx.tree_at(lambda t: t.mask, rows, out)
-    sim = Sim2GP(setup.stepper, dt=setup.period, prior=belief.posterior, frozen=True)
+    plain = setup.project.system, belief.posterior
+    sims = {False: _simulator(setup, *plain)}
+    if any(learner.forces for learner in models.values()):
+        known = belief.with_measurements(setup.project.system.parameters)
+        recording = recording_of_windows(setup.logs, setup.of)
+        robust = setup.project.spec.likelihood.robust
+        start = at_zero(likelihood, known)
+        wider = fit_forecast_machine(start, recording, robust=robust)
+        sims[True] = _simulator(setup, wider.system, wider.posterior)
     start_sd = _start_sd(setup.grid.lag[~test])
     resolution = np.asarray(setup.windows.floor)
     training = set(recording_names(setup.logs)) - {setup.logs[k].source for k in left}
@@ -220,7 +242,7 @@ def compare_fold(
     error, sd, steps = [], [], []
     for (name, learner), key in zip(models.items(), keys, strict=True):
         begin, learn, roll = jax.random.split(key, 3)
-        model = learner.make(sim, setup.reach)
+        model = learner.make(sims[learner.forces], setup.reach)
         fitted = model.fit(model.init(begin), train, key=learn)
         found = ensemble(fitted, setup.steps, start_sd, draws=DRAWS, key=roll)
         off = found.point - setup.steps.y
@@ -256,14 +278,23 @@ def _trivial(setup: Setup, test: np.ndarray) -> np.ndarray:
     return np.stack([hold, regression_errors(train, tested, rows)])
 
 
-def _fit_without(setup: Setup, left: Sequence[int], key: jax.Array) -> Estimate:
+def _simulator(setup: Setup, system: AbstractSystem, known: Gaussian) -> Sim2GP:
+    """In steps of the comparison, its parameters given."""
+    stepper = carrying_inputs(system, setup.period)
+    return Sim2GP(stepper, dt=setup.period, prior=known, frozen=True)
+
+
+def _fit_without(
+    setup: Setup, left: Sequence[int], key: jax.Array
+) -> tuple[WindowsLikelihood, Estimate]:
     """The simulator's parameters from the windows of all logs but ``left``."""
     mask = np.asarray(setup.windows.mask) & ~np.isin(setup.of, left)[:, None, None]
     kept = eqx.tree_at(lambda w: w.mask, setup.windows, mask)
     robust = setup.project.spec.likelihood.robust
     system = setup.project.system
     # One start: the folds are small changes of one problem, and share a compilation.
-    return fit_windows(system, kept, key=key, robust=robust, starts=1)
+    found = fit_windows(system, kept, key=key, robust=robust, starts=1)
+    return WindowsLikelihood(system, kept), found
 
 
 def _start_sd(lag: np.ndarray) -> np.ndarray:

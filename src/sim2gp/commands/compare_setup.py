@@ -40,7 +40,6 @@ class Setup:
     windows: Windows  # to fit the simulator
     of: np.ndarray  # log of each of these
     grid: Grid
-    stepper: AbstractSystem
     period: float
     samples: Samples  # to train what is learned
     steps: Steps  # to be judged by
@@ -86,7 +85,6 @@ def prepare_comparison(
         windows,
         of,
         grid,
-        stepper,
         period,
         samples,
         steps,
