@@ -76,6 +76,7 @@ def test_a_joint_that_moves_shows_its_forces_and_one_at_rest_does_not() -> None:
     assert [row[0] for row in forces_table(still)["rows"]] == list(still)
 
 
+@pytest.mark.nightly  # 10 s
 def test_better_sensors_show_more() -> None:
     e = experiment()
     found = designed(e, commands())
