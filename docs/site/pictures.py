@@ -44,8 +44,8 @@ CONDITIONS = {
     "ar95": "coloured noise (AR .95)",
     "friction5": "small dry friction is missing",
     "friction20": "large dry friction is missing",
-    "sharp20": "the same, sharper than the library's",
-    "cogging10": "cogging is missing: not in the library",
+    "sharp20": "the same, five times as sharp",
+    "cogging10": "cogging is missing",
 }
 TERM = "SIM2GP with the term"
 EPISODES = [
