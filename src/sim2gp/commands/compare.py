@@ -226,15 +226,7 @@ def compare_fold(
     )
     train = eqx.tree_at(lambda t: t.mask, rows, ~out)
     held = eqx.tree_at(lambda t: t.mask, rows, out)
-    plain = setup.project.system, belief.posterior
-    sims = {False: _simulator(setup, *plain)}
-    if any(learner.forces for learner in models.values()):
-        known = belief.with_measurements(setup.project.system.parameters)
-        recording = recording_of_windows(setup.logs, setup.of)
-        robust = setup.project.spec.likelihood.robust
-        start = at_zero(likelihood, known)
-        wider = fit_forecast_machine(start, recording, robust=robust)
-        sims[True] = _simulator(setup, wider.system, wider.posterior)
+    sims = _simulators(setup, likelihood, belief, models)
     start_sd = _start_sd(setup.grid.lag[~test])
     resolution = np.asarray(setup.windows.floor)
     training = set(recording_names(setup.logs)) - {setup.logs[k].source for k in left}
@@ -276,6 +268,21 @@ def _trivial(setup: Setup, test: np.ndarray) -> np.ndarray:
     start = np.asarray(tested.windows.start)[:, list(setup.steps.outputs)]
     hold = start[:, None] - setup.steps.y[test]
     return np.stack([hold, regression_errors(train, tested, rows)])
+
+
+def _simulators(
+    setup: Setup, likelihood: WindowsLikelihood, fit: Estimate, models: Learners
+) -> dict[bool, Sim2GP]:
+    """Without missing forces, and with them if a model asks for these."""
+    sims = {False: _simulator(setup, setup.project.system, fit.posterior)}
+    if any(learner.forces for learner in models.values()):
+        known = fit.with_measurements(setup.project.system.parameters)
+        recording = recording_of_windows(setup.logs, setup.of)
+        robust = setup.project.spec.likelihood.robust
+        start = at_zero(likelihood, known)
+        wider = fit_forecast_machine(start, recording, robust=robust)
+        sims[True] = _simulator(setup, wider.system, wider.posterior)
+    return sims
 
 
 def _simulator(setup: Setup, system: AbstractSystem, known: Gaussian) -> Sim2GP:
