@@ -181,6 +181,31 @@ def test_where_nothing_is_missing_little_is_paid(rho: float) -> None:
     assert before < sd < 1.6 * before
 
 
+def test_errors_of_the_parameters_frequencies_keep_their_width() -> None:
+    """Many forces of high frequencies: slow errors pull the constants, not these."""
+    rng, many, rows = np.random.default_rng(6), 24, 400
+
+    t = np.arange(rows) / rows
+    slow = np.stack([np.sin(2 * np.pi * (k + 1) * t) for k in range(OWN)], axis=1)
+    fast = np.stack([np.sin(2 * np.pi * (97 + 3 * k) * t) for k in range(many)], axis=1)
+    J = np.concatenate([3.0 * slow, 3.0 * fast], axis=1).reshape(40, 10, -1)
+    groups = {"fast": np.arange(OWN, OWN + many)}
+    model, own = Linear(J), np.eye(OWN + many)[:, :OWN]
+    ratios, noises = [], []
+    for _ in range(20):
+        y = ar1(rng, 0.9)
+        plain, pulls = model.fit(y)
+        wide = correct_posterior(model.prior, plain, pulls, groups)
+        few = gaussian(np.asarray(plain.mean)[:OWN], np.eye(OWN))
+        prior = gaussian(np.zeros(OWN), np.eye(OWN))
+        alone = correct_posterior(prior, few, pulls.onto(own))
+        pairs = zip(*(Plain(x.posterior).sd[:OWN] for x in (wide, alone)), strict=True)
+        ratios.append([one / other for one, other in pairs])
+        noises.append(wide.inflation / alone.inflation)
+    assert np.median(ratios) == pytest.approx(1.0, abs=0.1)
+    assert np.median(noises) == pytest.approx(1.0, abs=0.2)
+
+
 def test_it_does_not_matter_where_a_linear_machine_is_linearised() -> None:
     rng = np.random.default_rng(2)
     model = Linear(sensitivities(rng))

@@ -24,7 +24,9 @@ more or less matters to a matrix, so G is drawn towards one number for all direc
     G <- (nu G + k kappa^2 F) / (nu + k),   kappa^2 = tr(F^-1 G) / p,   k = p (p + 1),
 
 with ``nu`` its degrees of freedom, ``lambda >= 1``, and as wide as Student's t is with
-``nu``. The intervals are those of the prior and of data that count as often as that,
+``nu``. Forces that may be missing have a number of their own for the directions that
+are not the parameters': they are many, and of other frequencies. The intervals are
+those of the prior and of data that count as often as that,
 
     N(z_c, (F_c + I)^-1),     F_c = F G^-1 F,     z_c = (F_c + I)^-1 F_c z_data,
 
@@ -139,13 +141,16 @@ def correct_posterior(
     nu = min(W, BARTLETT * W / b)
     if len(s) == 0 or nu < FEWEST:
         return CorrectedFit(plain, math.nan, b, nu, False)
-    root, kappa2 = _shrink_scatter(_scatter(v, P, pulls.group, b) @ onto.T, nu)
+    columns = s[:, None] * Vt
+    own = np.setdiff1d(np.arange(p), _places(groups or {}))
+    rows = _scatter(v, P, pulls.group, b) @ onto.T
+    root, kappa2 = _shrink_apart(rows, columns[:, own], nu)
     _, size, U = np.linalg.svd(root, full_matrices=False)
     spread = np.maximum(size, 1.0) * math.sqrt(nu / (nu - 2.0))
     # F z_data = (F + I) z at the MAP, where the scores add up to -z.
     data = s * (Vt @ z) - (Vt @ pulls.scores.sum(axis=0)) / s
     weight = U / spread[:, None]
-    root, rest = weight @ (s[:, None] * Vt), weight @ data
+    root, rest = weight @ columns, weight @ data
     centre, scale, each = averaged(root, rest, groups or {})
     found = Gaussian(jnp.asarray(mu0 + L0 @ centre), jnp.asarray(L0 @ scale))
     return CorrectedFit(found, kappa2, b, nu, True, each)
@@ -287,6 +292,28 @@ def _running(x: Float[np.ndarray, "W *p"], b: int) -> Float[np.ndarray, "S *p"]:
     pad = np.zeros((b, *x.shape[1:]))
     total = np.cumsum(np.concatenate([pad, x, pad[1:]]), axis=0)
     return total[b:] - total[:-b]
+
+
+def _places(groups: Groups) -> Int[np.ndarray, " k"]:
+    """Those of all groups."""
+    return np.concatenate([np.zeros(0, int), *groups.values()])
+
+
+def _shrink_apart(
+    rows: Float[np.ndarray, "S q"], own: Float[np.ndarray, "q p"], nu: float
+) -> tuple[Float[np.ndarray, "T q"], float]:
+    """A root of G, and the number of the parameters' own directions.
+
+    What errors do in the span of ``own`` is drawn towards one number and what they do
+    to forces alone towards another: there are many more forces, of other frequencies.
+    """
+    Q = np.linalg.qr(own, mode="complete")[0]
+    mine, others = np.split(Q, [min(own.shape)], axis=1)
+    root, kappa2 = _shrink_scatter(rows @ mine, nu)
+    if others.shape[1] == 0:
+        return root @ mine.T, kappa2
+    more, _ = _shrink_scatter(rows @ others, nu)
+    return np.concatenate([root @ mine.T, more @ others.T]), kappa2
 
 
 def _shrink_scatter(
