@@ -17,7 +17,6 @@ from sim2gp.experiment_design.search import DesignResult, scale_after
 from sim2gp.identification.missing_physics.curves import curves_of
 from sim2gp.identification.missing_physics.reach import box_of_rows
 from sim2gp.identification.words import digits, join_names
-from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.relevance import EARNED
 from sim2gp.models.features import Encoding
 from sim2gp.systems.assemble import free_parts
@@ -50,7 +49,8 @@ def forces_shown(
     box = {name: where[name] if moves[name] else reach[name] for name in where}
     forces = missing_forces(system, box)
     wide = free_parts(system, forces, period=experiment.period)
-    belief = _with_forces(experiment.belief, wide.parameters.prior())
+    own = experiment.belief
+    belief = wide.parameters.prior().with_block(np.arange(own.mean.size), own)
     asked = replace(experiment, system=wide, belief=belief, corrected=None)
     after = np.asarray(scale_after(asked, found.commands))
     root = np.asarray(asked.belief.scale)
@@ -99,10 +99,3 @@ def forces_table(shown: dict[str, dict[str, Any]]) -> dict[str, Any]:
         "note": "Nats that the experiment is expected to give for a force of that size "
         f"(the prior's sd). Below {EARNED:g} it does not exclude the force.",
     }
-
-
-def _with_forces(belief: Gaussian, prior: Gaussian) -> Gaussian:
-    """The belief about the machine's own parameters, the prior about its forces."""
-    p = belief.mean.size
-    mean = prior.mean.at[:p].set(belief.mean)
-    return Gaussian(mean, prior.scale.at[:p, :p].set(belief.scale))

@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from sim2gp.errors import InputError, error
 from sim2gp.inference.linalg import library, solve_triangular, triangular
@@ -46,6 +46,14 @@ class Gaussian(eqx.Module):
     def plus(self, scale: Float[Array, "n l"]) -> "Gaussian":
         """The distribution of ``x + scale @ eps``, eps independent of ``x``."""
         return Gaussian(self.mean, jnp.concatenate([self.scale, scale], axis=1))
+
+    def with_block(self, at: Int[np.ndarray, " m"], other: "Gaussian") -> "Gaussian":
+        """``other`` at these places, the rest as it was, independent of it.
+
+        Both scales are square, and this one has no covariance with these places.
+        """
+        scale = self.scale.at[np.ix_(at, at)].set(other.scale)
+        return Gaussian(self.mean.at[at].set(other.mean), scale)
 
     def covariance(self) -> Float[Array, "n n"]:
         """``scale scale^T``, exactly symmetric."""

@@ -52,9 +52,7 @@ class MissingForces(AbstractModel):
         parts = [f for f in missing_forces(sim.system, box) if self.counts(f)]
         self.forces = tuple(parts)
         system, own = free_parts(sim.system, parts), sim.prior
-        more, p = system.parameters.prior(), own.mean.size
-        scale = more.scale.at[:p, :p].set(own.scale)
-        prior = Gaussian(more.mean.at[:p].set(own.mean), scale)
+        prior = system.parameters.prior().with_block(np.arange(own.mean.size), own)
         self.plain, self.sim = sim, Sim2GP(system, dt=sim.dt, prior=prior)
 
     def counts(self, function: AbstractUnknownFunction) -> bool:

@@ -242,7 +242,7 @@ def _in_batches(
             for done in as_completed(running):
                 yield from done.result().items()
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
+            pool.shutdown(cancel_futures=True)
             raise
 
 
@@ -250,7 +250,6 @@ def run_batch(
     cells: Sequence[AbstractCell], out: Path, old: Old = "refuse"
 ) -> dict[AbstractCell, Values]:
     """`run_cell` of cells of one batch; those not stored are computed as one."""
-    cells = list(cells)
     stored = Cells(out, _code(cells[0]), old)
     found = {cell: _stored(cell, stored) for cell in cells}
     left = [cell for cell in cells if found[cell] is None]

@@ -96,11 +96,12 @@ def forces_at_zero(
     system = free_parts(machine, forces)
     names, prior = system.parameters.names, system.parameters.prior()
     own = np.asarray([names.index(name) for name in machine.parameters.names])
-    scale = prior.scale.at[np.ix_(own, own)].set(fitted.prior.scale)
+    about = prior.with_block(own, fitted.prior)
+    mean, scale = prior.mean.at[own].set(fitted.posterior.mean), about.scale
     whole = replace(
         fitted,
-        prior=Gaussian(prior.mean.at[own].set(fitted.prior.mean), scale),
-        posterior=Gaussian(prior.mean.at[own].set(fitted.posterior.mean), scale),
+        prior=about,
+        posterior=Gaussian(mean, scale),
         information=jnp.zeros_like(scale),  # of another machine
         scores=jnp.zeros((len(fitted.scores), len(scale))),
     )
