@@ -206,6 +206,28 @@ def test_errors_of_the_parameters_frequencies_keep_their_width() -> None:
     assert np.median(noises) == pytest.approx(1.0, abs=0.2)
 
 
+def test_forces_that_follow_slow_errors_do_not_narrow_what_is_without_them() -> None:
+    """Free forces take slow errors out of the windows; those that are off do not."""
+    rng, many, rows = np.random.default_rng(7), 12, 400
+    t = np.arange(rows) / rows
+    waves = [np.sin(np.pi * (k + 1) * t) for k in range(OWN + many)]
+    J = 3.0 * np.stack(waves, axis=1).reshape(40, 10, -1)
+    groups = {f"wave {k}": np.asarray([OWN + k]) for k in range(many)}
+    model, own = Linear(J), np.eye(OWN + many)[:, :OWN]
+    prior, ratios = gaussian(np.zeros(OWN), np.eye(OWN)), []
+    for _ in range(20):
+        plain, pulls = model.fit(0.3 * ar1(rng, 0.9))
+        z = np.asarray(plain.mean)
+        wide = correct_posterior(model.prior, plain, pulls, groups)
+        still = pulls.at(own @ z[:OWN] - z).onto(own)
+        alone = correct_posterior(prior, gaussian(z[:OWN], np.eye(OWN)), still)
+        pairs = zip(*(Plain(x.posterior).sd[:OWN] for x in (wide, alone)), strict=True)
+        ratios.append([wide.missing] + [one / other for one, other in pairs])
+    missing, *wider = np.median(ratios, axis=0)
+    assert missing < NOTHING
+    assert min(wider) > 0.95
+
+
 def test_it_does_not_matter_where_a_linear_machine_is_linearised() -> None:
     rng = np.random.default_rng(2)
     model = Linear(sensitivities(rng))

@@ -36,9 +36,16 @@ class _Found(NamedTuple):
 
 
 def averaged(
-    root: Float[np.ndarray, "q p"], data: Float[np.ndarray, " q"], groups: Groups
+    root: Float[np.ndarray, "q p"],
+    data: Float[np.ndarray, " q"],
+    groups: Groups,
+    alone: tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p p"]] | None = None,
 ) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p p"], dict[str, float]]:
-    """Mean and scale of the unknowns; the probability of each group, and of `NONE`."""
+    """Mean and scale of the unknowns; the probability of each group, and of `NONE`.
+
+    ``alone`` are mean and scale without any group, where they are known better than
+    from ``root``.
+    """
     best = _posterior(root, data, groups, {})
     found = [best]
     while len(best.scales) < min(MOST, len(groups)):
@@ -51,6 +58,8 @@ def averaged(
     logs = np.asarray([f.log_probability for f in found])
     weights = np.exp(logs - logs.max())
     weights = weights / weights.sum()
+    if alone is not None:
+        found[0] = found[0]._replace(mean=alone[0], scale=alone[1])
     mean = weights @ np.stack([f.mean for f in found])
     rows = [
         math.sqrt(w) * np.concatenate([f.scale.T, [f.mean - mean]])

@@ -45,7 +45,8 @@ In the data's form above scales ``tau`` have a Gaussian posterior and an evidenc
 and the parameters are reported with the mean and the covariance of a mixture over which
 groups are on and at which scale. It has all that a search visits which turns on one
 more as long as that pays (`averaging`): what the data leave open of the forces widens
-the intervals, what they say of them moves the centre.
+the intervals, what they say of them moves the centre. Where no group is on, mean and
+covariance are those of the parameters alone, with the scatter that windows have then.
 """
 
 import math
@@ -127,10 +128,7 @@ def correct_posterior(
     z, p = np.linalg.solve(L0, np.asarray(plain.mean) - mu0), len(mu0)
     A = np.concatenate(list(pulls.factors))
     R = np.asarray(np.linalg.qr(np.concatenate([A, np.eye(p)]), mode="r"))
-    # From here to the MAP of what is linear: nothing where this is the MAP.
-    down = np.linalg.solve(R.T, z + pulls.scores.sum(axis=0))
-    step = -np.linalg.solve(R, down)
-    z, pulls = z + step, pulls.at(step)
+    z, pulls = _at_the_map(z, pulls, R)
     _, s, Vt = np.linalg.svd(A, full_matrices=False)
     seen = ~(s <= RANK_TOLERANCE * s.max(initial=0.0))
     s, Vt = s[seen], Vt[seen]
@@ -151,7 +149,8 @@ def correct_posterior(
     data = s * (Vt @ z) - (Vt @ pulls.scores.sum(axis=0)) / s
     weight = U / spread[:, None]
     root, rest = weight @ columns, weight @ data
-    centre, scale, each = averaged(root, rest, groups or {})
+    alone = _without_forces(z, pulls, own) if groups else None
+    centre, scale, each = averaged(root, rest, groups or {}, alone)
     found = Gaussian(jnp.asarray(mu0 + L0 @ centre), jnp.asarray(L0 @ scale))
     return CorrectedFit(found, kappa2, b, nu, True, each)
 
@@ -245,6 +244,14 @@ def _missing_physics_remark(found: CorrectedFit) -> str:
     )
 
 
+def _at_the_map(
+    z: Float[np.ndarray, " p"], pulls: Pulls, R: Float[np.ndarray, "p p"]
+) -> tuple[Float[np.ndarray, " p"], Pulls]:
+    """The MAP of what is linear, and the pulls there: the same where ``z`` is it."""
+    step = -np.linalg.solve(R, np.linalg.solve(R.T, z + pulls.scores.sum(axis=0)))
+    return z + step, pulls.at(step)
+
+
 def _whitened(
     pulls: Pulls, R: Float[np.ndarray, "p p"]
 ) -> tuple[Float[np.ndarray, "W p"], Float[np.ndarray, "W p p"]]:
@@ -297,6 +304,26 @@ def _running(x: Float[np.ndarray, "W *p"], b: int) -> Float[np.ndarray, "S *p"]:
 def _places(groups: Groups) -> Int[np.ndarray, " k"]:
     """Those of all groups."""
     return np.concatenate([np.zeros(0, int), *groups.values()])
+
+
+def _without_forces(
+    z: Float[np.ndarray, " p"], pulls: Pulls, own: Int[np.ndarray, " k"]
+) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p p"]] | None:
+    """Mean and scale of the parameters' entries ``own`` where nothing is missing.
+
+    Forces that are free absorb a part of slow errors, so the windows scatter less with
+    them than without. None where windows are too few.
+    """
+    p, k = len(z), len(own)
+    onto = np.eye(p)[:, own]
+    unit = jnp.eye(k)
+    still = pulls.at(onto @ z[own] - z).onto(onto)
+    here = Gaussian(jnp.asarray(z[own]), unit)
+    found = correct_posterior(Gaussian(jnp.zeros(k), unit), here, still)
+    if not found.enough:
+        return None
+    mean, scale = np.asarray(found.posterior.mean), np.asarray(found.posterior.scale)
+    return onto @ mean, onto @ scale @ onto.T
 
 
 def _shrink_apart(
