@@ -18,16 +18,8 @@ from sim2gp.data.split_log import cut
 from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.intervals import scatter as intervals
-from sim2gp.identification.intervals.averaging import (
-    NONE,
-    NOTHING,
-    SHARES,
-    averaged,
-)
-from sim2gp.identification.intervals.discrepancy import (
-    _apart,
-    corrected_windows,
-)
+from sim2gp.identification.intervals.averaging import NONE, NOTHING, SHARES, averaged
+from sim2gp.identification.intervals.discrepancy import _apart, corrected_windows
 from sim2gp.identification.intervals.pulls import Pulls
 from sim2gp.identification.intervals.scatter import CorrectedFit, correct_posterior
 from sim2gp.identification.intervals.words import interval_entry, missing_forces_table
@@ -184,7 +176,6 @@ def test_where_nothing_is_missing_little_is_paid(rho: float) -> None:
 def test_errors_of_the_parameters_frequencies_keep_their_width() -> None:
     """Many forces of high frequencies: slow errors pull the constants, not these."""
     rng, many, rows = np.random.default_rng(6), 24, 400
-
     t = np.arange(rows) / rows
     slow = np.stack([np.sin(2 * np.pi * (k + 1) * t) for k in range(OWN)], axis=1)
     fast = np.stack([np.sin(2 * np.pi * (97 + 3 * k) * t) for k in range(many)], axis=1)
@@ -208,12 +199,10 @@ def test_errors_of_the_parameters_frequencies_keep_their_width() -> None:
 
 def test_forces_that_follow_slow_errors_do_not_narrow_what_is_without_them() -> None:
     """Free forces take slow errors out of the windows; those that are off do not."""
-    rng, many, rows = np.random.default_rng(7), 12, 400
-    t = np.arange(rows) / rows
-    waves = [np.sin(np.pi * (k + 1) * t) for k in range(OWN + many)]
-    J = 3.0 * np.stack(waves, axis=1).reshape(40, 10, -1)
-    groups = {f"wave {k}": np.asarray([OWN + k]) for k in range(many)}
-    model, own = Linear(J), np.eye(OWN + many)[:, :OWN]
+    rng, many = np.random.default_rng(7), OWN + 12
+    waves = np.sin(np.pi * np.outer(np.arange(400) / 400, np.arange(many) + 1))
+    model, own = Linear(3.0 * waves.reshape(40, 10, -1)), np.eye(many)[:, :OWN]
+    groups = {f"wave {k}": np.asarray([k]) for k in range(OWN, many)}
     prior, ratios = gaussian(np.zeros(OWN), np.eye(OWN)), []
     for _ in range(20):
         plain, pulls = model.fit(0.3 * ar1(rng, 0.9))
