@@ -1,6 +1,7 @@
 """Forecasts with missing forces: on simulated arms, and read back from a run."""
 
 import json
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import equinox as eqx
@@ -41,6 +42,14 @@ class Arm(NamedTuple):
     plain: ForecastMachine
     machine: ForecastMachine
     tested: Grid
+
+
+@pytest.fixture(scope="module", autouse=True)
+def coarse_simulation() -> Iterator[None]:
+    """Friction here is not sharp: a third of the benchmark's steps will do."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(interval_arms, "SUBSTEPS", 3)
+        yield
 
 
 @in_float64

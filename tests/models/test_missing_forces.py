@@ -7,6 +7,7 @@ import pytest
 
 import sim2gp as sg
 from sim2gp.data.transitions import Transitions
+from sim2gp.studies.learners import misfit_of_belief
 from sim2gp.systems import Furuta, Machine, Spring
 
 KEY = jax.random.key(0)
@@ -54,9 +55,10 @@ def test_before_data_it_is_the_simulator():
 
 def test_a_spring_is_found_as_a_force_of_the_arms_position(with_spring):
     """By that group alone, with the noise that there is, and as the right curve."""
-    belief, _ = with_spring
+    belief, data = with_spring
     assert on(belief) == ["theta.position_force"]
     np.testing.assert_allclose(belief.noise, NOISE, rtol=0.25)
+    assert not misfit_of_belief(belief, data).alarm
 
     table, (force,) = belief.system.parameters, belief.system.effects
     at = table.groups[force.name]
@@ -91,6 +93,7 @@ def test_it_predicts_what_the_simulator_alone_cannot(with_spring):
     assert error(belief) < 1.3 * NOISE[2]
     assert error(alone) > 3.0 * error(belief)
     assert float(belief.log_evidence) > float(alone.log_evidence) + 100.0
+    assert misfit_of_belief(alone, data).alarm
 
 
 def test_where_nothing_is_missing_all_forces_go_off():

@@ -189,6 +189,29 @@ def test_what_missing_forces_cost_where_nothing_is_missing():
     assert found["figure"].startswith("-0.015")
 
 
+def test_what_no_force_can_be_has_to_be_said():
+    """A delay unseen by most of its seeds, or noise taken for physics, is a failure."""
+    study = MismatchMap("mismatch", seeds=4)
+    rows = [key[:2] for key in study.rows() if key[2] == "MissingForces"]
+    fine = {"forces": ["theta.position_force"], "contradicted": False}
+    doubtful, failed = {"contradicted": True}, {"failure": "E201"}
+    seen = {k: [fine] * 4 for k in rows}
+    for key in rows:
+        if key[1].split()[0] in ("delay", "geometry"):
+            seen[key] = [fine, doubtful, failed, fine]
+    claim = mismatch.said(seen)
+    assert claim["holds"]
+    assert claim["figure"] == "9 of 9; with nothing missing in 0%"
+    table = {row[0]: row[1:] for row in mismatch.found_table(seen)["rows"]}
+    assert table["furuta, spring mild"] == ["theta.position_force (4)", "0"]
+    assert table["furuta, delay mild"] == ["theta.position_force (2)", "2"]
+    alarmed = seen | {("cartpole", "nominal"): [doubtful, fine, fine, fine]}
+    assert not mismatch.said(alarmed)["holds"]
+    silent = seen | {("furuta", "delay mild"): [doubtful, fine, fine, fine]}
+    assert not mismatch.said(silent)["holds"]
+    assert "8 of 9; not furuta, delay mild (25%)" in mismatch.said(silent)["figure"]
+
+
 def test_the_map_is_written_whole(tmp_path: Path, monkeypatch):
     def learner(cell: Cell, redrawn: int):
         returns = [60.0 + 10.0 * e + cell.seed for e in range(cell.episodes)]

@@ -1,15 +1,25 @@
 """Cells of a study on an accelerator: in batches, and the same as alone."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
+from sim2gp.data.transitions import Transitions
+from sim2gp.errors import NotConverged
+from sim2gp.models import Sim2GP
+from sim2gp.planning.episode import Trajectory
+from sim2gp.planning.loop import SamplingRun
 from sim2gp.runs import Progress
 from sim2gp.studies import swingup
 from sim2gp.studies.study import run_cell, run_cells
 from sim2gp.studies.swingup import Cell
+from sim2gp.systems import Furuta
 
 ORACLE = {"hang_return": 50.0, "oracle_return": 150.0, "redrawn": 0, "returns": [150.0]}
 
@@ -55,3 +65,44 @@ def test_an_accelerator_computes_a_row_as_one(
     assert about == alone
     draw(out)
     assert len(names) == len(set(names)) == 5
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_cell_has_what_its_last_fit_found(
+    fails: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a fit that failed nothing but the failure."""
+    before = Sim2GP(Furuta()).init(jax.random.key(0))
+    after = eqx.tree_at(lambda b: b.count, before, jnp.asarray(250))
+    nothing, rows = np.zeros((0, 1)), np.ones((1, 1))
+
+    class Run(SamplingRun):
+        def __init__(self) -> None:
+            self.trajectories, self.belief = [], before
+            self.data = Transitions.of(nothing, nothing, nothing)
+
+        def next(self, update_every: int | None = None) -> Trajectory:
+            self.trajectories.append(Trajectory(rows, rows, rows[0], rows[0] > 2.0))
+            return self.trajectories[-1]
+
+        def fit(self) -> None:
+            if fails:
+                raise NotConverged("E201", "no MAP")
+            self.belief = after
+
+    run = Run()
+
+    def misfit(belief: Any, data: Any) -> SimpleNamespace:
+        assert belief is after
+        assert data is run.data
+        return SimpleNamespace(alarm=True)
+
+    monkeypatch.setattr(swingup, "_sampling", lambda cell, redrawn: run)
+    monkeypatch.setattr(swingup, "misfit_of_belief", misfit)
+    values = swingup.learner_cell(Cell("furuta", "nominal", "SIM2GP", 0, 2), 0)
+    del values["seconds"]
+    if fails:
+        assert values == {"returns": [1.0], "failure": "E201 no MAP."}
+    else:
+        found = {"forces": [], "contradicted": True}
+        assert values == {"returns": [1.0, 1.0], "failure": None} | found

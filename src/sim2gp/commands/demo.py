@@ -16,10 +16,7 @@ import numpy as np
 
 from sim2gp.belief import AbstractModel
 from sim2gp.commands.result import AbstractResult
-from sim2gp.data.one_step import OneStepLikelihood
-from sim2gp.data.transitions import Transitions
 from sim2gp.identification import diagnose
-from sim2gp.identification.misfit.residuals import misfit_of_transitions
 from sim2gp.identification.missing_physics.curves import (
     Curve,
     curves_of,
@@ -41,7 +38,7 @@ from sim2gp.planning.tasks import MACHINES, Task, episodes_to_95, hanging_return
 from sim2gp.runs import Progress
 from sim2gp.runs.provenance import provenance
 from sim2gp.runs.sinks import Nowhere, Sink, each_episode
-from sim2gp.studies.learners import MISSING, reach_of
+from sim2gp.studies.learners import MISSING, misfit_of_belief, reach_of
 from sim2gp.systems.base import AbstractPlant, AbstractSystem
 from sim2gp.types import Key, in_float64
 
@@ -211,7 +208,7 @@ def _demo_summary(
             for m in methods
         },
         "noise": dict(zip(states, np.asarray(belief.noise).tolist(), strict=True)),
-        "misfit": _misfit(learned, shown.data),
+        "misfit": misfit_of_belief(learned, shown.data).as_dict(),
         "log_evidence": float(belief.log_evidence),
         "n_transitions": int(belief.count),
         **found,
@@ -232,12 +229,6 @@ def _demo_summary(
     key = jax.random.fold_in(jax.random.key(seed), 1)
     arrays |= diagnose.arrays(table, belief.prior, belief.posterior, key=key)
     return summary, arrays
-
-
-def _misfit(belief: Sim2GPBelief, data: Transitions) -> dict[str, Any]:
-    likelihood = OneStepLikelihood(belief.system, data, belief.dt)
-    about = belief.prior, belief.posterior, belief.noise
-    return misfit_of_transitions(likelihood, *about).as_dict()
 
 
 @in_float64

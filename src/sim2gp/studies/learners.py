@@ -8,6 +8,10 @@ import jax
 import numpy as np
 
 from sim2gp.belief import AbstractModel
+from sim2gp.data.one_step import OneStepLikelihood
+from sim2gp.data.transitions import Transitions
+from sim2gp.identification.misfit.residuals import misfit_of_transitions
+from sim2gp.identification.misfit.tests import Misfit
 from sim2gp.models import (
     NLM,
     Auto,
@@ -17,6 +21,7 @@ from sim2gp.models import (
     Residual,
     ResidualFunctionSpace,
     Sim2GP,
+    Sim2GPBelief,
 )
 from sim2gp.planning import ICEM, MPC, SAC, AbstractPlanner, World
 from sim2gp.planning.domain_randomisation import randomised_world
@@ -115,6 +120,13 @@ def reach_of(task: Task, system: AbstractPlant) -> dict[str, float]:
     bound = np.asarray(task.trusted, float).tolist()
     pairs = zip(system.states, bound, strict=True)
     return {channel.name: half for channel, half in pairs if np.isfinite(half)}
+
+
+def misfit_of_belief(belief: Sim2GPBelief, data: Transitions) -> Misfit:
+    """Whether transitions contradict a fitted simulator."""
+    likelihood = OneStepLikelihood(belief.system, data, belief.dt)
+    about = belief.prior, belief.posterior, belief.noise
+    return misfit_of_transitions(likelihood, *about)
 
 
 @runtime_checkable

@@ -6,6 +6,7 @@ and regrets over three. Four learners meet all of it; the others the Furuta's ef
 on the first half of the seeds.
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -50,10 +51,17 @@ EXPRESSIBLE = ("coulomb", "dead_zone", "spring", "drag", "tilt")
 SETTINGS, EPISODES, FORCES_REGRET = 24 / 27, 2, 1.05
 #: Of the plain simulator's mean score, where nothing is missing.
 LOSS = 0.01
+#: Share of seeds in which residuals speak against the fit: at least so many where no
+#: force can be what is missing, at most so many where nothing is.
+SAID, SAID_WRONGLY = 0.5, 0.1
 #: Auto's regret is asked to be at most this many times that of the best fixed model.
 REGRET = 1.1
 #: Fixed models that know no more than Auto does.
 FIXED = tuple(m for m in METHODS if m not in ("Auto", WITH_TERM))
+
+
+#: Values of MissingForces' cells, by machine and condition.
+Found = Mapping[Key, Sequence[Values]]
 
 
 class MismatchMap(Study):
@@ -97,7 +105,13 @@ class MismatchMap(Study):
         self, arrays: Arrays, values: Mapping[AbstractCell, Values]
     ) -> dict[str, Any]:
         """Regrets and claims."""
-        table = {key: arrays[f"mismatch/{'/'.join(key)}"] for key in self.rows()}
+        rows = self.rows()
+        table = {key: arrays[f"mismatch/{'/'.join(key)}"] for key in rows}
+        found = {
+            key[:2]: [values[cell] for cell in row]
+            for key, row in rows.items()
+            if key[2] == "MissingForces"
+        }
         return {
             "title": "Mismatch map: every learner under what its simulator lacks",
             "episodes": self.episodes,
@@ -107,9 +121,10 @@ class MismatchMap(Study):
                 "episodes": EPISODES,
             },
             "regret": regrets(table, EVERYWHERE),
-            "claims": claims(table, self.rng),
+            "claims": claims(table, self.rng)
+            | {"what_is_no_force_is_said": said(found)},
             **returns_of(values),
-            "tables": tables(table),
+            "tables": [*tables(table), found_table(found)],
         }
 
     def pictures(
@@ -203,6 +218,48 @@ def solved_early(table: Table) -> dict[str, Any]:
         "(median of the best score) in at least 24 of 27 settings that a force or a "
         "function of an input can be",
     )
+
+
+def said(found: Found) -> dict[str, Any]:
+    """Whether a fit with missing forces shows that it is not enough, where it is not.
+
+    Cells whose fit failed count as said: the program has said so.
+    """
+    share = {key: float(np.mean([_said(v) for v in row])) for key, row in found.items()}
+    unknown = {
+        k: x for k, x in share.items() if k[1].split()[0] not in (*EXPRESSIBLE, NOMINAL)
+    }
+    silent = [f"{', '.join(k)} ({x:.0%})" for k, x in unknown.items() if x < SAID]
+    wrongly = max(x for k, x in share.items() if k[1] == NOMINAL)
+    figure = f"{len(unknown) - len(silent)} of {len(unknown)}"
+    figure += f"; not {', '.join(silent)}" if silent else ""
+    return claim(
+        not silent and wrongly <= SAID_WRONGLY,
+        f"{figure}; with nothing missing in {wrongly:.0%}",
+        "where no force can be what is missing, the misfit tests of MissingForces' fit "
+        f"say so in at least {SAID:.0%} of seeds, with nothing missing in at most "
+        f"{SAID_WRONGLY:.0%}",
+    )
+
+
+def _said(values: Values) -> bool:
+    return bool(values.get("failure")) or bool(values.get("contradicted"))
+
+
+def found_table(found: Found) -> dict[str, Any]:
+    """Forces that are on after the last fit, and seeds in which they are not enough."""
+    rows = []
+    for key, row in found.items():
+        counts = Counter(name for v in row for name in v.get("forces", ()))
+        names = (f"{name} ({n})" for name, n in counts.most_common())
+        rows.append([", ".join(key), ", ".join(names), str(sum(map(_said, row)))])
+    return {
+        "title": "What MissingForces found",
+        "columns": ["effect", "forces (seeds)", "seeds with misfit"],
+        "rows": rows,
+        "note": "After the last fit. Misfit: its residuals, or a fit that failed, say "
+        "that forces are not enough.",
+    }
 
 
 def nothing_lost(

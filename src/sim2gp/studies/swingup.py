@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sim2gp.errors import NotConverged, NotFinite
+from sim2gp.models import Sim2GPBelief
 from sim2gp.planning import MPC, AbstractPlanner, MarkovObjective
 from sim2gp.planning.episode import Trajectory
 from sim2gp.planning.loop import SamplingRun
@@ -27,6 +28,7 @@ from sim2gp.studies.learners import (
     TRAINED,
     HiddenMachine,
     effects_of,
+    misfit_of_belief,
     missing,
     planner_of,
     task_and_model,
@@ -177,13 +179,20 @@ def _accepted(found: AcceptedTruth) -> Values:
 
 def learner_cell(cell: Cell, redrawn: int) -> Values:
     """Returns of one learner; episodes after a fit that failed are not run."""
-    started, failure, seen = time.perf_counter(), "", []
+    started, failure = time.perf_counter(), ""
+    seen: list[Trajectory] = []
+    found: Values = {}
     try:
-        for trajectory in _episodes(cell, redrawn):
-            seen.append(trajectory)
+        if cell.method in TRAINED:
+            seen += _trained(cell, redrawn)
+        else:
+            run = _sampling(cell, redrawn)
+            seen = run.trajectories
+            _learn(run, cell)
+            found = found_by(run)
     except (NotConverged, NotFinite) as error:
         failure = str(error)
-    return _learned(seen, failure, time.perf_counter() - started)
+    return _learned(seen, failure, time.perf_counter() - started) | found
 
 
 def learner_cells(cells: Sequence[Cell], redrawn: Sequence[int]) -> list[Values]:
@@ -191,13 +200,32 @@ def learner_cells(cells: Sequence[Cell], redrawn: Sequence[int]) -> list[Values]
     started = time.perf_counter()
     runs = [_sampling(*pair) for pair in zip(cells, redrawn, strict=True)]
     ended = learn_together(runs, cells[0].episodes)
+    said = [found_by(run) for run in runs]
     seconds = (time.perf_counter() - started) / len(cells)
-    return [_learned(seen, failure, seconds) for seen, failure in ended]
+    return [
+        _learned(*each, seconds) | found
+        for each, found in zip(ended, said, strict=True)
+    ]
 
 
 def _learned(seen: Sequence[Trajectory], failure: str, seconds: float) -> Values:
     returns = [float(trajectory.total) for trajectory in seen]
     return {"returns": returns, "failure": failure or None, "seconds": seconds}
+
+
+def found_by(run: SamplingRun) -> Values:
+    """What a simulator's last fit has found: forces, and whether data contradict it.
+
+    Residuals are those of all episodes. The last one was not fitted, but what it would
+    have moved is projected out of them.
+    """
+    belief = run.belief
+    if not isinstance(belief, Sim2GPBelief) or not int(belief.count):
+        return {}
+    with jax.default_device(jax.devices("cpu")[0]):
+        misfit = misfit_of_belief(belief, run.data)
+    forces = list(belief.system.parameters.groups)
+    return {"forces": forces, "contradicted": misfit.alarm}
 
 
 def _sampling(cell: Cell, redrawn: int) -> SamplingRun:
@@ -215,19 +243,20 @@ def _sampling(cell: Cell, redrawn: int) -> SamplingRun:
     )
 
 
-def _episodes(cell: Cell, redrawn: int) -> Iterator[Trajectory]:
-    """Those of a learner, each before its fit, or of a policy trained elsewhere."""
-    if cell.method in TRAINED:
-        task, _ = task_and_model(cell, "SIM2GP", redrawn)
-        world = TRAINED[cell.method](task, MACHINES[cell.machine][0]())
-        key, planner = jax.random.key(cell.seed), cell.planner
-        yield from episodes_in(task, world, planner, key=key, episodes=cell.episodes)
-        return
-    run = _sampling(cell, redrawn)
+def _learn(run: SamplingRun, cell: Cell) -> None:
+    """A learner's episodes, each before its fit."""
     for _ in range(cell.episodes):
         if run.trajectories:
             run.fit()
-        yield run.next(cell.update_every)
+        run.next(cell.update_every)
+
+
+def _trained(cell: Cell, redrawn: int) -> Iterator[Trajectory]:
+    """Episodes of a policy trained elsewhere."""
+    task, _ = task_and_model(cell, "SIM2GP", redrawn)
+    world = TRAINED[cell.method](task, MACHINES[cell.machine][0]())
+    key, planner = jax.random.key(cell.seed), cell.planner
+    return episodes_in(task, world, planner, key=key, episodes=cell.episodes)
 
 
 def scores_of(
