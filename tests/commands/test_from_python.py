@@ -98,6 +98,7 @@ def test_a_saved_run_is_the_same_object(found: Any, tmp_path: Path) -> None:
     assert kept.rmse == one
 
 
+@pytest.mark.nightly  # 9 s
 def test_arrays_are_logs(found: Any, machine: dict[str, Any]) -> None:
     """Of the numbers that the files hold, to the last bit."""
     logs = [sg.Log.of(machine["recorded"](k), name=n) for k, n in enumerate("ab")]

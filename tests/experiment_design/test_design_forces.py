@@ -52,6 +52,7 @@ def designed(e: d.Experiment, U: np.ndarray) -> DesignResult:
     return DesignResult(np.asarray(U), 0.0, zero, states, states, states, 0.0, 1)
 
 
+@pytest.mark.nightly  # 18 s; by day: what commands leave, and the MuJoCo arm
 def test_a_joint_that_moves_shows_its_forces_and_one_at_rest_does_not() -> None:
     """At rest and hanging nothing is excluded, not even by exact sensors."""
     e = dataclasses.replace(experiment(), start=jnp.zeros(4))

@@ -37,6 +37,7 @@ def fitted(system: Any, log: Any) -> tuple[WindowsLikelihood, Any, np.ndarray]:
 
 
 @in_float64
+@pytest.mark.nightly  # 15 s; also a row of benchmarks/intervals.py
 def test_friction_that_the_model_lacks_is_found_and_the_truth_is_inside() -> None:
     """The plain interval of a damping is tens of sd away from its truth."""
     data, system = arms(), mujoco_arm()

@@ -277,6 +277,7 @@ def cases():
         rare = consumer in LONG and (wrapped or name in NETWORKS)
         rare |= wrapped and name.endswith(("Residual)", "FunctionSpace)"))
         rare |= name.endswith("FunctionSpace")
+        rare |= (name, consumer) == ("MissingForces", moments)
         marks = [pytest.mark.nightly] if rare else []
         yield pytest.param(
             name, consumer, marks=marks, id=f"{name}-{consumer.__name__}"

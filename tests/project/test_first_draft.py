@@ -73,6 +73,7 @@ def test_signs_and_units_of_a_servo_arm(tmp_path: Path, capsys: Any) -> None:
     assert "the gains of the servos" in text
 
 
+@pytest.mark.nightly  # 11 s
 def test_a_model_without_motors_is_fitted_to_its_swinging(
     tmp_path: Path, capsys: Any
 ) -> None:

@@ -164,6 +164,7 @@ def test_sensitivities_of_windows_are_differences_of_windows() -> None:
 
 
 @in_float64
+@pytest.mark.nightly  # 14 s; by day a step within JAX is the host's
 def test_mjx_takes_the_forces_as_c_mujoco_does() -> None:
     pytest.importorskip("mujoco.mjx", reason="MJX is not installed")
     c, mjx = arm(), arm("mjx")

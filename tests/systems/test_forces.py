@@ -116,6 +116,7 @@ def test_derivatives_are_those_of_differences():
     tt = prior.mean + prior.scale @ (0.3 * RNG.normal(size=prior.mean.size))
     s, a = jnp.asarray([0.4, -1.1, 2.0, -3.0]), jnp.asarray([1.3])
 
+    @jax.jit
     def f(x):
         at = tt + prior.scale @ x[4:]
         return machine.transition(at, s + x[:4], a, 0.02)
@@ -137,6 +138,7 @@ def test_a_draw_of_float32_follows_its_direction_as_in_float64():
     delta = prior.scale @ (0.1 * RNG.normal(size=tt.size))
     s, a = jnp.asarray([0.4, -1.1, 2.0, -3.0]), jnp.asarray([1.3])
 
+    @jax.jit
     def along(tt, delta, s, a):
         f = lambda tt: machine.transition(tt, s, a, 0.02)  # noqa: E731
         return jax.jvp(f, (tt,), (delta,))[1]
