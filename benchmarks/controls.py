@@ -3,8 +3,8 @@
 Learners for `missing_forces.py`. Left out, one at a time: the projected starts, the
 choice of scales, the smooth functions. Other models of what the simulator leaves: an
 exact Gaussian process on each output of a step, and an ensemble of networks. And
-physics that is no force of one variable: friction that grows with the load, damping
-that grows with position.
+physics that is no force of one variable: backlash, friction that grows with the load,
+damping that grows with position.
 """
 
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from residual_models import Ensemble, ProcessResidual
 from sim2gp.belief import AbstractBelief
@@ -25,12 +25,14 @@ from sim2gp.inference.estimate import Estimate, estimate
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.groups import BROAD, DRAWS, Start
 from sim2gp.inference.least_squares import prior_rows
+from sim2gp.inference.parameters import Parameter
 from sim2gp.inference.prior import AbstractPrior, ParameterPrior
 from sim2gp.inference.variable_projection import projected
 from sim2gp.models import MissingForces, Residual, Sim2GP
 from sim2gp.models.sim2gp import Sim2GPBelief, belief_of
 from sim2gp.studies.learners import METHODS
 from sim2gp.studies.swingup import Cell
+from sim2gp.systems.actuators import Lag
 from sim2gp.systems.effects.base import SUBSTEP, AbstractForce, on_joint
 from sim2gp.systems.effects.bases import Gap, Sign
 from sim2gp.systems.effects.forces import AbstractUnknownFunction
@@ -39,6 +41,9 @@ from sim2gp.systems.effects.units import gravity_of
 from sim2gp.systems.mechanism import AbstractMechanism, Pair
 from sim2gp.systems.parts import AbstractPart
 from sim2gp.types import AnyArray, Key, Scalar, in_float64
+
+#: Past inputs that a gap depends on, s; a swing crosses it more often.
+REMEMBERED = 0.2
 
 
 class AbstractLessForces(MissingForces):
@@ -173,7 +178,39 @@ class RisingDamping(AbstractForce):
         return on_joint(0, -x * q[0] ** 2 * v[0])
 
 
+class Backlash(Lag):
+    """Play between command and motor: the input follows once the gap is crossed.
+
+    ``y_k = clip(y_k-1, u_k - magnitude, u_k + magnitude)``, V, from the oldest input
+    that the state carries.
+    """
+
+    where: str = eqx.field(static=True, default="voltage")
+    magnitude: float = eqx.field(static=True, default=0.9)
+    what: ClassVar[str] = "backlash"
+    meaning: ClassVar[str] = "half the gap of the input"
+
+    def unit(self, plant: Any) -> str:
+        return "V"
+
+    def parameter(self, plant: Any) -> Parameter:
+        box = 0.05 * self.magnitude, 2.0 * self.magnitude
+        return Parameter(self.name, "V", self.meaning, "log_bounded", *box)
+
+    def memory(self, longest: float) -> float:
+        return REMEMBERED
+
+    def means(
+        self, held: Float[Array, " past"], dt: float, lag: Scalar, count: int
+    ) -> Float[Array, " count"]:
+        y = held[-1]
+        for u in held[-2::-1]:
+            y = jnp.clip(y, u - lag, u + lag)
+        return jnp.broadcast_to(y, (count,))
+
+
 OUTSIDE: dict[str, AbstractPart] = {
+    "backlash": Backlash(),
     "load friction": LoadFriction(),
     "rising damping": RisingDamping(),
 }

@@ -133,6 +133,16 @@ class Lag(AbstractActuator):
         box = SHORTEST_LAG, self.magnitude
         return Parameter(self.name, "s", self.meaning, "log_bounded", *box)
 
+    def memory(self, longest: float) -> float:
+        """For how long past inputs count, s, of a lag of at most ``longest``."""
+        return FADED * longest
+
+    def means(
+        self, held: Float[Array, " past"], dt: float, lag: Scalar, count: int
+    ) -> Float[Array, " count"]:
+        """`lagged_means`."""
+        return lagged_means(held, dt, lag, count)
+
 
 def neutral_actuators(
     channels: Sequence[Channel], ties: Mapping[str, str] | None = None

@@ -24,14 +24,12 @@ from sim2gp import checks
 from sim2gp.errors import error
 from sim2gp.inference.parameters import Parameter, Parameters, unknown_parameter
 from sim2gp.systems.actuators import (
-    FADED,
     AbstractActuator,
     Delay,
     Gain,
     Lag,
     Offset,
     delayed_means,
-    lagged_means,
 )
 from sim2gp.systems.base import (
     LONGEST_MEAN,
@@ -202,8 +200,9 @@ class Machine(AbstractSystem):
     def history(self) -> int:
         if self.period is None:
             return 0
-        lags = [self._range(p.name)[1] for p in self.actuators if isinstance(p, Lag)]
-        longest = max(self.longest_delay, FADED * max(lags, default=0.0))
+        lags = (p for p in self.actuators if isinstance(p, Lag))
+        past = [part.memory(self._range(part.name)[1]) for part in lags]
+        longest = max([self.longest_delay, *past])
         return math.ceil(longest / self.period - 1e-9)
 
     def record(self, values: Mapping[str, Scalar]) -> MachineParams:
@@ -281,8 +280,8 @@ class Machine(AbstractSystem):
         for part in self.actuators:
             if isinstance(part, Lag):
                 i = index_of(part.where, self.actions)
-                lag = params.parts[part.name]
-                means = means.at[:, i].set(lagged_means(held[:, i], dt, lag, count))
+                filtered = part.means(held[:, i], dt, params.parts[part.name], count)
+                means = means.at[:, i].set(filtered)
         return means
 
     @property
