@@ -49,8 +49,8 @@ class OneStepLikelihood(AbstractLikelihood):
         return 0
 
     def rows(
-        self, tt: Float[Array, " p"], scale: Float[Array, "p p"]
-    ) -> tuple[Float[Array, "N d"], Float[Array, "N d p"]]:
+        self, tt: Float[Array, " p"], scale: Float[Array, "p q"]
+    ) -> tuple[Float[Array, "N d"], Float[Array, "N d q"]]:
         """Residuals ``f - y`` and their Jacobian along each column of ``scale``.
 
         Masked rows are zero.
@@ -75,7 +75,7 @@ class OneStepLikelihood(AbstractLikelihood):
         self,
         tt: Float[Array, " p"],
         e: Float[Array, "1 0"],
-        scale: Float[Array, "p p"],
+        scale: Float[Array, "p q"],
     ) -> Blocks:
         del e
         r, J = self.rows(tt, scale)

@@ -58,7 +58,7 @@ class AbstractLikelihood(eqx.Module):
         self,
         tt: Float[Array, " p"],
         e: Float[Array, "W n"],
-        scale: Float[Array, "p p"],
+        scale: Float[Array, "p q"],
     ) -> Blocks:
         """Factors of ``[J_e J_z r]``, of residuals in the channels' own units.
 

@@ -32,7 +32,9 @@ from sim2gp.inference.laplace import Laplace
 from sim2gp.inference.prior import ParameterPrior
 from sim2gp.types import AnyScalar, Scalar
 
-EM_ROUNDS, ROUNDS = 100, 200
+EM_ROUNDS, ROUNDS = 100, 200  # at most
+#: Relative changes of the squared scales: EM has found what is needed, all rest.
+SLOW, RESTS = 0.02, 1e-4
 EARNED = 3.0  # nats: noise alone gives one group as much in 1 of 400 cases
 #: Of a group that is off, and of one that is as strong as it may be, in prior sd.
 OFF, MOST = 1e-4, 20.0
@@ -66,8 +68,12 @@ def relevant(
     members = jnp.asarray(prior.members)
     held = trust * (1.0 - jnp.sum(members, axis=0))
 
-    def turn(i: Array, carry: tuple) -> tuple:
-        variance, tau2 = carry
+    def unfinished(carry: tuple) -> Array:
+        i, (_, _, change) = carry
+        return (i < ROUNDS) & ((i <= EM_ROUNDS) | (change > RESTS))
+
+    def turn(carry: tuple) -> tuple:
+        i, (variance, tau2, _) = carry
         x, S = _posterior(linear, z, variance, prior.each(jnp.sqrt(tau2)), held)
         rows = jnp.append(x - z, 1.0)
         squares = jnp.einsum("i,cij,j->c", rows, linear.grams, rows)
@@ -79,10 +85,14 @@ def relevant(
         determined = jnp.sum(members, axis=1) - members @ own / tau2
         fixed_point = members @ x**2 / jnp.maximum(determined, 1e-6)
         new = jnp.where(i < EM_ROUNDS, em, jnp.minimum(em, fixed_point))
-        return variance, jnp.clip(new, OFF**2, MOST**2)
+        new = jnp.clip(new, OFF**2, MOST**2)
+        change = jnp.max(jnp.abs(jnp.log(new / tau2)), initial=0.0)
+        settled = (i < EM_ROUNDS) & (change < SLOW)
+        return jnp.where(settled, EM_ROUNDS, i + 1), (variance, new, change)
 
-    start = noise.sd**2, prior.scales**2
-    variance, tau2 = jax.lax.fori_loop(0, ROUNDS, turn, start)
+    zero, far = jnp.zeros((), int), jnp.full((), jnp.inf)
+    start = noise.sd**2, prior.scales**2, far
+    _, (variance, tau2, _) = jax.lax.while_loop(unfinished, turn, (zero, start))
     each = prior.each(jnp.sqrt(tau2))
     x, S = _posterior(linear, z, variance, each, held)
     whitened = S / jnp.outer(each, each)

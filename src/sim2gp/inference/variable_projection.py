@@ -11,6 +11,7 @@ The draws that leave least are where a descent may begin, with the noise that is
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Float
 
 from sim2gp.inference.likelihood import AbstractLikelihood
@@ -39,8 +40,7 @@ def projected(
     n = likelihood.n_nuisances
 
     def one(z: Array) -> tuple[Array, Array, Array]:
-        blocks = likelihood.blocks(about.at(z), e, about.scale)
-        rows = blocks[..., jnp.asarray([*(n + places), -1])]
+        rows = likelihood.blocks(about.at(z), e, about.scale[:, places])[..., n:]
         grams = jnp.einsum("wcij,wcik->cjk", rows, rows)
         G, g, r2 = grams[:, :-1, :-1], grams[:, :-1, -1], grams[:, -1, -1]
         eye = jnp.eye(len(places))
@@ -48,7 +48,7 @@ def projected(
         def turn(_: Array, carry: tuple) -> tuple:
             _, s2 = carry
             A = jnp.einsum("cij,c->ij", G, 1.0 / s2) + eye
-            w = -jnp.linalg.solve(A, jnp.einsum("ci,c->i", g, 1.0 / s2))
+            w = -cho_solve(cho_factor(A), jnp.einsum("ci,c->i", g, 1.0 / s2))
             left = r2 + 2.0 * g @ w + jnp.einsum("i,cij,j->c", w, G, w)
             return w, (2.0 * likelihood.floor**2 + left) / (2.0 + N)
 
