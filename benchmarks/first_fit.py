@@ -15,8 +15,6 @@ import os
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -24,6 +22,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from plain_fit import seconds
 from sim2gp.data.transitions import Transitions
 from sim2gp.planning import MarkovObjective
 from sim2gp.planning.loop import SamplingRun
@@ -32,16 +31,6 @@ from sim2gp.studies.swingup import Cell
 
 SETTINGS = ("nominal", "spring strong", "coulomb strong")
 SEED = 300
-
-
-def seconds(fit: Callable[[], Any], repeat: int) -> float:
-    """Median of so many, after one that compiles."""
-    found = []
-    for _ in range(repeat + 1):
-        started = time.perf_counter()
-        jax.block_until_ready(jax.tree.leaves(fit()))
-        found.append(time.perf_counter() - started)
-    return float(np.median(found[1:]))
 
 
 def earlier_seconds(
@@ -97,8 +86,8 @@ def main() -> None:
     rows = []
     for machine in ("furuta", "cartpole"):
         for setting in SETTINGS:
-            size = asked.episodes, asked.repeat, asked.earlier
-            rows.append(row(machine, setting, *size))
+            how = asked.episodes, asked.repeat, asked.earlier
+            rows.append(row(machine, setting, *how))
             print(json.dumps(rows[-1]), flush=True)
     medians = {
         name: float(np.median([r[name] for r in rows]))

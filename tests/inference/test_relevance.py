@@ -77,7 +77,7 @@ def test_a_group_stays_on_where_it_earns_its_place():
     """At the threshold its gain is the closed form's."""
     prior = ParameterPrior(table().prior(), table())
     kept = {}
-    for strength in np.geomspace(0.01, 0.3, 8).tolist():
+    for strength in np.geomspace(0.01, 0.3, 12).tolist():
         J, y = problem((2.0, strength))
         noise, p = Noise(jnp.ones(1), jnp.ones(1)), prior
         for _ in range(12):

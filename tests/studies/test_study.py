@@ -71,7 +71,7 @@ def test_an_accelerator_computes_a_row_as_one(
 def test_a_cell_has_what_its_last_fit_found(
     fails: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of a fit that failed nothing but the failure."""
+    """Of a fit that failed nothing but the failure; together with others the same."""
     before = Sim2GP(Furuta()).init(jax.random.key(0))
     after = eqx.tree_at(lambda b: b.count, before, jnp.asarray(250))
     nothing, rows = np.zeros((0, 1)), np.ones((1, 1))
@@ -99,8 +99,14 @@ def test_a_cell_has_what_its_last_fit_found(
 
     monkeypatch.setattr(swingup, "_sampling", lambda cell, redrawn: run)
     monkeypatch.setattr(swingup, "misfit_of_belief", misfit)
-    values = swingup.learner_cell(Cell("furuta", "nominal", "SIM2GP", 0, 2), 0)
-    del values["seconds"]
+    cell = Cell("furuta", "nominal", "SIM2GP", 0, 2)
+    values = swingup.learner_cell(cell, 0)
+    run.belief = after
+    ended = run.trajectories, values["failure"] or ""
+    monkeypatch.setattr(swingup, "learn_together", lambda runs, episodes: [ended])
+    (together,) = swingup.learner_cells([cell], [0])
+    del values["seconds"], together["seconds"]
+    assert together == values
     if fails:
         assert values == {"returns": [1.0], "failure": "E201 no MAP."}
     else:

@@ -200,11 +200,11 @@ def learner_cells(cells: Sequence[Cell], redrawn: Sequence[int]) -> list[Values]
     started = time.perf_counter()
     runs = [_sampling(*pair) for pair in zip(cells, redrawn, strict=True)]
     ended = learn_together(runs, cells[0].episodes)
-    said = [found_by(run) for run in runs]
+    pairs = list(zip(runs, ended, strict=True))
+    found = [{} if failure else found_by(run) for run, (_, failure) in pairs]
     seconds = (time.perf_counter() - started) / len(cells)
     return [
-        _learned(*each, seconds) | found
-        for each, found in zip(ended, said, strict=True)
+        _learned(*each, seconds) | more for each, more in zip(ended, found, strict=True)
     ]
 
 
@@ -217,15 +217,18 @@ def found_by(run: SamplingRun) -> Values:
     """What a simulator's last fit has found: forces, and whether data contradict it.
 
     Residuals are those of all episodes. The last one was not fitted, but what it would
-    have moved is projected out of them.
+    have moved is projected out of them. A step that is no number contradicts as well.
     """
     belief = run.belief
     if not isinstance(belief, Sim2GPBelief) or not int(belief.count):
         return {}
-    with jax.default_device(jax.devices("cpu")[0]):
-        misfit = misfit_of_belief(belief, run.data)
+    try:
+        with jax.default_device(jax.devices("cpu")[0]):
+            contradicted = misfit_of_belief(belief, run.data).alarm
+    except NotFinite:
+        contradicted = True
     forces = list(belief.system.parameters.groups)
-    return {"forces": forces, "contradicted": misfit.alarm}
+    return {"forces": forces, "contradicted": contradicted}
 
 
 def _sampling(cell: Cell, redrawn: int) -> SamplingRun:
