@@ -24,13 +24,13 @@ from sim2gp.systems import Furuta
 ORACLE = {"hang_return": 50.0, "oracle_return": 150.0, "redrawn": 0, "returns": [150.0]}
 
 
-def draw(out: Path, workers: int = 2) -> dict[str, Any]:
+def draw(out: Path) -> dict[str, Any]:
     """What a study of three learners and two seeds says of its cells."""
     rows = {
         (m,): [Cell("furuta", "nominal", m, seed, 2) for seed in (0, 1)]
         for m in ("SIM2GP", "RES", "NLM")
     }
-    return run_cells(rows, out, workers=workers, progress=Progress(quiet=True))[1]
+    return run_cells(rows, out, workers=1, progress=Progress(quiet=True))[1]
 
 
 def test_an_accelerator_computes_a_row_as_one(
@@ -54,7 +54,7 @@ def test_an_accelerator_computes_a_row_as_one(
     monkeypatch.setattr(swingup, "oracle_cell", lambda cell: ORACLE)
     monkeypatch.setattr(swingup, "oracle_cells", lambda cells: [ORACLE] * len(cells))
     run_cell(Cell("furuta", "nominal", "SIM2GP", 0, 2), out)
-    alone = draw(tmp_path / "other", 1)
+    alone = draw(tmp_path / "other")
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     names.clear()
     about = draw(out)

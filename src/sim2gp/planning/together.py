@@ -2,11 +2,14 @@
 
 A device with many cores takes about as long for hundreds of planned episodes as for
 one (`benchmarks/batched_episodes.py`). Runs whose worlds differ in numbers alone share
-a program; each is learned from by itself, on the host. Keys are those of `psrl` and
-`accept_truth`: a run is the same as alone, up to the rounding of float32.
+a program, on the first device of JAX's default backend. All else happens on the default
+device, which a study sets to the host (`host`): small programs and float64 are slow on
+a GPU. Keys are those of `psrl` and `accept_truth`: a run is the same as alone, up to
+the rounding of float32.
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -69,10 +72,9 @@ def _kept(run: SamplingRun, seen: Trajectory, state: Any, *, fit: bool) -> str:
     """Why a run ends here; empty if it does not. Its episode counts if it is finite."""
     try:
         check_finite(seen, run.task.name)
-        with jax.default_device(jax.devices("cpu")[0]):
-            run.keep(seen, state)
-            if fit:
-                run.fit()
+        run.keep(seen, state)
+        if fit:
+            run.fit()
     except (NotConverged, NotFinite) as error:
         return str(error)
     return ""
@@ -163,11 +165,20 @@ def _episodes(starts: Sequence[Start]) -> list[tuple[Trajectory, Any]]:
     arrays, rest = eqx.partition(starts[0], eqx.is_array)
     arrays = [arrays, *(eqx.filter(start, eqx.is_array) for start in starts[1:])]
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *arrays)
-    found, states = _run_all(stacked, rest)
-    found = jax.tree.map(np.asarray, found)
+    found, states = _run_all(jax.device_put(stacked, jax.devices()[0]), rest)
+    found, states = jax.tree.map(np.asarray, found), jax.device_put(states, _cpu())
     return [
         jax.tree.map(lambda x, k=k: x[k], (found, states)) for k in range(len(starts))
     ]
+
+
+def host() -> AbstractContextManager[Any]:
+    """Within it, what names no device is computed on the CPU."""
+    return jax.default_device(_cpu())
+
+
+def _cpu() -> jax.Device:
+    return jax.devices("cpu")[0]
 
 
 @eqx.filter_jit

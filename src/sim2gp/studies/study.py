@@ -5,11 +5,11 @@ never computed again. Cells of one seed meet the same machine under the same noi
 claims compare learners seed by seed (`sim2gp.studies.claims`).
 """
 
+import os
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import fields, is_dataclass
 from functools import partial
 from pathlib import Path
@@ -207,6 +207,8 @@ def run_cells(
     named = [(cell.name, cell.arguments) for cell in every]
     stored.check(named)
     values: dict[AbstractCell, Values] = {}
+    # Each process would claim most of a GPU's memory, and all share one.
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     compute = _in_processes if jax.default_backend() == "cpu" else _in_batches
     with progress.task("cells", len(every)) as task:
         for stage in stages:
@@ -231,19 +233,13 @@ def _in_processes(
 def _in_batches(
     cells: Sequence[AbstractCell], out: Path, old: Old, workers: int
 ) -> Done:
-    """A batch at a time in each thread: others are fitted while one is planned."""
+    """A batch at a time in each process: others are fitted while one is planned."""
     batches: dict[Hashable, list[AbstractCell]] = {}
     for cell in cells:
         batches.setdefault(cell.batch, []).append(cell)
-    with ThreadPoolExecutor(workers) as pool:
-        work = partial(run_batch, out=out, old=old)
-        running = [pool.submit(work, batch) for batch in batches.values()]
-        try:
-            for done in as_completed(running):
-                yield from done.result().items()
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+    work = partial(run_batch, out=out, old=old)
+    for _, values in spread(work, [[batch] for batch in batches.values()], workers):
+        yield from values.items()
 
 
 def run_batch(

@@ -21,7 +21,7 @@ from sim2gp.planning.episode import Trajectory
 from sim2gp.planning.loop import SamplingRun
 from sim2gp.planning.oracle import AcceptedTruth, accept_truth, episodes_in
 from sim2gp.planning.tasks import MACHINES, hanging_return, score
-from sim2gp.planning.together import accept_together, learn_together
+from sim2gp.planning.together import accept_together, host, learn_together
 from sim2gp.studies.learners import (
     CONDITIONS,
     QUICK_TRAINING,
@@ -132,7 +132,8 @@ class Cell(AbstractCell):
         redrawn = [int(x["redrawn"]) for x in needed if x is not None]
         if cells[0].batch == cells[0]:
             return super().compute_batch(cells, needed)
-        return learner_cells(cells, redrawn) if redrawn else oracle_cells(cells)
+        with host():
+            return learner_cells(cells, redrawn) if redrawn else oracle_cells(cells)
 
 
 def reference(cell: Cell) -> Cell:
@@ -223,7 +224,7 @@ def found_by(run: SamplingRun) -> Values:
     if not isinstance(belief, Sim2GPBelief) or not int(belief.count):
         return {}
     try:
-        with jax.default_device(jax.devices("cpu")[0]):
+        with host():
             contradicted = misfit_of_belief(belief, run.data).alarm
     except NotFinite:
         contradicted = True
