@@ -23,7 +23,7 @@ from sim2gp.data.transitions import Transitions
 from sim2gp.inference.arrowhead import Noise
 from sim2gp.inference.estimate import Estimate, estimate
 from sim2gp.inference.gaussian import Gaussian
-from sim2gp.inference.groups import BROAD, DRAWS, Start
+from sim2gp.inference.groups import BROAD, Start
 from sim2gp.inference.least_squares import prior_rows
 from sim2gp.inference.parameters import Parameter
 from sim2gp.inference.prior import AbstractPrior, ParameterPrior
@@ -98,8 +98,7 @@ class WithoutRelevance(AbstractLessForces):
         last: Start,
         key: Key,
     ) -> Estimate:
-        best = eqx.filter_jit(projected)(likelihood.thinned(ROWS), prior, DRAWS, 1, key)
-        (z,), (sd,) = best
+        z, sd = eqx.filter_jit(projected)(likelihood.thinned(ROWS), prior, key)
         given = GivenScales(prior)
         noise = Noise(sd, jnp.ones(1))
         return estimate(likelihood, given, starts=z[None], noise=noise)

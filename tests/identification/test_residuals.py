@@ -11,6 +11,7 @@ from descents import estimate_of
 from linear_system import linear, transitions
 from sim2gp.data.one_step import OneStepLikelihood
 from sim2gp.data.split_log import cut
+from sim2gp.data.transitions import earlier_inputs
 from sim2gp.data.windows import Windows
 from sim2gp.data.windows_likelihood import (
     WindowsLikelihood,
@@ -19,7 +20,6 @@ from sim2gp.data.windows_likelihood import (
     linearise,
 )
 from sim2gp.identification.misfit.residuals import (
-    earlier,
     encode_angles,
     misfit_of_transitions,
     misfit_of_windows,
@@ -52,7 +52,8 @@ def test_a_linear_fit_is_tested_on_its_own_rows() -> None:
     sd, tt = np.asarray(noise), estimate
     theirs = misfit(
         (J @ tt - y) / sd, J.reshape(300, 6), jacobian=J / sd[:, None],
-        past=earlier(J.reshape(300, 6), np.arange(300)), group=np.arange(300),
+        past=earlier_inputs(np.zeros((300, 1)), J.reshape(300, 6), np.ones((300, 1))),
+        group=np.arange(300),
     )  # fmt: skip
     for name, finding in theirs.tests.items():
         ours, its = found.tests[name].statistic, finding.statistic
@@ -66,7 +67,8 @@ def test_a_linear_fit_is_tested_on_its_own_rows() -> None:
 
 def test_inputs_of_the_tests() -> None:
     a = np.arange(6.0)[:, None]
-    past = earlier(a, np.array([0, 0, 0, 0, 1, 1]))
+    s = np.array([0.0, 1.0, 2.0, 3.0, 0.0, 1.0])[:, None]
+    past = earlier_inputs(s, a, s + 1.0)
     np.testing.assert_array_equal(past[3], [2.0, 1.0, 0.0])
     np.testing.assert_array_equal(past[1], [0.0, 0.0, 0.0])
     np.testing.assert_array_equal(past[5], [4.0, 4.0, 4.0])

@@ -15,7 +15,7 @@ from sim2gp.inference.levenberg_marquardt import evaluate, relaxed
 from sim2gp.inference.likelihood import AbstractLikelihood
 from sim2gp.inference.parameters import Parameter, Parameters
 from sim2gp.inference.prior import ParameterPrior
-from sim2gp.inference.variable_projection import projected
+from sim2gp.inference.variable_projection import SHAPES, projected
 
 pytestmark = pytest.mark.usefixtures("float64")
 T = np.linspace(0.0, 4.0, 80)
@@ -65,38 +65,35 @@ def prior() -> ParameterPrior:
 def test_the_best_draw_has_its_weights_and_noise_at_the_profile():
     """As scipy finds them at the same rate; and the rate is near the true one."""
     likelihood = waves()
-    starts, noises = projected(likelihood, prior(), 64, 2, jax.random.key(0))
+    start, noise = projected(likelihood, prior(), jax.random.key(0))
     about = prior().gaussian
-    tt = np.asarray(about.at(starts[0]))
+    tt = np.asarray(about.at(start))
     assert float(TABLE.constrain(jnp.asarray(tt))[0]) == pytest.approx(RATE, abs=0.1)
 
     def cost(x):
-        z = np.asarray(starts[0]).copy()
+        z = np.asarray(start).copy()
         z[1:] = x[:2]
         r = np.asarray(likelihood.residual(about.at(jnp.asarray(z))))
         # Two more samples at the floor, as everywhere.
         scatter = (2e-12 + r @ r) / (2.0 + r.size)
         return 0.5 * r.size * np.log(scatter) + 0.5 * (x[:2] @ x[:2])
 
-    best = scipy.optimize.minimize(cost, np.asarray(starts[0])[1:], tol=1e-12)
-    np.testing.assert_allclose(starts[0, 1:], best.x, atol=1e-4)
+    best = scipy.optimize.minimize(cost, np.asarray(start)[1:], tol=1e-12)
+    np.testing.assert_allclose(start[1:], best.x, atol=1e-4)
     r = likelihood.residual(jnp.asarray(tt))
-    assert float(noises[0, 0]) == pytest.approx(
-        float(jnp.sqrt(jnp.mean(r**2))), rel=0.02
-    )
-    assert float(noises[0, 0]) <= float(noises[1, 0])  # best first
+    assert float(noise[0]) == pytest.approx(float(jnp.sqrt(jnp.mean(r**2))), rel=0.02)
 
 
 def test_a_descent_from_there_finds_what_one_from_the_mean_does_not():
     likelihood, unit = waves(), jnp.ones(1)
-    starts, noises = projected(likelihood, prior(), 64, 1, jax.random.key(0))
+    start, left = projected(likelihood, prior(), jax.random.key(0))
 
     @eqx.filter_jit
     def fit(z, sd):
         noise = Noise(sd, unit)
         return estimate(likelihood, prior(), starts=z, noise=noise)
 
-    good = fit(starts, noises[0])
+    good = fit(start[None], left)
     poor = fit(jnp.zeros((1, 3)), likelihood.first_noise().sd)
     assert float(good.noise.sd[0]) == pytest.approx(NOISE, rel=0.2)
     assert float(good.log_evidence) > float(poor.log_evidence) + 50.0
@@ -116,3 +113,41 @@ def test_relaxed_weights_are_the_ridge_solution():
     np.testing.assert_allclose(here.by_z[1:], 0.0, atol=1e-9)
     there = evaluate(likelihood, prior(), here.z, none, noise)
     assert float(here.cost) == pytest.approx(float(there.cost), rel=1e-12)
+
+
+EDGE = 2.9
+ABRUPT = Parameters(
+    (
+        Parameter("rate", "1/s", "", "bounded", 0.5, 60.0),
+        Parameter("w", "1", "", "identity", sd=2.0, group="w"),
+        Parameter("edge", "s", "", "log", 0.0, np.inf, 0.7, 0.6, group="w", shape=True),
+    )
+)
+
+
+class Late(Waves):
+    """A wave from an edge on: its rate is hard to draw, the edge to descend to."""
+
+    def residual(self, tt):
+        rate, w, edge = ABRUPT.constrain(tt)
+        began = 0.5 * (1.0 + jnp.tanh((T - edge) / 0.01))
+        return w * began * jnp.sin(rate * T) - self.y
+
+
+def test_a_shape_is_searched_from_the_parameters_that_are_given():
+    """To the nearest point of the search; the rate is that of ``also``."""
+    rng = np.random.default_rng(0)
+    y = 0.8 * (T > EDGE) * np.sin(47.0 * T) + 0.02 * rng.normal(size=T.size)
+    likelihood = Late(
+        jnp.full((1, 1), float(T.size)), jnp.full(1, 1e-6), jnp.asarray(y)
+    )
+    about = ParameterPrior(ABRUPT.prior(), ABRUPT)
+    true = about.gaussian.whitened(ABRUPT.unconstrain(jnp.asarray([47.0, 0.8, EDGE])))
+    also = true.at[1:].set(0.0)
+    start, noise = projected(likelihood, about, jax.random.key(0), also)
+    assert float(start[0]) == pytest.approx(float(also[0]))
+    spacing = float(SHAPES[1] - SHAPES[0])
+    assert abs(float(start[2] - true[2])) < 0.51 * spacing
+    assert float(start[1]) == pytest.approx(float(true[1]), rel=0.2)
+    alone = projected(likelihood, about, jax.random.key(0))[1]
+    assert float(noise[0]) < 0.5 * float(alone[0])

@@ -199,15 +199,18 @@ def test_weights_are_groups_of_one_function_each():
     groups = machine.parameters.groups
     assert len(groups) == 8  # three a joint, two an input
     every = np.concatenate(list(groups.values()))
-    width = machine.parameters.names.index("voltage.dead_zone.width")
-    assert sorted([*every, width]) == list(range(8, len(machine.parameters)))
+    shapes = [k for k, p in enumerate(machine.parameters.free) if p.shape]
+    assert [machine.parameters.names[k] for k in shapes] == [
+        f"voltage.dead_zone.{x}" for x in ("width", "softness")
+    ]
+    assert sorted([*every, *shapes]) == list(range(8, len(machine.parameters)))
     assert len(machine.parameters.ungrouped()) == 8
 
 
 def test_a_gap_takes_the_input_away_below_its_width():
     gap, w = Gap(0.5), 0.8
     for share in (1.0, 0.5):
-        x = jnp.asarray([share * w, w])
+        x = jnp.asarray([share * w, w, 0.05])
         for u, there in ((0.4, 1.0), (-0.6, 1.0), (1.2, 0.0)):
             found = float(gap.value(x, jnp.asarray(u)))
             assert found == pytest.approx(-share * u * there, abs=6e-3)

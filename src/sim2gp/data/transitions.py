@@ -15,6 +15,8 @@ from sim2gp.types import AnyArray
 
 logger = logging.getLogger(__name__)
 
+PAST = 3  # earlier inputs that are tried: a delay shows there
+
 
 class Transitions(eqx.Module):
     """Rows of ``(state, action, next_state)``; rows with a false mask do not exist.
@@ -52,6 +54,11 @@ class Transitions(eqx.Module):
     def count(self) -> int:
         """Number of transitions held (host-side)."""
         return int(np.sum(np.asarray(self.mask)))
+
+    @property
+    def rows(self) -> tuple[AnyArray, AnyArray, AnyArray]:
+        """``(s, a, s')``, to their capacity."""
+        return self.state, self.action, self.next_state
 
     def extend(
         self,
@@ -95,6 +102,26 @@ class Transitions(eqx.Module):
     def delta(self) -> Float[Array, "capacity n"]:
         """The regression target ``y = s' - s``."""
         return jnp.asarray(self.next_state) - jnp.asarray(self.state)
+
+
+def earlier_inputs(
+    s: Float[np.ndarray, "N n"],
+    a: Float[np.ndarray, "N m"],
+    s2: Float[np.ndarray, "N n"],
+) -> Float[np.ndarray, "N l"]:
+    """The `PAST` inputs before each row; before an episode, its first one."""
+    episode = episode_numbers(s, s2)
+    first = np.searchsorted(episode, episode)
+    rows = [np.maximum(np.arange(len(a)) - k, first) for k in range(1, PAST + 1)]
+    return np.concatenate([a[row] for row in rows], axis=1)
+
+
+def episode_numbers(
+    start: Float[np.ndarray, "N n"], end: Float[np.ndarray, "N n"]
+) -> Int[np.ndarray, " N"]:
+    """An episode goes on where a row starts in the state in which the last ended."""
+    breaks = np.any(start[1:] != end[:-1], axis=1)
+    return np.concatenate([np.zeros(min(len(start), 1), int), np.cumsum(breaks)])
 
 
 def with_history(

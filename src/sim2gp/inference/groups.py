@@ -2,12 +2,12 @@
 
 The model is linear in the groups, as functions of unknown shape are in their weights.
 Where they explain much, a descent from the prior's mean ends at parameters that explain
-little with much noise. Fits start from draws of the other parameters for which the
-groups are solved linearly (`sim2gp.inference.variable_projection`), with the noise that
-is left there, and where all groups are off.
+little with much noise. Fits start where all groups are off, and from the best of that
+fit's parameters and draws of others, for which the groups are solved linearly
+(`sim2gp.inference.variable_projection`), with the noise that is left there.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -24,7 +24,6 @@ from sim2gp.inference.relevance import OFF
 from sim2gp.inference.variable_projection import projected
 from sim2gp.types import Key
 
-DRAWS = 64  # of the other parameters
 BROAD = 3.0  # scale of every group in a first descent
 SAME = 1.2  # times the last noise: the last fit still explains the data
 
@@ -52,7 +51,7 @@ def estimate_groups(
     key: Key,
 ) -> Estimate:
     """From the last fit; where that no longer explains the data, the fit of highest
-    evidence from projected parameters, and with all groups off.
+    evidence with all groups off, and from projected parameters.
 
     Draws are judged by ``some`` of the data. What did not converge is reported by
     `Convergence.check`.
@@ -62,31 +61,32 @@ def estimate_groups(
     off = last.z.at[np.asarray(prior.linear)].set(0.0)
     fitted = last._replace(z=jnp.where(last.enough, last.z, jnp.nan))
     plain = Start(off, first, OFF / BROAD * prior.scales, no)
-    each = fitted, Start(off, first, prior.scales, no, True), plain
+    each = fitted, plain, Start(off, first, prior.scales, no, True)
 
-    def best_draw(_: Start) -> tuple[Array, Array]:
-        (z,), (sd,) = projected(some, prior, DRAWS, 1, key)
-        return z, sd
+    def descend(start: Start, before: Array) -> Estimate:
+        def best_draw() -> tuple[Array, Array]:
+            return projected(some, prior, key, before)
 
-    def descend(start: Start) -> Estimate:
-        given = lambda start: (start.z, start.noise)  # noqa: E731
-        z, sd = jax.lax.cond(start.project, best_draw, given, start)
+        given = lambda: (start.z, start.noise)  # noqa: E731
+        z, sd = jax.lax.cond(start.project, best_draw, given)
         noise, about = Noise(sd, jnp.ones(1)), prior.scaled(start.scales)
         return estimate(likelihood, about, starts=z[None], noise=noise)
 
-    def skip(start: Start) -> Estimate:
-        shapes = jax.eval_shape(descend, start)
+    def skip(start: Start, before: Array) -> Estimate:
+        shapes = jax.eval_shape(descend, start, before)
         none: Estimate = jax.tree.map(lambda x: jnp.full(x.shape, -1, x.dtype), shapes)
         return none
 
-    def turn(done: Array, start: Start) -> tuple[Array, Estimate]:
-        found = jax.lax.cond(done, skip, descend, start)
+    def turn(carry: tuple[Array, Array], start: Start) -> tuple[Any, Estimate]:
+        done, before = carry
+        found = jax.lax.cond(done, skip, descend, start, before)
         same = jnp.all(found.noise.sd <= SAME * start.noise)
         ended = found.convergence.status == CONVERGED
-        return done | (start.enough & same & ended), found
+        now = prior.gaussian.whitened(found.posterior.mean)
+        return (done | (start.enough & same & ended), now), found
 
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *each)
-    _, found = jax.lax.scan(turn, no, stacked)
+    _, found = jax.lax.scan(turn, (no, off), stacked)
     there = found.convergence.status == CONVERGED
     there = there & jnp.isfinite(found.log_evidence)
     ranked = jnp.where(there, found.log_evidence, -jnp.inf)

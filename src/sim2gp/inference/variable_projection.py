@@ -5,7 +5,9 @@ them (Golub and Pereyra 1973, SIAM Journal on Numerical Analysis 10):
 
     w = argmin sum_c N_c log s_c(w) + 1/2 ||w||^2,    s_c^2 = mean ||r_c + J_c w||^2
 
-The draws that leave least are where a descent may begin, with the noise that is left.
+The draw that leaves least is where a descent may begin, with the noise that is left. A
+descent does not find a shape that turns suddenly, as the width of a dead zone: it is
+tried over its prior's range, the others held.
 """
 
 import jax
@@ -19,22 +21,29 @@ from sim2gp.inference.prior import ParameterPrior
 from sim2gp.types import Key
 
 ROUNDS = 15  # of weights given noise, and noise given weights
+#: Of each shape, in prior sds, and of draws so many times as many.
+SHAPES = np.linspace(-2.0, 2.0, 24)
+DRAWS = 2
 
 
 def projected(
     likelihood: AbstractLikelihood,
     prior: ParameterPrior,
-    draws: int,
-    best: int,
     key: Key,
-) -> tuple[Float[Array, "best p"], Float[Array, "best c"]]:
-    """The best of so many draws: whitened starts, and the noise sd at each.
+    also: Float[Array, " p"] | None = None,
+) -> tuple[Float[Array, " p"], Float[Array, " c"]]:
+    """The best of some draws: a whitened start, and the noise sd there.
 
-    Linear are the weights of groups. The first draw is the prior's mean.
+    Linear are the weights of groups. The first draw is the prior's mean, the second
+    ``also`` (whitened). Each shape of a function is then searched along its own axis.
     """
     places, about = np.asarray(prior.linear), prior.gaussian
-    z = jax.random.normal(key, (draws, about.mean.size))
-    z = z.at[:, places].set(0.0).at[0].set(0.0)
+    p, shapes = about.mean.size, np.flatnonzero([p.shape for p in prior.table.free])
+    z = jax.random.normal(key, (DRAWS + len(shapes), len(SHAPES), p))
+    z = z.at[0, 0].set(0.0)
+    z = z if also is None else z.at[0, 1].set(also)
+    axes = np.zeros((len(z), p))
+    axes[np.arange(DRAWS, len(z)), shapes] = 1.0
     counts, first = likelihood.counts, likelihood.first_noise()
     N, e = jnp.sum(counts, axis=0), jnp.zeros((len(counts), likelihood.n_nuisances))
     n = likelihood.n_nuisances
@@ -57,6 +66,17 @@ def projected(
         cost = 0.5 * (N @ jnp.log(s2) + w @ w + z @ z)
         return cost, z.at[places].set(w), jnp.sqrt(s2)
 
-    costs, starts, noises = jax.lax.map(one, z)
-    order = jnp.argsort(jnp.where(jnp.isfinite(costs), costs, jnp.inf))[:best]
-    return starts[order], noises[order]
+    def better(best: tuple, plan: tuple) -> tuple[tuple, None]:
+        """The best so far and some more: draws, or itself with one of its shapes."""
+        tried, axis = plan
+        along = (best[1] * (1.0 - axis))[None] + SHAPES[:, None] * axis[None]
+        tried = jnp.where(jnp.any(axis > 0.0), along, tried).at[:, places].set(0.0)
+        found = jax.lax.map(one, tried)
+        k = jnp.argmin(jnp.where(jnp.isfinite(found[0]), found[0], jnp.inf))
+        new = jax.tree.map(lambda x: x[k], found)
+        less = new[0] < best[0]
+        return jax.tree.map(lambda x, y: jnp.where(less, x, y), new, best), None
+
+    best = jnp.asarray(jnp.inf), jnp.zeros(p), first.sd
+    (_, start, noise), _ = jax.lax.scan(better, best, (z, jnp.asarray(axes)))
+    return start, noise

@@ -4,10 +4,11 @@
 
 (`sim2gp.systems.effects.forces`). Weights of the functions are parameters like the
 simulator's own, so that the linearised posterior is that of `Sim2GP`. Each fit chooses
-the scales (`sim2gp.inference.relevance`): before data all are off.
+the scales (`sim2gp.inference.relevance`): before data all are off. Where inputs arrive
+late (`sim2gp.models.late_inputs`) all stay off.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ import numpy as np
 from jaxtyping import Int
 
 from sim2gp.belief import AbstractBelief, AbstractModel
-from sim2gp.data.one_step import estimate_forces
+from sim2gp.data.one_step import OneStepLikelihood, estimate_forces
 from sim2gp.data.transitions import Transitions
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.groups import Start
@@ -23,11 +24,13 @@ from sim2gp.inference.prior import ParameterPrior
 from sim2gp.inference.relevance import OFF, ON
 from sim2gp.models.draws import LinearizedDraw
 from sim2gp.models.features import Encoding
+from sim2gp.models.late_inputs import arrive_late
 from sim2gp.models.sim2gp import Sim2GP, Sim2GPBelief, belief_of
 from sim2gp.systems.assemble import free_parts
 from sim2gp.systems.base import AbstractSystem
-from sim2gp.systems.effects.forces import AbstractUnknownFunction
+from sim2gp.systems.effects.forces import AbstractUnknownFunction, MissingFriction
 from sim2gp.systems.effects.missing import missing_forces
+from sim2gp.systems.machine import as_machine
 from sim2gp.types import Action, Dynamics, Key, State, in_float64
 
 
@@ -42,6 +45,7 @@ class MissingForces(AbstractModel):
 
     plain: Sim2GP
     sim: Sim2GP
+    wide: Sim2GP
     forces: tuple[AbstractUnknownFunction, ...]
 
     @in_float64
@@ -49,11 +53,23 @@ class MissingForces(AbstractModel):
         self, sim: Sim2GP, *, reach: Mapping[str, float] | None = None
     ) -> None:
         box = Encoding.of(sim.system, reach or {}).box()
-        parts = [f for f in missing_forces(sim.system, box) if self.counts(f)]
-        self.forces = tuple(parts)
-        system, own = free_parts(sim.system, parts), sim.prior
+        self.plain = sim
+        self.forces = self._functions(box)
+        self.sim = self._with(self.forces)
+        self.wide = self._with(self._functions(box, wide=True))
+
+    def _functions(
+        self, box: Mapping[str, tuple[float, float]], *, wide: bool = False
+    ) -> tuple[AbstractUnknownFunction, ...]:
+        every = missing_forces(self.plain.system, box, wide=wide)
+        return tuple(f for f in every if self.counts(f))
+
+    def _with(self, forces: Sequence[AbstractUnknownFunction]) -> Sim2GP:
+        """The simulator with forces, and its own prior."""
+        own = self.plain.prior
+        system = free_parts(self.plain.system, forces)
         prior = system.parameters.prior().with_block(np.arange(own.mean.size), own)
-        self.plain, self.sim = sim, Sim2GP(system, dt=sim.dt, prior=prior)
+        return Sim2GP(system, dt=self.plain.dt, prior=prior)
 
     def counts(self, function: AbstractUnknownFunction) -> bool:
         """Whether the machine may lack such a function: any, here."""
@@ -79,16 +95,31 @@ class MissingForces(AbstractModel):
     ) -> Sim2GPBelief:
         """The best of several starts by evidence, with noise and scales learned.
 
-        Raises `NotConverged`, `NotFinite` or `DeadParameters`.
+        Friction is looked for as wide as the machine's own substeps can follow; a fit
+        with the short ones that steep friction needs follows where it is found. Raises
+        `NotConverged`, `NotFinite` or `DeadParameters`.
         """
         assert isinstance(belief, Sim2GPBelief)
         rows = jax.tree.map(jnp.asarray, data)
-        found = estimate_forces(
-            self.system, rows, self.sim.dt, self._prior(), self._start(belief), key
-        )
-        names = self.system.parameters.names
-        found.convergence.check(names, f"{data.count} transitions")
-        return self._needed(belief_of(self.sim, found, rows))
+        if not _has_friction(belief.system):
+            belief = self._fitted(self.wide, belief, rows, key)
+        if _has_friction(belief.system):
+            belief = self._fitted(self.sim, belief, rows, key)
+        if belief.system == self.plain.system:
+            return belief
+        likelihood = OneStepLikelihood(belief.system, rows, belief.dt)
+        if arrive_late(likelihood, belief.prior, belief.posterior):
+            return self.plain.fit(self.init(key), data, key=key)
+        return belief
+
+    def _fitted(
+        self, sim: Sim2GP, belief: Sim2GPBelief, rows: Transitions, key: Key
+    ) -> Sim2GPBelief:
+        """With the forces of ``sim``, about the machine with those that are on."""
+        prior, start = self._prior(), self._start(belief)
+        found = estimate_forces(sim.system, rows, sim.dt, prior, start, key)
+        found.convergence.check(self.system.parameters.names, f"{rows.count} rows")
+        return self._needed(belief_of(sim, found, rows))
 
     def update(
         self, belief: AbstractBelief, s: State, a: Action, s2: State
@@ -99,12 +130,13 @@ class MissingForces(AbstractModel):
     def shared(self, draw: Dynamics) -> Dynamics:
         """The draw as one of the machine with all forces: those that are off are zero.
 
-        Slower, but every set of forces is one program.
+        Slower, but all sets of forces are two programs, with friction and without.
         """
         assert isinstance(draw, LinearizedDraw)
-        at, mean = self._places(draw.system), self.sim.prior.mean.astype(jnp.float32)
+        sim = self.sim if _has_friction(draw.system) else self.wide
+        at, mean = self._places(draw.system), sim.prior.mean.astype(jnp.float32)
         delta = jnp.zeros_like(mean).at[at].set(draw.delta)
-        return LinearizedDraw(self.system, mean.at[at].set(draw.tt), delta, draw.dt)
+        return LinearizedDraw(sim.system, mean.at[at].set(draw.tt), delta, draw.dt)
 
     def _prior(self) -> ParameterPrior:
         """With all forces at the scale of their own prior."""
@@ -131,3 +163,9 @@ class MissingForces(AbstractModel):
         """Those of a machine's parameters in the table with all forces."""
         names = self.system.parameters.names
         return np.asarray([names.index(name) for name in system.parameters.names])
+
+
+def _has_friction(system: AbstractSystem) -> bool:
+    """Whether one of the forces that are on is dry friction."""
+    effects = as_machine(system).effects
+    return any(isinstance(effect, MissingFriction) for effect in effects)

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sim2gp.data.one_step import OneStepLikelihood
+from sim2gp.data.transitions import earlier_inputs, episode_numbers
 from sim2gp.data.windows import Windows
 from sim2gp.data.windows_likelihood import WindowsLikelihood, linearise
 from sim2gp.identification.misfit.tests import Misfit, misfit
@@ -19,8 +20,6 @@ from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.systems.base import Channel
 from sim2gp.types import in_float64
-
-PAST = 3  # earlier inputs that are tried, too: a delay shows there
 
 
 @in_float64
@@ -39,15 +38,14 @@ def misfit_of_transitions(
     found = _residual_rows(likelihood, posterior.mean, prior.scale)
     r, J = (np.asarray(x)[:N] for x in found)
     sd = np.asarray(noise)
-    s, a, s2 = (np.asarray(x)[:N] for x in (data.state, data.action, data.next_state))
-    episode = _episode_numbers(s, s2)
+    s, a, s2 = (np.asarray(x)[:N] for x in data.rows)
     states = system.physical_states
     return misfit(
         r / sd,
         np.concatenate([encode_angles(s[:, : len(states)], states), a], axis=1),
         jacobian=J / sd[:, None],
-        past=earlier(a, episode),
-        group=episode,
+        past=earlier_inputs(s, a, s2),
+        group=episode_numbers(s, s2),
         channels=[channel.name for channel in states],
     )
 
@@ -95,28 +93,11 @@ def encode_angles(
     return np.stack(columns, axis=1)
 
 
-def earlier(
-    a: Float[np.ndarray, "N m"], episode: Int[np.ndarray, " N"]
-) -> Float[np.ndarray, "N l"]:
-    """The `PAST` inputs before each row; before an episode, its first one."""
-    N = len(a)
-    first = np.searchsorted(episode, episode)
-    rows = [np.maximum(np.arange(N) - k, first) for k in range(1, PAST + 1)]
-    return np.concatenate([a[row] for row in rows], axis=1)
-
-
 def _successive(cut: Windows) -> Int[np.ndarray, " W"]:
     """One number for one-step windows each of which starts where the last one ended."""
     end = np.sum(np.asarray(cut.y), axis=1, where=np.asarray(cut.mask))
     start = np.asarray(cut.start)[:, list(cut.outputs)]
-    return _episode_numbers(start, end)
-
-
-def _episode_numbers(
-    start: Float[np.ndarray, "N n"], end: Float[np.ndarray, "N n"]
-) -> Int[np.ndarray, " N"]:
-    breaks = np.any(start[1:] != end[:-1], axis=1)
-    return np.concatenate([np.zeros(min(len(start), 1), int), np.cumsum(breaks)])
+    return episode_numbers(start, end)
 
 
 @eqx.filter_jit

@@ -24,8 +24,8 @@ from sim2gp.types import AnyArray
 #: Of the interval and of the kernel's length, in half-widths of where a machine moves.
 REACH, LENGTH = 2.5, 1.0
 COUNT = 6  # of features
-SOFT = 0.05  # of a dead zone's width: how soon it ends
-WIDTH_SD = 0.6  # of the logarithm of a dead zone's width
+SOFT = 0.05  # of a dead zone's width: how soon it ends, its median
+SHAPE_SD = 0.6  # of the logarithms of a dead zone's width and of this softness
 
 #: One value, or a batch of them in NumPy.
 Points = Float[AnyArray, "*b"]
@@ -168,25 +168,28 @@ class Sign:
 
 @dataclass(frozen=True)
 class Gap:
-    """A dead zone of an unknown width: of all bases only this has a shape to learn.
+    """A dead zone of an unknown width: of all bases only this has shapes to learn.
 
-    ``width`` is the width's median; its logarithm has the sd `WIDTH_SD`.
+    ``width`` is the width's median, ``softness`` that of the share of the width in
+    which it ends; their logarithms have the sd `SHAPE_SD`.
     """
 
     width: float
+    softness: float = SOFT
     sds: ClassVar[tuple[float, ...]] = (1.0,)
 
-    def value(self, x: Float[AnyArray, " 2"], z: Points) -> Points:
+    def value(self, x: Float[AnyArray, " 3"], z: Points) -> Points:
         """What it takes away: ``x[0]`` at the edge, where ``z`` is the width ``x[1]``.
 
-        A true dead zone takes all of the input, ``x[0] = x[1]``.
+        A true dead zone takes all of the input, ``x[0] = x[1]``. The softness is
+        ``x[2]``.
         """
         w = x[1]
-        return (dead_zone(z, w, SOFT * w) - z) * (x[0] / w)
+        return (dead_zone(z, w, x[2] * w) - z) * (x[0] / w)
 
     def features(self, z: Float[AnyArray, "*b"]) -> Float[Array, "*b 1"]:
-        """What it takes away for ``x[0] = 1``, at the width's median."""
-        x = jnp.asarray([1.0, self.width])
+        """What it takes away for ``x[0] = 1``, at the medians of its shapes."""
+        x = jnp.asarray([1.0, self.width, self.softness])
         return jnp.asarray(self.value(x, jnp.asarray(z)))[..., None]
 
 

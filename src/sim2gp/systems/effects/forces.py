@@ -30,7 +30,8 @@ from sim2gp.systems.effects.base import (
     AbstractInputEffect,
     AbstractJointEffect,
 )
-from sim2gp.systems.effects.bases import WIDTH_SD, Basis, Gap, Sign, Sines
+from sim2gp.systems.effects.bases import SHAPE_SD, Basis, Gap, Sign, Sines
+from sim2gp.systems.effects.friction_laws import COULOMB_SUBSTEP
 from sim2gp.systems.effects.units import force_unit, velocity_of
 from sim2gp.systems.mechanism import AbstractMechanism, Inertia, Pair
 from sim2gp.types import AnyArray, Scalar, State
@@ -59,6 +60,7 @@ class AbstractUnknownFunction(AbstractEffect):
         found = {f"{self.name}[{k}]": w for k, w in enumerate(weights, start=1)}
         if isinstance(self.basis, Gap):
             found[f"{self.name}.width"] = self.basis.width
+            found[f"{self.name}.softness"] = self.basis.softness
         return found
 
     def own(self, values: Mapping[str, Scalar]) -> Float[AnyArray, " k"]:
@@ -72,10 +74,15 @@ class AbstractUnknownFunction(AbstractEffect):
             for name, sd in zip(names, self.basis.sds, strict=False)
         ]
         if isinstance(self.basis, Gap):
-            about = names[-1], unit, "width of the dead zone", "log", 0.0, math.inf
-            mean, sd = math.log(self.basis.width), WIDTH_SD
-            width = Parameter(*about, mean, sd, group=self.name, shape=True)
-            found.append(width)
+            gap = self.basis
+            shapes = (
+                (names[-2], unit, "width of the dead zone", gap.width),
+                (names[-1], "1", "share of it in which it ends", gap.softness),
+            )
+            for name, of, means, median in shapes:
+                about = name, of, means, "log", 0.0, math.inf, math.log(median)
+                shape = Parameter(*about, SHAPE_SD, group=self.name, shape=True)
+                found.append(shape)
         return tuple(found)
 
 
@@ -93,6 +100,12 @@ class MissingForce(AbstractUnknownFunction):
 
     def unit(self, plant: AbstractPlant) -> str:
         return force_unit(plant, self.where)
+
+
+class MissingFriction(MissingForce):
+    """Dry friction of one joint: as steep as its substep can follow."""
+
+    max_substep: ClassVar[float] = COULOMB_SUBSTEP
 
 
 class MissingInput(AbstractInputEffect, AbstractUnknownFunction):

@@ -8,11 +8,13 @@ from sim2gp.systems.effects.bases import Gap, Sign, periodic, ripple, smooth
 from sim2gp.systems.effects.forces import (
     AbstractUnknownFunction,
     MissingForce,
+    MissingFriction,
     MissingInput,
 )
 from sim2gp.systems.effects.scales import drives
 from sim2gp.systems.effects.units import joint_of
 from sim2gp.systems.machine import plant_of
+from sim2gp.systems.mechanism import AbstractMechanism
 
 HARMONICS = 2  # of a joint that may turn round
 RIPPLES = 12  # in a turn, of cogging
@@ -32,6 +34,7 @@ def missing_forces(
     *,
     fine: bool = False,
     closely: bool = False,
+    wide: bool = False,
 ) -> list[AbstractUnknownFunction]:
     """Of each joint a force by position, by velocity and of dry friction; of each input
     a smooth change and a dead zone.
@@ -39,10 +42,13 @@ def missing_forces(
     ``box`` is where the machine moves, by channel. With ``fine``, of each hinge the
     cogging of a motor as well. ``closely``, each function by position and by velocity
     has details too, and a joint that turns round is also pulled to where it started.
+    ``wide`` friction needs no shorter substeps than the machine has.
     """
     plant = plant_of(system)
+    steep = isinstance(plant, AbstractMechanism) and not wide
+    friction = MissingFriction if steep else MissingForce
     # An engine holds a force for its own step, which must not reverse the joint.
-    step = plant.own_step or min(plant.max_substep, LONGEST_MEAN)
+    step = plant.own_step or min(plant.max_substep, LONGEST_MEAN, friction.max_substep)
     found: list[AbstractUnknownFunction] = []
     for name, drive in drives(plant).items():
         joint = joint_of(plant, name)
@@ -66,7 +72,7 @@ def missing_forces(
             MissingForce(
                 name, drive.force, by_speed, of_velocity=True, what="velocity_force"
             ),
-            MissingForce(
+            friction(
                 name, DRY * drive.force, sign, of_velocity=True, what="dry_friction"
             ),
         ]
