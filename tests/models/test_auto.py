@@ -104,6 +104,16 @@ def test_it_answers_as_the_chosen_model(runs):
     assert float(gains[0]) == float(gains[1])
 
 
+def test_draws_before_and_after_data_are_one_program(runs):
+    """None has a number of 64 bits: on a GPU planning would fail."""
+    _, _, beliefs = runs[0.6]
+    for draw in (
+        f(b) for b in beliefs for f in (lambda b: b.sample(KEY), lambda b: b.point())
+    ):
+        kinds = {leaf.dtype.itemsize for leaf in jax.tree.leaves(draw)}
+        assert kinds == {4}
+
+
 def test_it_acts_on_what_each_would(runs):
     _, _, beliefs = runs[0.6]
     doubtful = eqx.tree_at(lambda b: b.beliefs[1].kappa, beliefs[-1], jnp.asarray(9.0))

@@ -8,7 +8,7 @@ simple to complex, and the simplest one is kept unless another is better by more
 one standard error of the paired difference.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import equinox as eqx
 import jax
@@ -70,7 +70,7 @@ class AutoBelief(AbstractBelief):
         return self._spoken([b.predict(s, a) for b in self.beliefs])
 
     def sample(self, key: Key) -> Dynamics:
-        return AutoDraw(tuple(b.sample(key) for b in self.beliefs), self.index)
+        return self._draw(b.sample(key) for b in self.beliefs)
 
     def untempered(self) -> "AutoBelief":
         """That of each."""
@@ -78,7 +78,11 @@ class AutoBelief(AbstractBelief):
         return eqx.tree_at(lambda b: b.beliefs, self, each)
 
     def point(self) -> Dynamics:
-        return AutoDraw(tuple(b.point() for b in self.beliefs), self.index)
+        return self._draw(b.point() for b in self.beliefs)
+
+    def _draw(self, draws: Iterable[Dynamics]) -> "AutoDraw":
+        """In 32 bits, as planning is, whatever the belief counts in."""
+        return AutoDraw(tuple(draws), self.index.astype(jnp.int32))
 
     def sensitivity(self, s: State, a: Action) -> Sensitivity:
         each = zip(*(b.sensitivity(s, a) for b in self.beliefs), strict=True)
