@@ -127,7 +127,7 @@ def test_scales_stay_as_chosen_and_a_fit_that_fails_is_not_used(
         scale = scales.get(name.split(".")[-1].removesuffix("[1]"), 1.0)
         assert sd[name] == pytest.approx(scale * first[name])
     assert sum("dry_friction" in name for name in table.names) == 2
-    assert sum("dead_zone" in name for name in table.names) == 4  # two of them widths
+    assert sum("dead_zone" in name for name in table.names) == 6  # and two shapes each
     own = [table.names.index(name) for name in system.parameters.names]
     np.testing.assert_array_equal(
         np.asarray(given["warm_start"].posterior.mean)[own], known.mean
