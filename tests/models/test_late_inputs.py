@@ -1,4 +1,4 @@
-"""Inputs that arrive late are told from forces by what earlier inputs explain."""
+"""Inputs that arrive late: earlier inputs explain what forces leave over."""
 
 import equinox as eqx
 import jax

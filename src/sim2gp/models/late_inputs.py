@@ -1,9 +1,8 @@
-"""Whether inputs arrive late: the one thing missing that forces take for their own.
+"""Whether inputs arrive late: a delay, which forces imitate.
 
-A force may follow the input of the step before, since a controller's inputs depend on
-the states that a force depends on. The forces found so are wrong wherever the policy is
-another one. What they leave over still depends on earlier inputs, which it does on no
-machine whose inputs act at once.
+A controller's inputs depend on the states that a force depends on, so that a force can
+follow the input of the step before. Such a force is wrong for any other policy. What it
+leaves over still depends on earlier inputs; where inputs act at once, nothing does.
 """
 
 import equinox as eqx
