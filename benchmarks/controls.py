@@ -12,12 +12,10 @@ from functools import partial
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from residual_models import Ensemble, ProcessResidual
-from sim2gp.belief import AbstractBelief
 from sim2gp.data.one_step import ROWS, OneStepLikelihood
 from sim2gp.data.transitions import Transitions
 from sim2gp.inference.arrowhead import Noise
@@ -29,7 +27,7 @@ from sim2gp.inference.parameters import Parameter
 from sim2gp.inference.prior import AbstractPrior, ParameterPrior
 from sim2gp.inference.variable_projection import projected
 from sim2gp.models import MissingForces, Residual, Sim2GP
-from sim2gp.models.sim2gp import Sim2GPBelief, belief_of
+from sim2gp.models.sim2gp import Sim2GPBelief
 from sim2gp.studies.learners import METHODS
 from sim2gp.studies.swingup import Cell
 from sim2gp.systems.actuators import Lag
@@ -40,14 +38,14 @@ from sim2gp.systems.effects.friction_laws import COULOMB_SUBSTEP, coulomb
 from sim2gp.systems.effects.units import gravity_of
 from sim2gp.systems.mechanism import AbstractMechanism, Pair
 from sim2gp.systems.parts import AbstractPart
-from sim2gp.types import AnyArray, Key, Scalar, in_float64
+from sim2gp.types import AnyArray, Key, Scalar
 
 #: Past inputs that a gap depends on, s; a swing crosses it more often.
 REMEMBERED = 0.2
 
 
 class AbstractLessForces(MissingForces):
-    """MissingForces with another fit."""
+    """MissingForces with another estimate, and nothing else changed."""
 
     def found(
         self,
@@ -58,16 +56,11 @@ class AbstractLessForces(MissingForces):
     ) -> Estimate:
         raise NotImplementedError
 
-    @in_float64
-    def fit(
-        self, belief: AbstractBelief, data: Transitions, *, key: Key
-    ) -> Sim2GPBelief:
-        assert isinstance(belief, Sim2GPBelief)
-        rows = jax.tree.map(jnp.asarray, data)
-        likelihood = OneStepLikelihood(self.system, rows, self.sim.dt)
-        found = self.found(likelihood, self._prior(), self._start(belief), key)
-        found.convergence.check(self.system.parameters.names, f"{data.count} rows")
-        return self._needed(belief_of(self.sim, found, rows))
+    def _estimate(
+        self, sim: Sim2GP, belief: Sim2GPBelief, rows: Transitions, key: Key
+    ) -> Estimate:
+        likelihood = OneStepLikelihood(sim.system, rows, sim.dt)
+        return self.found(likelihood, self._prior(), self._start(belief), key)
 
 
 class WithoutProjection(AbstractLessForces):

@@ -11,7 +11,7 @@ from descents import estimate_of
 from linear_system import linear, transitions
 from sim2gp.data.one_step import OneStepLikelihood
 from sim2gp.data.split_log import cut
-from sim2gp.data.transitions import earlier_inputs
+from sim2gp.data.transitions import earlier_inputs, episode_numbers
 from sim2gp.data.windows import Windows
 from sim2gp.data.windows_likelihood import (
     WindowsLikelihood,
@@ -52,8 +52,7 @@ def test_a_linear_fit_is_tested_on_its_own_rows() -> None:
     sd, tt = np.asarray(noise), estimate
     theirs = misfit(
         (J @ tt - y) / sd, J.reshape(300, 6), jacobian=J / sd[:, None],
-        past=earlier_inputs(np.zeros((300, 1)), J.reshape(300, 6), np.ones((300, 1))),
-        group=np.arange(300),
+        past=earlier_inputs(J.reshape(300, 6), np.arange(300)), group=np.arange(300),
     )  # fmt: skip
     for name, finding in theirs.tests.items():
         ours, its = found.tests[name].statistic, finding.statistic
@@ -68,7 +67,9 @@ def test_a_linear_fit_is_tested_on_its_own_rows() -> None:
 def test_inputs_of_the_tests() -> None:
     a = np.arange(6.0)[:, None]
     s = np.array([0.0, 1.0, 2.0, 3.0, 0.0, 1.0])[:, None]
-    past = earlier_inputs(s, a, s + 1.0)
+    episode = episode_numbers(s, s + 1.0)
+    np.testing.assert_array_equal(episode, [0, 0, 0, 0, 1, 1])
+    past = earlier_inputs(a, episode)
     np.testing.assert_array_equal(past[3], [2.0, 1.0, 0.0])
     np.testing.assert_array_equal(past[1], [0.0, 0.0, 0.0])
     np.testing.assert_array_equal(past[5], [4.0, 4.0, 4.0])

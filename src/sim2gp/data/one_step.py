@@ -95,6 +95,14 @@ class OneStepLikelihood(AbstractLikelihood):
 
 
 @eqx.filter_jit
+def compiled_rows(
+    likelihood: OneStepLikelihood, tt: Float[Array, " p"], scale: Float[Array, "p q"]
+) -> tuple[Float[Array, "N d"], Float[Array, "N d q"]]:
+    """`OneStepLikelihood.rows`, for callers on the host."""
+    return likelihood.rows(tt, scale)
+
+
+@eqx.filter_jit
 def estimate_forces(
     system: AbstractSystem,
     data: Transitions,

@@ -56,9 +56,11 @@ class Transitions(eqx.Module):
         return int(np.sum(np.asarray(self.mask)))
 
     @property
-    def rows(self) -> tuple[AnyArray, AnyArray, AnyArray]:
-        """``(s, a, s')``, to their capacity."""
-        return self.state, self.action, self.next_state
+    def held(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """``(s, a, s')`` of the transitions held (host-side)."""
+        N = self.count
+        s, a, s2 = map(np.asarray, (self.state, self.action, self.next_state))
+        return s[:N], a[:N], s2[:N]
 
     def extend(
         self,
@@ -105,12 +107,9 @@ class Transitions(eqx.Module):
 
 
 def earlier_inputs(
-    s: Float[np.ndarray, "N n"],
-    a: Float[np.ndarray, "N m"],
-    s2: Float[np.ndarray, "N n"],
+    a: Float[np.ndarray, "N m"], episode: Int[np.ndarray, " N"]
 ) -> Float[np.ndarray, "N l"]:
     """The `PAST` inputs before each row; before an episode, its first one."""
-    episode = episode_numbers(s, s2)
     first = np.searchsorted(episode, episode)
     rows = [np.maximum(np.arange(len(a)) - k, first) for k in range(1, PAST + 1)]
     return np.concatenate([a[row] for row in rows], axis=1)

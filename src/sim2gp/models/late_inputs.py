@@ -5,18 +5,17 @@ follow the input of the step before. Such a force is wrong for any other policy.
 leaves over still depends on earlier inputs; where inputs act at once, nothing does.
 """
 
-import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from scipy.special import fdtrc
 
-from sim2gp.data.one_step import OneStepLikelihood
-from sim2gp.data.transitions import earlier_inputs
+from sim2gp.data.one_step import OneStepLikelihood, compiled_rows
+from sim2gp.data.transitions import earlier_inputs, episode_numbers
 from sim2gp.inference.gaussian import Gaussian
 
 LEVEL = 1e-4
-#: Of a channel's residual variance, by earlier inputs: .15 to .5 under delays of 5 to
-#: 20 ms, at most .03 where forces are what is missing (`docs/decisions.md`).
+#: Of a channel's residual variance, by earlier inputs: .15 to .5 under delays of 10 to
+#: 20 ms, at most .04 where forces are what is missing (`docs/decisions.md`).
 SHARE = 0.1
 
 
@@ -29,9 +28,10 @@ def arrive_late(
     """
     data = likelihood.data
     N = data.count
-    found = _rows(likelihood, posterior.mean, prior.scale)
+    found = compiled_rows(likelihood, posterior.mean, prior.scale)
     r, J = (np.asarray(x)[:N] for x in found)
-    past = earlier_inputs(*(np.asarray(x)[:N] for x in data.rows))
+    s, a, s2 = data.held
+    past = earlier_inputs(a, episode_numbers(s, s2))
     d = r.shape[1]
     return any(_explain(past, r[:, c], J[:, c], LEVEL / d) for c in range(d))
 
@@ -56,11 +56,3 @@ def _left(r: Float[np.ndarray, " N"], A: Float[np.ndarray, "N p"]) -> float:
     size = np.linalg.norm(A, axis=0)
     A = A / np.where(size > 0.0, size, 1.0)
     return float(np.sum((r - A @ np.linalg.lstsq(A, r)[0]) ** 2))
-
-
-@eqx.filter_jit
-def _rows(
-    likelihood: OneStepLikelihood, tt: Array, scale: Array
-) -> tuple[Array, Array]:
-    """Residuals and their Jacobian, per prior standard deviation."""
-    return likelihood.rows(tt, scale)

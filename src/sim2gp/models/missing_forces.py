@@ -18,6 +18,7 @@ from jaxtyping import Int
 from sim2gp.belief import AbstractBelief, AbstractModel
 from sim2gp.data.one_step import OneStepLikelihood, estimate_forces
 from sim2gp.data.transitions import Transitions
+from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.groups import Start
 from sim2gp.inference.prior import ParameterPrior
@@ -105,7 +106,7 @@ class MissingForces(AbstractModel):
             belief = self._fitted(self.wide, belief, rows, key)
         if _has_friction(belief.system):
             belief = self._fitted(self.sim, belief, rows, key)
-        if belief.system == self.plain.system:
+        if not belief.system.parameters.groups:
             return belief
         likelihood = OneStepLikelihood(belief.system, rows, belief.dt)
         if arrive_late(likelihood, belief.prior, belief.posterior):
@@ -116,10 +117,17 @@ class MissingForces(AbstractModel):
         self, sim: Sim2GP, belief: Sim2GPBelief, rows: Transitions, key: Key
     ) -> Sim2GPBelief:
         """With the forces of ``sim``, about the machine with those that are on."""
-        prior, start = self._prior(), self._start(belief)
-        found = estimate_forces(sim.system, rows, sim.dt, prior, start, key)
-        found.convergence.check(self.system.parameters.names, f"{rows.count} rows")
+        found = self._estimate(sim, belief, rows, key)
+        found.convergence.check(
+            self.system.parameters.names, f"{rows.count} transitions"
+        )
         return self._needed(belief_of(sim, found, rows))
+
+    def _estimate(
+        self, sim: Sim2GP, belief: Sim2GPBelief, rows: Transitions, key: Key
+    ) -> Estimate:
+        prior, start = self._prior(), self._start(belief)
+        return estimate_forces(sim.system, rows, sim.dt, prior, start, key)
 
     def update(
         self, belief: AbstractBelief, s: State, a: Action, s2: State

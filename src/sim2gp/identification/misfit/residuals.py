@@ -7,11 +7,10 @@ simulation whose model errs at all drifts, so that on real machines these tests
 raise the alarm as a rule: that is right, the posterior counts every sample as new.
 """
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sim2gp.data.one_step import OneStepLikelihood
+from sim2gp.data.one_step import OneStepLikelihood, compiled_rows
 from sim2gp.data.transitions import earlier_inputs, episode_numbers
 from sim2gp.data.windows import Windows
 from sim2gp.data.windows_likelihood import WindowsLikelihood, linearise
@@ -35,17 +34,18 @@ def misfit_of_transitions(
     """
     system, data = likelihood.system, likelihood.data
     N = data.count
-    found = _residual_rows(likelihood, posterior.mean, prior.scale)
+    found = compiled_rows(likelihood, posterior.mean, prior.scale)
     r, J = (np.asarray(x)[:N] for x in found)
     sd = np.asarray(noise)
-    s, a, s2 = (np.asarray(x)[:N] for x in data.rows)
+    s, a, s2 = data.held
+    episode = episode_numbers(s, s2)
     states = system.physical_states
     return misfit(
         r / sd,
         np.concatenate([encode_angles(s[:, : len(states)], states), a], axis=1),
         jacobian=J / sd[:, None],
-        past=earlier_inputs(s, a, s2),
-        group=episode_numbers(s, s2),
+        past=earlier_inputs(a, episode),
+        group=episode,
         channels=[channel.name for channel in states],
     )
 
@@ -98,11 +98,3 @@ def _successive(cut: Windows) -> Int[np.ndarray, " W"]:
     end = np.sum(np.asarray(cut.y), axis=1, where=np.asarray(cut.mask))
     start = np.asarray(cut.start)[:, list(cut.outputs)]
     return episode_numbers(start, end)
-
-
-@eqx.filter_jit
-def _residual_rows(
-    likelihood: OneStepLikelihood, tt: Array, scale: Array
-) -> tuple[Array, Array]:
-    """Residuals ``f - s'`` and their Jacobian, per prior standard deviation."""
-    return likelihood.rows(tt, scale)

@@ -11,6 +11,7 @@ from sim2gp.systems.effects.forces import (
     MissingFriction,
     MissingInput,
 )
+from sim2gp.systems.effects.friction_laws import COULOMB_SUBSTEP
 from sim2gp.systems.effects.scales import drives
 from sim2gp.systems.effects.units import joint_of
 from sim2gp.systems.machine import plant_of
@@ -45,7 +46,9 @@ def missing_forces(
     ``wide`` friction needs no shorter substeps than the machine has.
     """
     plant = plant_of(system)
-    steep = isinstance(plant, AbstractMechanism) and not wide
+    # Others have short substeps, or kicks and steps that no effect can shorten.
+    shorter = plant.max_substep > COULOMB_SUBSTEP
+    steep = isinstance(plant, AbstractMechanism) and shorter and not wide
     friction = MissingFriction if steep else MissingForce
     # An engine holds a force for its own step, which must not reverse the joint.
     step = plant.own_step or min(plant.max_substep, LONGEST_MEAN, friction.max_substep)
