@@ -49,7 +49,7 @@ docs: $(VENV)/.docs
 
 # Two processes, whole files each, and one cache of what they compile, empty at the start.
 # Compilation is most of the time: by day XLA optimises nothing, by night as for users.
-unit: export XLA_FLAGS = --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0
+unit: export XLA_FLAGS = --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1
 unit: $(VENV)/.test
 	@cache=$$(mktemp -d) && trap 'rm -rf "$$cache"' EXIT && \
 	  export JAX_COMPILATION_CACHE_DIR="$$cache" && \

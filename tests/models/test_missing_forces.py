@@ -17,11 +17,11 @@ REACH = {"theta": 2.0, "theta.velocity": 15.0, "alpha.velocity": 25.0}
 MODEL = sg.MissingForces(sg.Sim2GP(Furuta()), reach=REACH)
 
 
-def recorded(parts, seed=0) -> Transitions:
+def recorded(parts, seed=0, arm=1.5) -> Transitions:
     """Steps of a machine from states all over, under random inputs."""
     rng = np.random.default_rng(seed)
     machine = Machine(Furuta(), effects=parts)
-    s = rng.uniform(-1.0, 1.0, (ROWS, 4)) * [1.5, 3.0, 8.0, 12.0]
+    s = rng.uniform(-1.0, 1.0, (ROWS, 4)) * [arm, 3.0, 8.0, 12.0]
     a = rng.uniform(-5.0, 5.0, (ROWS, 1))
     with jax.enable_x64(True):
         # Twice as finely as the model is, as a true machine with effects.
@@ -140,6 +140,35 @@ def test_of_the_simulator_alone_the_forces_are_averaged(with_spring):
     precision = np.linalg.inv((C @ C.T)[own, own]) - np.eye(8)
     A = np.asarray(alone.information)
     np.testing.assert_allclose(A.T @ A, precision, rtol=1e-4, atol=1e-6)
+
+
+def test_reaches_grow_until_functions_hold_the_data():
+    """By doubling, of channels that do not turn; two reaches are within a function."""
+    s = np.zeros((40, 4))
+    s[7] = [8.1, 90.0, 29.0, -51.0]
+    model = MODEL.holding(Transitions.of(s, np.zeros((40, 1)), s))
+    wider = {"theta": 8.0, "alpha.velocity": 50.0}
+    assert dict(model.reach) == REACH | wider
+    forces = {f.name: f.basis for f in model.forces}
+    same = [f.name for f in MODEL.forces if forces[f.name] == f.basis]
+    assert len(forces) == len(MODEL.forces) == len(same) + 2
+    inside = Transitions.of(s[:5], np.zeros((5, 1)), s[:5])
+    assert MODEL.holding(inside) is MODEL
+
+
+@pytest.mark.nightly  # 60 s; reaches are compared by day
+def test_a_spring_is_found_far_beyond_the_reach():
+    """And once the data are near again, as the narrower function that it then is."""
+    data = recorded([Spring("theta", 0.1 * STIFFNESS)], arm=20.0)
+    belief = MODEL.fit(MODEL.init(KEY), data, key=KEY)
+    assert on(belief) == ["theta.position_force"]
+    np.testing.assert_allclose(belief.noise, NOISE, rtol=0.3)
+    draw = belief.sample(KEY)
+    assert MODEL.shared(draw) is draw
+    near = MODEL.fit(belief, recorded([Spring("theta", STIFFNESS)]), key=KEY)
+    assert on(near) == ["theta.position_force"]
+    np.testing.assert_allclose(near.noise, NOISE, rtol=0.3)
+    assert near.system.effects[0].basis == MODEL.forces[0].basis
 
 
 def test_a_draw_is_the_same_with_all_forces(with_spring):

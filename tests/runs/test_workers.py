@@ -7,6 +7,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -81,6 +83,29 @@ def test_no_thread_of_a_worker_leaves_its_core() -> None:
 def test_one_worker_is_this_process() -> None:
     found = dict(spread(square, [[1, 2], [3]], 1))
     assert found == {n: (n**2, os.getpid()) for n in (1, 2, 3)}
+
+
+@jax.jit
+def doubled(x: jax.Array) -> jax.Array:
+    return 2.0 * x
+
+
+def programs(size: int) -> int:
+    """How many there are of `doubled`, with that of one more size."""
+    doubled(jnp.zeros(size))
+    return doubled._cache_size()
+
+
+@pytest.mark.skipif(not workers.MAPS.exists(), reason="Linux limits a process's maps")
+def test_programs_are_forgotten_before_memory_maps_run_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A study of many programs died of it after 43 of its 100 cells."""
+    sizes = [[1, 2, 3]]
+    assert [n for _, n in spread(programs, sizes, 1)] == [1, 2, 3]
+    doubled.clear_cache()
+    monkeypatch.setattr(workers, "MOST", 0)
+    assert [n for _, n in spread(programs, sizes, 1)] == [1, 1, 1]
 
 
 @pytest.mark.parametrize("count", [1, 2])

@@ -8,8 +8,10 @@ the scales (`sim2gp.inference.relevance`): before data all are off. Where inputs
 late (`sim2gp.models.late_inputs`) all stay off.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,10 +31,17 @@ from sim2gp.models.late_inputs import arrive_late
 from sim2gp.models.sim2gp import Sim2GP, Sim2GPBelief, belief_of
 from sim2gp.systems.assemble import free_parts
 from sim2gp.systems.base import AbstractSystem
-from sim2gp.systems.effects.forces import AbstractUnknownFunction, MissingFriction
+from sim2gp.systems.effects.bases import Sign
+from sim2gp.systems.effects.forces import (
+    AbstractUnknownFunction,
+    MissingForce,
+    MissingFriction,
+)
 from sim2gp.systems.effects.missing import missing_forces
 from sim2gp.systems.machine import as_machine
 from sim2gp.types import Action, Dynamics, Key, State, in_float64
+
+FAR = 2.0  # reaches of a channel; functions are constant beyond 2.5 (`bases.REACH`)
 
 
 class MissingForces(AbstractModel):
@@ -40,20 +49,22 @@ class MissingForces(AbstractModel):
 
     ``sim`` gives the prior of its own parameters. ``reach`` gives half-widths of where
     the machine moves, for some channels by name (`Encoding.of`, whose errors it
-    raises). A belief is about the machine with the forces that are on: one that is off
-    costs nothing.
+    raises); a fit doubles those that its data leave. A belief is about the machine with
+    the forces that are on: one that is off costs nothing.
     """
 
     plain: Sim2GP
     sim: Sim2GP
     wide: Sim2GP
     forces: tuple[AbstractUnknownFunction, ...]
+    reach: tuple[tuple[str, float], ...] = eqx.field(static=True)
 
     @in_float64
     def __init__(
         self, sim: Sim2GP, *, reach: Mapping[str, float] | None = None
     ) -> None:
         box = Encoding.of(sim.system, reach or {}).box()
+        self.reach = tuple((reach or {}).items())
         self.plain = sim
         self.forces = self._functions(box)
         self.sim = self._with(self.forces)
@@ -101,7 +112,11 @@ class MissingForces(AbstractModel):
         `NotConverged`, `NotFinite` or `DeadParameters`.
         """
         assert isinstance(belief, Sim2GPBelief)
+        model = self.holding(data)
+        if model is not self:
+            return model.fit(belief, data, key=key)
         rows = jax.tree.map(jnp.asarray, data)
+        belief = belief if self._has(belief.system) else self.init(key)
         if not _has_friction(belief.system):
             belief = self._fitted(self.wide, belief, rows, key)
         if _has_friction(belief.system):
@@ -138,13 +153,39 @@ class MissingForces(AbstractModel):
     def shared(self, draw: Dynamics) -> Dynamics:
         """The draw as one of the machine with all forces: those that are off are zero.
 
-        Slower, but all sets of forces are two programs, with friction and without.
+        Slower, but all sets of forces are two programs, with friction and without. One
+        whose forces have another range stays as it is.
         """
         assert isinstance(draw, LinearizedDraw)
+        if not self._has(draw.system):
+            return draw
         sim = self.sim if _has_friction(draw.system) else self.wide
         at, mean = self._places(draw.system), sim.prior.mean.astype(jnp.float32)
         delta = jnp.zeros_like(mean).at[at].set(draw.delta)
         return LinearizedDraw(sim.system, mean.at[at].set(draw.tt), delta, draw.dt)
+
+    def holding(self, data: Transitions) -> "MissingForces":
+        """Itself, or with reaches doubled until none of the data are far beyond them.
+
+        A function is constant there: a spring would have to be noise.
+        """
+        given, system = dict(self.reach), self.plain.system
+        box = Encoding.of(system, given).box()
+        outer = np.max(np.abs(data.held[0]), axis=0, initial=0.0)
+        wider = {}
+        for channel, x in zip(system.states, outer.tolist(), strict=False):
+            half = max(map(abs, box[channel.name]))
+            if x > FAR * half and not channel.turns:
+                twice = math.ceil(math.log2(x / (FAR * half)))
+                wider[channel.name] = half * 2.0**twice
+        return type(self)(self.plain, reach=given | wider) if wider else self
+
+    def _has(self, system: AbstractSystem) -> bool:
+        """Whether a machine's functions have the ranges of these."""
+        ours = {f.name: f.basis for f in self.forces}
+        on = [e for e in as_machine(system).effects if e.name in ours]
+        bases = [(e.basis, ours[e.name]) for e in on if isinstance(e, MissingForce)]
+        return all(isinstance(x, Sign) or x == y for x, y in bases)
 
     def _prior(self) -> ParameterPrior:
         """With all forces at the scale of their own prior."""

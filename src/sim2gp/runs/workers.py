@@ -12,7 +12,10 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from itertools import chain, cycle
+from pathlib import Path
 from typing import Any, TypeVar
+
+import jax
 
 from sim2gp import cleanup, errors
 from sim2gp.errors import Sim2GPError, error
@@ -20,6 +23,9 @@ from sim2gp.errors import Sim2GPError, error
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 PATIENCE = 1.0  # s between looks at whether the processes still live
+#: Memory maps of a process, of the 65,530 that Linux gives it: each compiled program
+#: takes several, and without any left the process dies.
+MAPS, MOST = Path("/proc/self/maps"), 20_000
 
 
 def cores() -> int:
@@ -42,6 +48,7 @@ def spread(
         for group in groups:
             for job in group:
                 yield job, work(job)
+                _forget_programs()
         return
     context = multiprocessing.get_context("spawn")
     jobs, results = context.Queue(), context.Queue()
@@ -144,10 +151,17 @@ def _serve(work: Callable[[Any], Any], jobs: Any, results: Any) -> None:
         for number, job in enumerate(group, first):
             try:
                 results.put((number, work(job), None))
+                _forget_programs()
             except Sim2GPError as caught:
                 failure = type(caught).__name__, caught.arguments
                 results.put((number, None, failure))
                 return
+
+
+def _forget_programs() -> None:
+    """Give their memory maps back, once there are many."""
+    if MAPS.exists() and MAPS.read_bytes().count(b"\n") > MOST:
+        jax.clear_caches()
 
 
 def _follow() -> None:

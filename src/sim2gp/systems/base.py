@@ -75,6 +75,11 @@ class Channel:
         where = f"limits of {self.name}"
         checks.bounds(where, self.low, self.high, unbounded=True, empty=True)
 
+    @property
+    def turns(self) -> bool:
+        """Whether it is an angle that may go round."""
+        return self.angle and not math.isfinite(self.low + self.high)
+
 
 class AbstractSystem(eqx.Module):
     """A machine: how it flows under a constant input, and its one-step map ``step``.

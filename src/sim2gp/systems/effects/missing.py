@@ -1,6 +1,5 @@
 """What any machine may lack: forces on each joint, and changes of each input."""
 
-import math
 from collections.abc import Mapping
 
 from sim2gp.systems.base import LONGEST_MEAN, AbstractSystem
@@ -55,8 +54,7 @@ def missing_forces(
     found: list[AbstractUnknownFunction] = []
     for name, drive in drives(plant).items():
         joint = joint_of(plant, name)
-        turns = joint.angle and not math.isfinite(joint.low + joint.high)
-        at = periodic(HARMONICS) if turns else smooth(*box[name])
+        at = periodic(HARMONICS) if joint.turns else smooth(*box[name])
         by_speed = smooth(*box[f"{name}.velocity"])
         sign = Sign(WIDTH * drive.acceleration * step)
         if fine and joint.angle:
@@ -65,7 +63,7 @@ def missing_forces(
             )
         if closely:
             found += _details(name, drive.force, box)
-            if turns:
+            if joint.turns:
                 long = smooth(*box[name])
                 found.append(
                     MissingForce(name, drive.force, long, what="pull.position_force")
