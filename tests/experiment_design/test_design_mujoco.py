@@ -82,6 +82,7 @@ def test_worth_is_that_of_the_definition() -> None:
     np.testing.assert_allclose(ahead, expected, rtol=0.0, atol=1e-6 * size)
 
 
+@pytest.mark.nightly  # 7 s; of a bundled machine by day
 def test_forces_that_its_motion_shows() -> None:
     """Counted by the engine's own slopes: of a motion, and at rest."""
     experiment = experiment_with()

@@ -56,6 +56,7 @@ def test_friction_that_the_model_lacks_is_found_and_the_truth_is_inside() -> Non
     assert np.all(np.abs(curve.mean - expected)[fast] < 2.5 * curve.sd[fast])
 
 
+@pytest.mark.nightly  # 7 s; missing friction is found by day
 @in_float64
 def test_a_fit_has_a_free_force_on_the_host() -> None:
     """Its prior is as wide as it says: the host keeps the scale."""

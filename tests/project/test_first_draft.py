@@ -191,6 +191,7 @@ def test_an_input_without_a_column_is_a_number(tmp_path: Path, capsys: Any) -> N
         load_project(out).load_logs()
 
 
+@pytest.mark.nightly  # 7 s
 def test_a_mesh_behind_a_link_and_the_root(tmp_path: Path, capsys: Any) -> None:
     stored, folder = tmp_path / "stored", tmp_path / "model"
     stored.mkdir()
@@ -211,6 +212,7 @@ def test_a_mesh_behind_a_link_and_the_root(tmp_path: Path, capsys: Any) -> None:
     assert load_project(tmp_path / "arm.toml").spec.options == {"root": "."}
 
 
+@pytest.mark.nightly  # 8 s; other commands are interrupted by day
 def test_ctrl_c_ends_init_while_it_tries_readings(tmp_path: Path) -> None:
     """Of a six-axis arm without stops: the most readings that a draft tries."""
     arm_and_log(tmp_path, LINKS, limited=False, seconds=10.0)

@@ -234,6 +234,7 @@ trees = st.recursive(
 
 
 @given(st.dictionaries(st.text(), trees))
+@settings(max_examples=settings.default.max_examples // 4)
 def test_json_round_trip(tree: dict[str, Any]) -> None:
     assert json.loads(to_json(tree)) == tree
 
