@@ -143,9 +143,9 @@ def test_of_the_simulator_alone_the_forces_are_averaged(with_spring):
 
 
 def test_reaches_grow_until_functions_hold_the_data():
-    """By doubling, of channels that do not turn; two reaches are within a function."""
+    """By doubling, of channels that do not turn, where data are far beyond."""
     s = np.zeros((40, 4))
-    s[7] = [8.1, 90.0, 29.0, -51.0]
+    s[7] = [7.9, 90.0, 18.0, -49.0]
     model = MODEL.holding(Transitions.of(s, np.zeros((40, 1)), s))
     wider = {"theta": 8.0, "alpha.velocity": 50.0}
     assert dict(model.reach) == REACH | wider

@@ -41,7 +41,7 @@ from sim2gp.systems.effects.missing import missing_forces
 from sim2gp.systems.machine import as_machine
 from sim2gp.types import Action, Dynamics, Key, State, in_float64
 
-FAR = 2.0  # reaches of a channel; functions are constant beyond 2.5 (`bases.REACH`)
+FAR = 1.25  # reaches of a channel: a function is accurate within about one
 
 
 class MissingForces(AbstractModel):
@@ -165,9 +165,9 @@ class MissingForces(AbstractModel):
         return LinearizedDraw(sim.system, mean.at[at].set(draw.tt), delta, draw.dt)
 
     def holding(self, data: Transitions) -> "MissingForces":
-        """Itself, or with reaches doubled until none of the data are far beyond them.
+        """Itself, or with reaches doubled until the data are within them.
 
-        A function is constant there: a spring would have to be noise.
+        Far beyond its reach a function is constant: a spring would have to be noise.
         """
         given, system = dict(self.reach), self.plain.system
         box = Encoding.of(system, given).box()
@@ -176,8 +176,7 @@ class MissingForces(AbstractModel):
         for channel, x in zip(system.states, outer.tolist(), strict=False):
             half = max(map(abs, box[channel.name]))
             if x > FAR * half and not channel.turns:
-                twice = math.ceil(math.log2(x / (FAR * half)))
-                wider[channel.name] = half * 2.0**twice
+                wider[channel.name] = half * 2.0 ** math.ceil(math.log2(x / half))
         return type(self)(self.plain, reach=given | wider) if wider else self
 
     def _has(self, system: AbstractSystem) -> bool:
