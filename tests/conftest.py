@@ -61,7 +61,8 @@ hypothesis.settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "unit"))
 
 
 #: Resident bytes above which a file of tests leaves no compiled code to the next one.
-#: A program of one operation keeps 1.4 MB, a file of tests at most 1.3 GB.
+#: A program of one operation keeps 1.4 MB, a file of tests at most 1.3 GB. All of them
+#: in two processes: at most 1.8 GiB in each.
 MUCH = 1000 * 2**20
 #: Linux: pages of this process, in all and resident.
 PAGES = Path("/proc/self/statm")

@@ -104,3 +104,18 @@ _SOLVE = {
     for lower in (False, True)
     for transposed in (False, True)
 }
+
+
+def sine_to(
+    others: Float[np.ndarray, "k p"], column: Float[np.ndarray, " k"]
+) -> tuple[float, Float[np.ndarray, " p"]]:
+    """Sine of a column's angle to the others' span, and their shares of it.
+
+    All at unit length; zeros for a column that is nothing.
+    """
+    length = np.linalg.norm(column)
+    if length == 0.0:
+        return 0.0, np.zeros(others.shape[1])
+    size = np.maximum(np.linalg.norm(others, axis=0), 1e-300)
+    share, *_ = np.linalg.lstsq(others / size, column / length, rcond=1e-10)
+    return float(np.linalg.norm(column / length - others / size @ share)), share

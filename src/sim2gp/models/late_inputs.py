@@ -12,6 +12,7 @@ from scipy.special import fdtrc
 from sim2gp.data.one_step import OneStepLikelihood, compiled_rows
 from sim2gp.data.transitions import earlier_inputs, episode_numbers
 from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.linalg import sine_to
 
 LEVEL = 1e-4
 #: Of a channel's residual variance, by earlier inputs: .15 to .5 under delays of 10 to
@@ -43,16 +44,10 @@ def _explain(
     level: float,
 ) -> bool:
     """Whether further columns take a share of a channel's squares, beyond chance."""
-    less, more = (_left(r, A) for A in (J, np.concatenate([J, past], axis=1)))
+    both = np.concatenate([J, past], axis=1)
+    less, more = (r @ r * sine_to(A, r)[0] ** 2 for A in (J, both))
     q, rest = past.shape[1], len(r) - J.shape[1] - past.shape[1]
     if rest < 1 or not less > 0.0:
         return False
     ratio = (less - more) / q / (more / rest)
     return bool(less - more > SHARE * less and fdtrc(q, rest, ratio) < level)
-
-
-def _left(r: Float[np.ndarray, " N"], A: Float[np.ndarray, "N p"]) -> float:
-    """The sum of squares that columns leave."""
-    size = np.linalg.norm(A, axis=0)
-    A = A / np.where(size > 0.0, size, 1.0)
-    return float(np.sum((r - A @ np.linalg.lstsq(A, r)[0]) ** 2))

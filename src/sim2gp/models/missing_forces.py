@@ -116,7 +116,7 @@ class MissingForces(AbstractModel):
         if model is not self:
             return model.fit(belief, data, key=key)
         rows = jax.tree.map(jnp.asarray, data)
-        belief = belief if self._has(belief.system) else self.init(key)
+        belief = belief if self._same_ranges(belief.system) else self.init(key)
         if not _has_friction(belief.system):
             belief = self._fitted(self.wide, belief, rows, key)
         if _has_friction(belief.system):
@@ -157,7 +157,7 @@ class MissingForces(AbstractModel):
         whose forces have another range stays as it is.
         """
         assert isinstance(draw, LinearizedDraw)
-        if not self._has(draw.system):
+        if not self._same_ranges(draw.system):
             return draw
         sim = self.sim if _has_friction(draw.system) else self.wide
         at, mean = self._places(draw.system), sim.prior.mean.astype(jnp.float32)
@@ -179,12 +179,14 @@ class MissingForces(AbstractModel):
                 wider[channel.name] = half * 2.0 ** math.ceil(math.log2(x / half))
         return type(self)(self.plain, reach=given | wider) if wider else self
 
-    def _has(self, system: AbstractSystem) -> bool:
+    def _same_ranges(self, system: AbstractSystem) -> bool:
         """Whether a machine's functions have the ranges of these."""
         ours = {f.name: f.basis for f in self.forces}
-        on = [e for e in as_machine(system).effects if e.name in ours]
-        bases = [(e.basis, ours[e.name]) for e in on if isinstance(e, MissingForce)]
-        return all(isinstance(x, Sign) or x == y for x, y in bases)
+        forces = [e for e in as_machine(system).effects if isinstance(e, MissingForce)]
+        of_range = [
+            e for e in forces if e.name in ours and not isinstance(e.basis, Sign)
+        ]
+        return all(e.basis == ours[e.name] for e in of_range)
 
     def _prior(self) -> ParameterPrior:
         """With all forces at the scale of their own prior."""

@@ -31,7 +31,7 @@ from sim2gp.inference.estimate import Estimate, estimate
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.least_squares import prior_rows
 from sim2gp.inference.likelihood import AbstractLikelihood
-from sim2gp.inference.linalg import triangular
+from sim2gp.inference.linalg import sine_to, triangular
 from sim2gp.inference.linear_likelihood import LinearLikelihood
 from sim2gp.inference.prior import AbstractPrior
 from sim2gp.systems.assemble import free_parts
@@ -190,21 +190,6 @@ def _alias(blocks: np.ndarray, bare: Estimate) -> tuple[float, list[int]]:
     sine, share = sine_to(R[:, :-1], R[:, -1])
     order = np.argsort(-np.abs(share))
     return sine, [int(j) for j in order[:3] if abs(share[j]) > SHARED]
-
-
-def sine_to(
-    others: Float[np.ndarray, "k p"], column: Float[np.ndarray, " k"]
-) -> tuple[float, Float[np.ndarray, " p"]]:
-    """Sine of a column's angle to the others' span, and their shares of it.
-
-    All at unit length; zeros for a column that is nothing.
-    """
-    length = np.linalg.norm(column)
-    if length == 0.0:
-        return 0.0, np.zeros(others.shape[1])
-    size = np.maximum(np.linalg.norm(others, axis=0), 1e-300)
-    share, *_ = np.linalg.lstsq(others / size, column / length, rcond=1e-10)
-    return float(np.linalg.norm(column / length - others / size @ share)), share
 
 
 def sandwich_inflation(
