@@ -11,7 +11,7 @@ import numpy as np
 
 from sim2gp.systems import AbstractSystem, MuJoCo, UniformRodArm
 from sim2gp.systems.assemble import with_parts
-from sim2gp.systems.effects.bases import Sign, Sines
+from sim2gp.systems.effects.bases import Harmonics, Sign
 from sim2gp.systems.effects.forces import MissingForce
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ def knowing_arm(condition: "Condition") -> AbstractSystem:
     from interval_arms import TURNS
 
     forces = [
-        MissingForce(q, 0.05, Sines(TURNS, (1.0,)), what="cogging")
+        MissingForce(q, 0.05, Harmonics((1.0,), frequency=TURNS), what="cogging")
         if condition.cogging
         else MissingForce(
             q, 0.05, Sign(condition.width), of_velocity=True, what="dry_friction"

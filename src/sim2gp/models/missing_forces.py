@@ -10,6 +10,7 @@ late (`sim2gp.models.late_inputs`) all stay off.
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -31,10 +32,9 @@ from sim2gp.models.late_inputs import arrive_late
 from sim2gp.models.sim2gp import Sim2GP, Sim2GPBelief, belief_of
 from sim2gp.systems.assemble import free_parts
 from sim2gp.systems.base import AbstractSystem
-from sim2gp.systems.effects.bases import Sign
+from sim2gp.systems.effects.bases import AbstractSines
 from sim2gp.systems.effects.forces import (
     AbstractUnknownFunction,
-    MissingForce,
     MissingFriction,
 )
 from sim2gp.systems.effects.missing import missing_forces
@@ -153,16 +153,18 @@ class MissingForces(AbstractModel):
     def shared(self, draw: Dynamics) -> Dynamics:
         """The draw as one of the machine with all forces: those that are off are zero.
 
-        Slower, but all sets of forces are two programs, with friction and without. One
-        whose forces have another range stays as it is.
+        Slower, but all sets of forces are two programs, with friction and without.
         """
         assert isinstance(draw, LinearizedDraw)
-        if not self._same_ranges(draw.system):
-            return draw
         sim = self.sim if _has_friction(draw.system) else self.wide
+        own = {e.name: e for e in as_machine(draw.system).effects}
+        effects = tuple(own.get(e.name, e) for e in as_machine(sim.system).effects)
+        system = replace(
+            as_machine(sim.system), effects=effects
+        )  # ranges may be others
         at, mean = self._places(draw.system), sim.prior.mean.astype(jnp.float32)
         delta = jnp.zeros_like(mean).at[at].set(draw.delta)
-        return LinearizedDraw(sim.system, mean.at[at].set(draw.tt), delta, draw.dt)
+        return LinearizedDraw(system, mean.at[at].set(draw.tt), delta, draw.dt)
 
     def holding(self, data: Transitions) -> "MissingForces":
         """Itself, or with reaches doubled until the data are within them.
@@ -182,11 +184,16 @@ class MissingForces(AbstractModel):
     def _same_ranges(self, system: AbstractSystem) -> bool:
         """Whether a machine's functions have the ranges of these."""
         ours = {f.name: f.basis for f in self.forces}
-        forces = [e for e in as_machine(system).effects if isinstance(e, MissingForce)]
-        of_range = [
-            e for e in forces if e.name in ours and not isinstance(e.basis, Sign)
+        pairs = [
+            (f.basis, ours[f.name])
+            for f in as_machine(system).effects
+            if isinstance(f, AbstractUnknownFunction) and f.name in ours
         ]
-        return all(e.basis == ours[e.name] for e in of_range)
+        return all(
+            float(x.start) == float(y.start) and float(x.span) == float(y.span)
+            for x, y in pairs
+            if isinstance(x, AbstractSines) and isinstance(y, AbstractSines)
+        )
 
     def _prior(self) -> ParameterPrior:
         """With all forces at the scale of their own prior."""

@@ -10,11 +10,12 @@ On an interval these are the reduced-rank features of a squared-exponential kern
 """
 
 import math
-from dataclasses import dataclass
 from typing import ClassVar
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from equinox import AbstractVar
 from jaxtyping import Array, Float
 
 from sim2gp.inference.linalg import library
@@ -29,64 +30,115 @@ SHAPE_SD = 0.6  # of the logarithms of a dead zone's width and of this softness
 
 #: One value, or a batch of them in NumPy.
 Points = Float[AnyArray, "*b"]
+Number = float | Float[AnyArray, ""]
 
 
-@dataclass(frozen=True)
-class Sines:
-    """``sin(k w (z - start))``, ``k = 1..count``, on ``span``; constant beyond it.
+class AbstractSines(eqx.Module):
+    """``sin(k pi (z - start) / span)``, ``k = 1..count``; zero beyond both ends.
 
-    With ``cosines`` those too, after the sines. ``sds`` are those of the weights of a
-    function whose own sd is one. Of NumPy arrays, points may come in batches.
+    ``sds`` are those of the weights of a function whose own sd is one. Of NumPy arrays,
+    points may come in batches.
     """
 
-    frequency: float
-    sds: tuple[float, ...]
-    start: float = 0.0
-    span: float = math.inf
-    cosines: bool = False
+    start: AbstractVar[Number]
+    span: AbstractVar[Number]
+    sds: AbstractVar[tuple[float, ...]]
 
     def value(self, x: Float[AnyArray, "k *b"], z: Points) -> Points:
         """The function with weights ``x``."""
         xp, (angle, _) = library(z), self._angle(z)
-        sine, cosine = xp.sin(angle), xp.cos(angle)
-        if not self.cosines:
-            return sine * _clenshaw(x, cosine)[0]
-        half = len(self.sds) // 2
-        first, second = _clenshaw(x[half:], cosine)
-        return sine * _clenshaw(x[:half], cosine)[0] + cosine * first - second
+        return xp.sin(angle) * _clenshaw(x, xp.cos(angle))[0]
 
     def slope(self, x: Float[AnyArray, "k *b"], z: Points) -> Points:
         """Its derivative."""
         xp, (angle, rate) = library(z), self._angle(z)
-        sine, cosine = xp.sin(angle), xp.cos(angle)
-        half = len(self.sds) // 2 if self.cosines else len(self.sds)
-        k = np.arange(1, half + 1)
-        first, second = _clenshaw((x[:half].T * k.astype(x.dtype)).T, cosine)
-        slope = cosine * first - second
-        if self.cosines:
-            others = (x[half:].T * k.astype(x.dtype)).T
-            slope = slope - sine * _clenshaw(others, cosine)[0]
-        return rate * slope
+        cosine = xp.cos(angle)
+        first, second = _clenshaw(_times_order(x), cosine)
+        return rate * (cosine * first - second)
 
     def features(self, z: Float[AnyArray, "*b"]) -> Float[AnyArray, "*b k"]:
         """Its values for each weight alone."""
         xp, (angle, _) = library(z), self._angle(z)
         sine, cosine = xp.sin(angle), xp.cos(angle)
-        half = len(self.sds) // 2 if self.cosines else len(self.sds)
-        found = _multiples(xp.zeros_like(sine), sine, cosine, half)
-        if self.cosines:
-            found += _multiples(xp.ones_like(cosine), cosine, cosine, half)
-        return xp.stack(found, axis=-1)
+        none = xp.zeros_like(sine)
+        return xp.stack(_multiples(none, sine, cosine, len(self.sds)), axis=-1)
 
     def _angle(self, z: Points) -> tuple[Points, AnyArray]:
-        """``w (z - start)``, and its derivative."""
-        xp, end = library(z), self.start + self.span
-        w = xp.asarray(self.frequency, z.dtype)
-        if not math.isfinite(end):
-            return w * (z - self.start), w
-        inside = (z > self.start) & (z < end)
-        angle = w * (xp.clip(z, self.start, end) - self.start)
-        return angle, xp.where(inside, w, xp.zeros_like(w))
+        """``pi (z - start) / span``, held beyond the ends, and its derivative."""
+        xp = library(z)
+        start, span = (xp.asarray(x, z.dtype) for x in (self.start, self.span))
+        along, w = z - start, math.pi / span
+        inside = (along > 0.0) & (along < span)
+        return w * xp.clip(along, 0.0, span), xp.where(inside, w, xp.zeros_like(w))
+
+
+class Sines(AbstractSines):
+    """Their ends are inputs of a compiled program, which serves other ends as well."""
+
+    start: Float[AnyArray, ""]
+    span: Float[AnyArray, ""]
+    sds: tuple[float, ...] = eqx.field(static=True)
+
+
+class FixedSines(AbstractSines):
+    """Their ends are part of a compiled program: an engine on the host needs numbers
+    while JAX traces."""
+
+    start: float = eqx.field(static=True)
+    span: float = eqx.field(static=True)
+    sds: tuple[float, ...] = eqx.field(static=True)
+
+
+class Harmonics(eqx.Module):
+    """``sin(k w z)`` and ``cos(k w z)``, ``k = 1, 2, ...``: of an angle, say.
+
+    ``sines`` and ``cosines`` are sds of their weights: as many of each, or no cosines.
+    """
+
+    sines: tuple[float, ...] = eqx.field(static=True)
+    cosines: tuple[float, ...] = eqx.field(static=True, default=())
+    frequency: float = eqx.field(static=True, default=1.0)
+
+    @property
+    def sds(self) -> tuple[float, ...]:
+        """Those of all weights."""
+        return self.sines + self.cosines
+
+    def value(self, x: Float[AnyArray, "k *b"], z: Points) -> Points:
+        """The function with weights ``x``."""
+        xp, half = library(z), len(self.sines)
+        sine, cosine = xp.sin(self.frequency * z), xp.cos(self.frequency * z)
+        found: Points = sine * _clenshaw(x[:half], cosine)[0]
+        if self.cosines:
+            first, second = _clenshaw(x[half:], cosine)
+            found = found + cosine * first - second
+        return found
+
+    def slope(self, x: Float[AnyArray, "k *b"], z: Points) -> Points:
+        """Its derivative."""
+        xp, half = library(z), len(self.sines)
+        sine, cosine = xp.sin(self.frequency * z), xp.cos(self.frequency * z)
+        first, second = _clenshaw(_times_order(x[:half]), cosine)
+        slope = cosine * first - second
+        if self.cosines:
+            slope = slope - sine * _clenshaw(_times_order(x[half:]), cosine)[0]
+        return self.frequency * slope
+
+    def features(self, z: Float[AnyArray, "*b"]) -> Float[AnyArray, "*b k"]:
+        """Its values for each weight alone."""
+        xp = library(z)
+        sine, cosine = xp.sin(self.frequency * z), xp.cos(self.frequency * z)
+        found = _multiples(xp.zeros_like(sine), sine, cosine, len(self.sines))
+        if self.cosines:
+            one = xp.ones_like(cosine)
+            found += _multiples(one, cosine, cosine, len(self.cosines))
+        return xp.stack(found, axis=-1)
+
+
+def _times_order(x: Float[AnyArray, "k *b"]) -> Float[AnyArray, "k *b"]:
+    """Weight ``k`` times ``k``, counted from one."""
+    k = np.arange(1, len(x) + 1).astype(x.dtype)
+    return (x.T * k).T
 
 
 def _clenshaw(x: Float[AnyArray, "k *b"], cosine: Points) -> tuple[Points, Points]:
@@ -120,37 +172,41 @@ def smooth(
     count: int = COUNT,
     reach: float = REACH,
     length: float = LENGTH,
-) -> Sines:
+    fixed: bool = False,
+) -> AbstractSines:
     """Smooth functions where a machine moves, ``low`` to ``high``, and beyond.
 
     There is room on both sides: functions fall to zero where the data end, not before.
-    ``reach`` and ``length`` (of the kernel) are in half-widths.
+    ``reach`` and ``length`` (of the kernel) are in half-widths. ``fixed`` are
+    `FixedSines`.
     """
     half = 0.5 * (high - low)
-    L, l = reach * half, length * half
-    w, top = 0.5 * math.pi / L, math.sqrt(2.0 * math.pi) * l / L
-    variances = [math.exp(-0.5 * (l * k * w) ** 2) for k in range(1, count + 1)]
+    L = reach * half
+    w, top = 0.5 * math.pi * length / reach, math.sqrt(2.0 * math.pi) * length / reach
+    variances = [math.exp(-0.5 * (k * w) ** 2) for k in range(1, count + 1)]
     sds = tuple(math.sqrt(top * v) for v in variances)
-    return Sines(w, sds, 0.5 * (low + high) - L, 2.0 * L)
+    start, span = 0.5 * (low + high) - L, 2.0 * L
+    if fixed:
+        return FixedSines(start, span, sds)
+    return Sines(np.asarray(start), np.asarray(span), sds)
 
 
-def periodic(count: int) -> Sines:
+def periodic(count: int) -> Harmonics:
     """Harmonics of an angle that may turn round."""
     sds = tuple(1.0 / k for k in range(1, count + 1))
-    return Sines(1.0, sds + sds, cosines=True)
+    return Harmonics(sds, sds)
 
 
-def ripple(count: int) -> Sines:
+def ripple(count: int) -> Harmonics:
     """Of an angle, up to so many waves in a turn, each as large: a motor's cogging."""
     sds = (1.0,) * count
-    return Sines(1.0, sds + sds, cosines=True)
+    return Harmonics(sds, sds)
 
 
-@dataclass(frozen=True)
-class Sign:
+class Sign(eqx.Module):
     """Dry friction: against a velocity, smoothed over ``width``."""
 
-    width: float
+    width: float = eqx.field(static=True)
     sds: ClassVar[tuple[float, ...]] = (1.0,)
 
     def value(self, x: Float[AnyArray, "1 *b"], z: Points) -> Points:
@@ -166,16 +222,15 @@ class Sign:
         return x[0] * (library(z).tanh(z / self.width) ** 2 - 1.0) / self.width
 
 
-@dataclass(frozen=True)
-class Gap:
+class Gap(eqx.Module):
     """A dead zone of an unknown width: of all bases only this has shapes to learn.
 
     ``width`` is the width's median, ``softness`` that of the share of the width in
     which it ends; their logarithms have the sd `SHAPE_SD`.
     """
 
-    width: float
-    softness: float = SOFT
+    width: float = eqx.field(static=True)
+    softness: float = eqx.field(static=True, default=SOFT)
     sds: ClassVar[tuple[float, ...]] = (1.0,)
 
     def value(self, x: Float[AnyArray, " 3"], z: Points) -> Points:
@@ -193,4 +248,5 @@ class Gap:
         return jnp.asarray(self.value(x, jnp.asarray(z)))[..., None]
 
 
-Basis = Sines | Sign | Gap
+StateBasis = AbstractSines | Harmonics | Sign
+Basis = StateBasis | Gap

@@ -12,7 +12,6 @@ whose scale ``tau`` the data choose (`sim2gp.inference.relevance`).
 
 import math
 from collections.abc import Mapping
-from functools import partial
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -30,7 +29,7 @@ from sim2gp.systems.effects.base import (
     AbstractInputEffect,
     AbstractJointEffect,
 )
-from sim2gp.systems.effects.bases import SHAPE_SD, Basis, Gap, Sign, Sines
+from sim2gp.systems.effects.bases import SHAPE_SD, Basis, Gap, StateBasis
 from sim2gp.systems.effects.friction_laws import COULOMB_SUBSTEP
 from sim2gp.systems.effects.units import force_unit, velocity_of
 from sim2gp.systems.mechanism import AbstractMechanism, Inertia, Pair
@@ -91,7 +90,7 @@ class MissingForce(AbstractUnknownFunction):
 
     where: str = eqx.field(static=True)
     magnitude: float = eqx.field(static=True)
-    basis: Sines | Sign = eqx.field(static=True)
+    basis: StateBasis
     of_velocity: bool = eqx.field(static=True, default=False)
     what: str = eqx.field(static=True, default="position_force")
     weights: tuple[float, ...] = eqx.field(static=True, default=())
@@ -113,7 +112,7 @@ class MissingInput(AbstractInputEffect, AbstractUnknownFunction):
 
     where: str = eqx.field(static=True)
     magnitude: float = eqx.field(static=True)
-    basis: Basis = eqx.field(static=True)
+    basis: Basis
     what: str = eqx.field(static=True, default="input_force")
     weights: tuple[float, ...] = eqx.field(static=True, default=())
     meaning: ClassVar[str] = "input that is missing"
@@ -129,7 +128,7 @@ class ForceField(eqx.Module):
     It acts on a machine as `AbstractJointForce` does, on all of its joints.
     """
 
-    forces: tuple[MissingForce, ...] = eqx.field(static=True)
+    forces: tuple[MissingForce, ...]
 
     @property
     def values(self) -> dict[str, float]:
@@ -147,12 +146,13 @@ class ForceField(eqx.Module):
         v: Mapping[str, Scalar],
     ) -> dict[str, Scalar]:
         """The force on each joint that has one, at positions and velocities by name."""
-        own = dict(zip(self.forces, _split(self.forces, x), strict=True))
+        each = list(zip(self.forces, _split(self.forces, x), strict=True))
         found = {}
         for name in dict.fromkeys(f.where for f in self.forces):
-            mine = tuple(f for f in self.forces if f.where == name)
-            weights = jnp.concatenate([own[f] for f in mine])
-            found[name] = _force(mine, weights, q[name], v[name])
+            mine = [(f, w) for f, w in each if f.where == name]
+            forces, weights = zip(*mine, strict=True)
+            own = jnp.concatenate(weights)
+            found[name] = _force(own, q[name], v[name], forces=forces)
         return found
 
     def inertia(
@@ -196,9 +196,9 @@ class ForceField(eqx.Module):
         return s
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
+@eqx.filter_custom_jvp
 def _force(
-    forces: tuple[MissingForce, ...], x: Float[AnyArray, " k"], q: Scalar, v: Scalar
+    x: Float[Array, " k"], q: Scalar, v: Scalar, *, forces: tuple[MissingForce, ...]
 ) -> Scalar:
     """The force on one joint. Its derivatives by the state and by each weight are the
     same for every parameter: they are computed once."""
@@ -207,11 +207,11 @@ def _force(
     return sum(each[1:], each[0])
 
 
-@_force.defjvp
+@_force.def_jvp
 def _force_jvp(
-    forces: tuple[MissingForce, ...], primals: tuple, tangents: tuple
+    primals: tuple, tangents: tuple, *, forces: tuple[MissingForce, ...]
 ) -> tuple[Scalar, Scalar]:
-    (x, q, v), (dx, dq, dv) = primals, tangents
+    (x, q, v), (dx, dq, dv) = primals, tangents  # None where nothing moves
     by = {False: jnp.zeros_like(q), True: jnp.zeros_like(q)}
     for f, w in zip(forces, _split(forces, x), strict=True):
         slope = f.basis.slope(w, v if f.of_velocity else q)
@@ -219,10 +219,15 @@ def _force_jvp(
     each = [f.basis.features(v if f.of_velocity else q) for f in forces]
     by_x = jnp.concatenate(each)
     by_x, by_q, by_v = jax.lax.optimization_barrier((by_x, by[False], by[True]))
-    # Inference asks for all weights at once. Planning, in float32, follows one of their
-    # directions, where a product of matrices would end the compiler's fusion.
-    along = jnp.sum(by_x * dx) if dx.dtype == jnp.float32 else by_x @ dx
-    return _force(forces, x, q, v), along + by_q * dq + by_v * dv
+    change = jnp.zeros_like(q)
+    if dx is not None:
+        # Inference asks for all weights at once. Planning, in float32, follows one of
+        # their directions, where a product of matrices would end the compiler's fusion.
+        single = dx.dtype == jnp.float32
+        change = jnp.sum(by_x * dx) if single else by_x @ dx
+    for slope, moved in ((by_q, dq), (by_v, dv)):
+        change = change if moved is None else change + slope * moved
+    return _force(x, q, v, forces=forces), change
 
 
 def _split(

@@ -1,9 +1,11 @@
 """What any machine may lack: forces on each joint, and changes of each input."""
 
 from collections.abc import Mapping
+from functools import partial
 
 from sim2gp.systems.base import LONGEST_MEAN, AbstractSystem
-from sim2gp.systems.effects.bases import Gap, Sign, periodic, ripple, smooth
+from sim2gp.systems.effects import bases
+from sim2gp.systems.effects.bases import Gap, Sign, StateBasis, periodic, ripple
 from sim2gp.systems.effects.forces import (
     AbstractUnknownFunction,
     MissingForce,
@@ -14,7 +16,7 @@ from sim2gp.systems.effects.friction_laws import COULOMB_SUBSTEP
 from sim2gp.systems.effects.scales import drives
 from sim2gp.systems.effects.units import joint_of
 from sim2gp.systems.machine import plant_of
-from sim2gp.systems.mechanism import AbstractMechanism
+from sim2gp.systems.mechanism import AbstractForcedPlant, AbstractMechanism
 
 HARMONICS = 2  # of a joint that may turn round
 RIPPLES = 12  # in a turn, of cogging
@@ -51,6 +53,8 @@ def missing_forces(
     friction = MissingFriction if steep else MissingForce
     # An engine holds a force for its own step, which must not reverse the joint.
     step = plant.own_step or min(plant.max_substep, LONGEST_MEAN, friction.max_substep)
+    smooth = partial(bases.smooth, fixed=isinstance(plant, AbstractForcedPlant))
+    details = partial(smooth, count=DETAILS, reach=DETAIL_REACH, length=DETAIL)
     found: list[AbstractUnknownFunction] = []
     for name, drive in drives(plant).items():
         joint = joint_of(plant, name)
@@ -62,7 +66,8 @@ def missing_forces(
                 MissingForce(name, DRY * drive.force, ripple(RIPPLES), what="ripple")
             )
         if closely:
-            found += _details(name, drive.force, box)
+            by = box[name], box[f"{name}.velocity"]
+            found += _details(name, drive.force, *(details(*ends) for ends in by))
             if joint.turns:
                 long = smooth(*box[name])
                 found.append(
@@ -89,17 +94,13 @@ def missing_forces(
 
 
 def _details(
-    name: str, force: float, box: Mapping[str, tuple[float, float]]
+    name: str, force: float, by_position: StateBasis, by_speed: StateBasis
 ) -> list[AbstractUnknownFunction]:
     """Of a joint, by position and by velocity: a spring's play, a detent, a cusp.
 
     They are of the kind of the smooth force: where that is on, its details may be.
     """
     size = DETAIL_SIZE * force
-    by_position, by_speed = (
-        smooth(*box[of], count=DETAILS, reach=DETAIL_REACH, length=DETAIL)
-        for of in (name, f"{name}.velocity")
-    )
     return [
         MissingForce(name, size, by_position, what="detail.position_force"),
         MissingForce(
