@@ -9,6 +9,7 @@ On an interval these are the reduced-rank features of a squared-exponential kern
     S_k      = sqrt(2 pi) l / L exp(-1/2 (l k pi / 2L)^2)
 """
 
+import abc
 import math
 from typing import ClassVar
 
@@ -33,38 +34,77 @@ Points = Float[AnyArray, "*b"]
 Number = float | Float[AnyArray, ""]
 
 
-class AbstractSines(eqx.Module):
-    """``sin(k pi (z - start) / span)``, ``k = 1..count``; zero beyond both ends.
+class AbstractHarmonics(eqx.Module):
+    """``sin(k angle(z))``, then ``cos(k angle(z))``, ``k = 1, 2, ...``
 
-    ``sds`` are those of the weights of a function whose own sd is one. Of NumPy arrays,
-    points may come in batches.
+    ``sines`` and ``cosines`` are the weights' sds for a function whose own sd is one:
+    as many of each, or no cosines. Of NumPy arrays, points may come in batches.
     """
 
-    start: AbstractVar[Number]
-    span: AbstractVar[Number]
-    sds: AbstractVar[tuple[float, ...]]
+    sines: AbstractVar[tuple[float, ...]]
+
+    @property
+    def cosines(self) -> tuple[float, ...]:
+        """None, but of an angle."""
+        return ()
+
+    @abc.abstractmethod
+    def angle(self, z: Points) -> tuple[Points, AnyArray]:
+        """Of a value, and its derivative."""
+
+    @property
+    def sds(self) -> tuple[float, ...]:
+        """Those of all weights."""
+        return self.sines + self.cosines
 
     def value(self, x: Float[AnyArray, "k *b"], z: Points) -> Points:
         """The function with weights ``x``."""
-        xp, (angle, _) = library(z), self._angle(z)
-        return xp.sin(angle) * _clenshaw(x, xp.cos(angle))[0]
+        xp, (angle, _), half = library(z), self.angle(z), len(self.sines)
+        sine, cosine = xp.sin(angle), xp.cos(angle)
+        found: Points = sine * _clenshaw(x[:half], cosine)[0]
+        if self.cosines:
+            first, second = _clenshaw(x[half:], cosine)
+            found = found + cosine * first - second
+        return found
 
     def slope(self, x: Float[AnyArray, "k *b"], z: Points) -> Points:
         """Its derivative."""
-        xp, (angle, rate) = library(z), self._angle(z)
-        cosine = xp.cos(angle)
-        first, second = _clenshaw(_times_order(x), cosine)
-        return rate * (cosine * first - second)
+        xp, (angle, rate), half = library(z), self.angle(z), len(self.sines)
+        sine, cosine = xp.sin(angle), xp.cos(angle)
+        first, second = _clenshaw(_times_order(x[:half]), cosine)
+        slope = cosine * first - second
+        if self.cosines:
+            slope = slope - sine * _clenshaw(_times_order(x[half:]), cosine)[0]
+        return rate * slope
 
     def features(self, z: Float[AnyArray, "*b"]) -> Float[AnyArray, "*b k"]:
         """Its values for each weight alone."""
-        xp, (angle, _) = library(z), self._angle(z)
+        xp, (angle, _) = library(z), self.angle(z)
         sine, cosine = xp.sin(angle), xp.cos(angle)
-        none = xp.zeros_like(sine)
-        return xp.stack(_multiples(none, sine, cosine, len(self.sds)), axis=-1)
+        found = _multiples(xp.zeros_like(sine), sine, cosine, len(self.sines))
+        if self.cosines:
+            found += _multiples(xp.ones_like(sine), cosine, cosine, len(self.cosines))
+        return xp.stack(found, axis=-1)
 
-    def _angle(self, z: Points) -> tuple[Points, AnyArray]:
-        """``pi (z - start) / span``, held beyond the ends, and its derivative."""
+
+class Harmonics(AbstractHarmonics):
+    """Of an angle that turns round; ``frequency`` in a turn."""
+
+    sines: tuple[float, ...] = eqx.field(static=True)
+    cosines: tuple[float, ...] = eqx.field(static=True, default=())
+    frequency: float = eqx.field(static=True, default=1.0)
+
+    def angle(self, z: Points) -> tuple[Points, AnyArray]:
+        return self.frequency * z, library(z).asarray(self.frequency, z.dtype)
+
+
+class AbstractSines(AbstractHarmonics):
+    """``sin(k pi (z - start) / span)``; zero beyond both ends."""
+
+    start: AbstractVar[Number]
+    span: AbstractVar[Number]
+
+    def angle(self, z: Points) -> tuple[Points, AnyArray]:
         xp = library(z)
         start, span = (xp.asarray(x, z.dtype) for x in (self.start, self.span))
         along, w = z - start, math.pi / span
@@ -77,7 +117,7 @@ class Sines(AbstractSines):
 
     start: Float[AnyArray, ""]
     span: Float[AnyArray, ""]
-    sds: tuple[float, ...] = eqx.field(static=True)
+    sines: tuple[float, ...] = eqx.field(static=True)
 
 
 class FixedSines(AbstractSines):
@@ -86,53 +126,7 @@ class FixedSines(AbstractSines):
 
     start: float = eqx.field(static=True)
     span: float = eqx.field(static=True)
-    sds: tuple[float, ...] = eqx.field(static=True)
-
-
-class Harmonics(eqx.Module):
-    """``sin(k w z)`` and ``cos(k w z)``, ``k = 1, 2, ...``: of an angle, say.
-
-    ``sines`` and ``cosines`` are sds of their weights: as many of each, or no cosines.
-    """
-
     sines: tuple[float, ...] = eqx.field(static=True)
-    cosines: tuple[float, ...] = eqx.field(static=True, default=())
-    frequency: float = eqx.field(static=True, default=1.0)
-
-    @property
-    def sds(self) -> tuple[float, ...]:
-        """Those of all weights."""
-        return self.sines + self.cosines
-
-    def value(self, x: Float[AnyArray, "k *b"], z: Points) -> Points:
-        """The function with weights ``x``."""
-        xp, half = library(z), len(self.sines)
-        sine, cosine = xp.sin(self.frequency * z), xp.cos(self.frequency * z)
-        found: Points = sine * _clenshaw(x[:half], cosine)[0]
-        if self.cosines:
-            first, second = _clenshaw(x[half:], cosine)
-            found = found + cosine * first - second
-        return found
-
-    def slope(self, x: Float[AnyArray, "k *b"], z: Points) -> Points:
-        """Its derivative."""
-        xp, half = library(z), len(self.sines)
-        sine, cosine = xp.sin(self.frequency * z), xp.cos(self.frequency * z)
-        first, second = _clenshaw(_times_order(x[:half]), cosine)
-        slope = cosine * first - second
-        if self.cosines:
-            slope = slope - sine * _clenshaw(_times_order(x[half:]), cosine)[0]
-        return self.frequency * slope
-
-    def features(self, z: Float[AnyArray, "*b"]) -> Float[AnyArray, "*b k"]:
-        """Its values for each weight alone."""
-        xp = library(z)
-        sine, cosine = xp.sin(self.frequency * z), xp.cos(self.frequency * z)
-        found = _multiples(xp.zeros_like(sine), sine, cosine, len(self.sines))
-        if self.cosines:
-            one = xp.ones_like(cosine)
-            found += _multiples(one, cosine, cosine, len(self.cosines))
-        return xp.stack(found, axis=-1)
 
 
 def _times_order(x: Float[AnyArray, "k *b"]) -> Float[AnyArray, "k *b"]:
@@ -187,8 +181,8 @@ def smooth(
     sds = tuple(math.sqrt(top * v) for v in variances)
     start, span = 0.5 * (low + high) - L, 2.0 * L
     if fixed:
-        return FixedSines(start, span, sds)
-    return Sines(np.asarray(start), np.asarray(span), sds)
+        return FixedSines(start=start, span=span, sines=sds)
+    return Sines(start=np.asarray(start), span=np.asarray(span), sines=sds)
 
 
 def periodic(count: int) -> Harmonics:
@@ -248,5 +242,5 @@ class Gap(eqx.Module):
         return jnp.asarray(self.value(x, jnp.asarray(z)))[..., None]
 
 
-StateBasis = AbstractSines | Harmonics | Sign
+StateBasis = AbstractHarmonics | Sign
 Basis = StateBasis | Gap

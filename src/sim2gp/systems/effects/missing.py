@@ -60,14 +60,12 @@ def missing_forces(
         joint = joint_of(plant, name)
         at = periodic(HARMONICS) if joint.turns else smooth(*box[name])
         by_speed = smooth(*box[f"{name}.velocity"])
-        sign = Sign(WIDTH * drive.acceleration * step)
+        sign, dry = Sign(WIDTH * drive.acceleration * step), DRY * drive.force
         if fine and joint.angle:
-            found.append(
-                MissingForce(name, DRY * drive.force, ripple(RIPPLES), what="ripple")
-            )
+            found.append(MissingForce(name, dry, ripple(RIPPLES), what="ripple"))
         if closely:
-            by = box[name], box[f"{name}.velocity"]
-            found += _details(name, drive.force, *(details(*ends) for ends in by))
+            by = details(*box[name]), details(*box[f"{name}.velocity"])
+            found += _details(name, drive.force, *by)
             if joint.turns:
                 long = smooth(*box[name])
                 found.append(
@@ -78,9 +76,7 @@ def missing_forces(
             MissingForce(
                 name, drive.force, by_speed, of_velocity=True, what="velocity_force"
             ),
-            friction(
-                name, DRY * drive.force, sign, of_velocity=True, what="dry_friction"
-            ),
+            friction(name, dry, sign, of_velocity=True, what="dry_friction"),
         ]
     for channel in plant.actions:
         low, high = box[channel.name]
