@@ -38,7 +38,7 @@ from sim2gp.systems.effects.friction_laws import COULOMB_SUBSTEP, coulomb
 from sim2gp.systems.effects.units import gravity_of
 from sim2gp.systems.mechanism import AbstractMechanism, Pair
 from sim2gp.systems.parts import AbstractPart
-from sim2gp.types import AnyArray, Key, Scalar
+from sim2gp.types import AnyArray, Scalar
 
 #: Past inputs that a gap depends on, s; a swing crosses it more often.
 REMEMBERED = 0.2
@@ -52,15 +52,14 @@ class AbstractLessForces(MissingForces):
         likelihood: OneStepLikelihood,
         prior: ParameterPrior,
         last: Start,
-        key: Key,
     ) -> Estimate:
         raise NotImplementedError
 
     def _estimate(
-        self, sim: Sim2GP, belief: Sim2GPBelief, rows: Transitions, key: Key
+        self, sim: Sim2GP, belief: Sim2GPBelief, rows: Transitions
     ) -> Estimate:
         likelihood = OneStepLikelihood(sim.system, rows, sim.dt)
-        return self.found(likelihood, self._prior(), self._start(belief), key)
+        return self.found(likelihood, self._prior(), self._start(belief))
 
 
 class WithoutProjection(AbstractLessForces):
@@ -71,7 +70,6 @@ class WithoutProjection(AbstractLessForces):
         likelihood: OneStepLikelihood,
         prior: ParameterPrior,
         last: Start,
-        key: Key,
     ) -> Estimate:
         first = likelihood.first_noise().sd
         z = jnp.where(last.enough, last.z, 0.0)
@@ -89,9 +87,8 @@ class WithoutRelevance(AbstractLessForces):
         likelihood: OneStepLikelihood,
         prior: ParameterPrior,
         last: Start,
-        key: Key,
     ) -> Estimate:
-        z, sd = eqx.filter_jit(projected)(likelihood.thinned(ROWS), prior, key)
+        z, sd = eqx.filter_jit(projected)(likelihood.thinned(ROWS), prior, last.z)
         given = GivenScales(prior)
         noise = Noise(sd, jnp.ones(1))
         return estimate(likelihood, given, starts=z[None], noise=noise)

@@ -1,4 +1,4 @@
-"""Forces of one-step data: their sizes against closed forms, and planted ones."""
+"""Forces that are found: their sizes against closed forms, and planted ones."""
 
 import jax
 import jax.numpy as jnp
@@ -9,15 +9,20 @@ import planted_forces as study
 from sim2gp.data.one_step import OneStepLikelihood
 from sim2gp.data.transitions import Transitions
 from sim2gp.identification.missing_physics.curves import Curve
+from sim2gp.identification.missing_physics.data import FREE
 from sim2gp.identification.missing_physics.forces import (
+    SHARE,
     FoundForces,
+    _of_free_size,
     _with_free_sizes,
     find_forces,
 )
 from sim2gp.inference.estimate import estimate
 from sim2gp.inference.parameters import Parameter, Parameters
 from sim2gp.inference.prior import ParameterPrior
-from sim2gp.systems import ODE, Channel
+from sim2gp.inference.relevance import OFF
+from sim2gp.systems import ODE, Channel, UniformRodArm
+from sim2gp.systems.effects.missing import missing_forces
 
 COUNT, SD = 12, 0.02
 SHAPE = np.random.default_rng(0).normal(size=(400, COUNT)) / 4.0
@@ -85,6 +90,21 @@ def test_a_force_is_as_probable_as_the_functions_it_is_the_sum_of() -> None:
     assert of_all.probability(both[0]) == 0.8
 
 
+def test_other_shapes_of_a_force_are_part_of_its_curve() -> None:
+    """A share of its size: of those of the same joint and variable, and of no other."""
+    plant = UniformRodArm()
+    names = [c.name for c in (*plant.states, *plant.actions)]
+    forces = missing_forces(plant, dict.fromkeys(names, (-1.0, 2.0)), closely=True)
+    scales = np.asarray([0.2 if f.name == "q1.dry_friction" else OFF for f in forces])
+    found = zip(forces, _of_free_size(scales, forces), strict=True)
+    size = {f.name: scale * f.magnitude for f, scale in found}
+    friction = 0.2 * next(f for f in forces if f.name == "q1.dry_friction").magnitude
+    assert size.pop("q1.dry_friction") == pytest.approx(friction / FREE)
+    for name in ("q1.velocity_force", "q1.detail.velocity_force"):
+        assert size.pop(name) == pytest.approx(SHARE * friction)
+    assert max(size.values()) == OFF * max(f.magnitude for f in forces)
+
+
 @pytest.mark.nightly
 def test_a_detent_is_drawn_and_nothing_is_not() -> None:
     """The study in small: a detent on a cart's rail, and a cart without one."""
@@ -94,3 +114,12 @@ def test_a_detent_is_drawn_and_nothing_is_not() -> None:
     assert found["error"] < 0.2 * found["size"]
     data, _, _ = study.data_for(study.Case("cartpole", study.NOTHING, 4))
     assert find_forces(data, data.fit()).found == ()
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(("shape", "index"), [("cable", 1016), ("stribeck", 1010)])
+def test_a_force_on_an_arm_is_within_its_band(shape: str, index: int) -> None:
+    """In windows of a log: a weak cable, and friction of another shape than ours."""
+    found = study.cell(study.Case(study.ARM, shape, index))
+    assert found["named"]
+    assert found["inside"] > 0.9

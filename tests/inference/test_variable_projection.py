@@ -62,13 +62,18 @@ def prior() -> ParameterPrior:
     return ParameterPrior(TABLE.prior(), TABLE)
 
 
-def test_the_best_draw_has_its_weights_and_noise_at_the_profile():
-    """As scipy finds them at the same rate; and the rate is near the true one."""
+def at_rate(rate):
+    """Whitened parameters, the weights at zero."""
+    return prior().gaussian.whitened(TABLE.unconstrain(jnp.asarray([rate, 0.0, 0.0])))
+
+
+def test_a_start_has_its_weights_and_noise_at_the_profile():
+    """As scipy finds them at the same rate: the given one, which explains more."""
     likelihood = waves()
-    start, noise = projected(likelihood, prior(), jax.random.key(0))
+    start, noise = projected(likelihood, prior(), at_rate(RATE + 0.1))
     about = prior().gaussian
     tt = np.asarray(about.at(start))
-    assert float(TABLE.constrain(jnp.asarray(tt))[0]) == pytest.approx(RATE, abs=0.1)
+    assert float(TABLE.constrain(jnp.asarray(tt))[0]) == pytest.approx(RATE + 0.1)
 
     def cost(x):
         z = np.asarray(start).copy()
@@ -86,7 +91,7 @@ def test_the_best_draw_has_its_weights_and_noise_at_the_profile():
 
 def test_a_descent_from_there_finds_what_one_from_the_mean_does_not():
     likelihood, unit = waves(), jnp.ones(1)
-    start, left = projected(likelihood, prior(), jax.random.key(0))
+    start, left = projected(likelihood, prior(), at_rate(RATE + 0.1))
 
     @eqx.filter_jit
     def fit(z, sd):
@@ -97,6 +102,13 @@ def test_a_descent_from_there_finds_what_one_from_the_mean_does_not():
     poor = fit(jnp.zeros((1, 3)), likelihood.first_noise().sd)
     assert float(good.noise.sd[0]) == pytest.approx(NOISE, rel=0.2)
     assert float(good.log_evidence) > float(poor.log_evidence) + 50.0
+
+
+@pytest.mark.parametrize("rate", [0.7, np.nan])
+def test_the_mean_is_better_than_a_start_that_explains_less(rate):
+    start, noise = projected(waves(), prior(), at_rate(rate))
+    assert float(start[0]) == 0.0
+    assert np.isfinite(float(noise[0]))
 
 
 def test_relaxed_weights_are_the_ridge_solution():
@@ -144,10 +156,10 @@ def test_a_shape_is_searched_from_the_parameters_that_are_given():
     about = ParameterPrior(ABRUPT.prior(), ABRUPT)
     true = about.gaussian.whitened(ABRUPT.unconstrain(jnp.asarray([47.0, 0.8, EDGE])))
     also = true.at[1:].set(0.0)
-    start, noise = projected(likelihood, about, jax.random.key(0), also)
+    start, noise = projected(likelihood, about, also)
     assert float(start[0]) == pytest.approx(float(also[0]))
     spacing = float(SHAPES[1] - SHAPES[0])
     assert abs(float(start[2] - true[2])) < 0.51 * spacing
     assert float(start[1]) == pytest.approx(float(true[1]), rel=0.2)
-    alone = projected(likelihood, about, jax.random.key(0))[1]
+    alone = projected(likelihood, about, jnp.zeros(3))[1]
     assert float(noise[0]) < 0.5 * float(alone[0])

@@ -20,7 +20,7 @@ from sim2gp.inference.least_squares import factor
 from sim2gp.inference.likelihood import AbstractLikelihood
 from sim2gp.inference.prior import ParameterPrior
 from sim2gp.systems.base import AbstractSystem
-from sim2gp.types import Key, in_float64
+from sim2gp.types import in_float64
 
 BLOCK = 250  # rows: an episode
 ROWS = 64  # that judge draws of parameters
@@ -109,11 +109,10 @@ def estimate_forces(
     dt: float,
     prior: ParameterPrior,
     last: Start,
-    key: Key,
 ) -> Estimate:
     """Of a machine whose forces are groups of parameters: `estimate_groups`."""
     likelihood = OneStepLikelihood(system, data, dt)
-    return estimate_groups(likelihood, likelihood.thinned(ROWS), prior, last, key)
+    return estimate_groups(likelihood, likelihood.thinned(ROWS), prior, last)
 
 
 def _rms_change(data: Transitions, d: int) -> Float[Array, " d"]:

@@ -78,7 +78,7 @@ class WindowsLikelihood(AbstractLikelihood):
         self,
         tt: Float[Array, " p"],
         e: Float[Array, "W n"],
-        scale: Float[Array, "p p"],
+        scale: Float[Array, "p q"],
     ) -> Blocks:
         n, p = e.shape[1], scale.shape[1]
         if self.on_host and not isinstance(tt, jax.core.Tracer):
@@ -137,12 +137,14 @@ class WindowsLikelihood(AbstractLikelihood):
 
     def first_noise(self) -> Noise:
         """The measurements' sd about each window's mean."""
-        counts, floor = np.asarray(self.counts), np.asarray(self.floor)
-        y, mask = np.asarray(self.windows.y), np.asarray(self.windows.mask)
-        mean = np.where(mask, y, 0.0).sum(axis=1) / np.maximum(counts, 1)
-        squares = np.where(mask, (y - mean[:, None]) ** 2, 0.0).sum(axis=(0, 1))
-        sd = np.sqrt(squares / np.maximum(counts.sum(axis=0), 1)) + floor
-        return Noise(*jax.device_put((sd, np.ones(len(y)))))
+        # Numbers that are known ask for no program.
+        xp = jnp if isinstance(self.counts, jax.core.Tracer) else np
+        windows = self.windows.y, self.windows.mask, self.counts, self.floor
+        y, mask, counts, floor = map(xp.asarray, windows)
+        mean = xp.where(mask, y, 0.0).sum(axis=1) / xp.maximum(counts, 1)
+        squares = xp.where(mask, (y - mean[:, None]) ** 2, 0.0).sum(axis=(0, 1))
+        sd = xp.sqrt(squares / xp.maximum(counts.sum(axis=0), 1)) + floor
+        return Noise(*jax.device_put((sd, xp.ones(len(y)))))
 
 
 def _residual(

@@ -3,7 +3,7 @@
 The model is linear in the groups, as functions of unknown shape are in their weights.
 Where they explain much, a descent from the prior's mean ends at parameters that explain
 little with much noise. Fits start where all groups are off, and from the best of that
-fit's parameters and draws of others, for which the groups are solved linearly
+fit's parameters and the prior's mean, for which the groups are solved linearly
 (`sim2gp.inference.variable_projection`), with the noise that is left there.
 """
 
@@ -22,7 +22,6 @@ from sim2gp.inference.likelihood import AbstractLikelihood
 from sim2gp.inference.prior import ParameterPrior
 from sim2gp.inference.relevance import OFF
 from sim2gp.inference.variable_projection import projected
-from sim2gp.types import Key
 
 BROAD = 3.0  # scale of every group in a first descent
 SAME = 1.2  # times the last noise: the last fit still explains the data
@@ -48,12 +47,11 @@ def estimate_groups(
     some: AbstractLikelihood,
     prior: ParameterPrior,
     last: Start,
-    key: Key,
 ) -> Estimate:
     """From the last fit; where that no longer explains the data, the fit of highest
     evidence with all groups off, and from projected parameters.
 
-    Draws are judged by ``some`` of the data. What did not converge is reported by
+    Starts are judged by ``some`` of the data. What did not converge is reported by
     `Convergence.check`.
     """
     prior = prior.scaled(jnp.full(len(prior.scales), BROAD))
@@ -64,12 +62,13 @@ def estimate_groups(
     each = fitted, plain, Start(off, first, prior.scales, no, True)
 
     def descend(start: Start, before: Array) -> Estimate:
-        def best_draw() -> tuple[Array, Array]:
-            return projected(some, prior, key, before)
-
-        given = lambda: (start.z, start.noise)  # noqa: E731
-        z, sd = jax.lax.cond(start.project, best_draw, given)
-        noise, about = Noise(sd, jnp.ones(1)), prior.scaled(start.scales)
+        z, sd = jax.lax.cond(
+            start.project,
+            lambda: projected(some, prior, before),
+            lambda: (start.z, start.noise),
+        )
+        noise = Noise(sd, likelihood.first_noise().weights)
+        about = prior.scaled(start.scales)
         return estimate(likelihood, about, starts=z[None], noise=noise)
 
     def skip(start: Start, before: Array) -> Estimate:

@@ -1,13 +1,12 @@
 """Starts of a fit whose model is linear in many of its parameters.
 
-At a draw of the other parameters the linear ones are solved for, and the noise with
-them (Golub and Pereyra 1973, SIAM Journal on Numerical Analysis 10):
+The linear ones are solved for, and the noise with them, the others held (Golub and
+Pereyra 1973, SIAM Journal on Numerical Analysis 10):
 
     w = argmin sum_c N_c log s_c(w) + 1/2 ||w||^2,    s_c^2 = mean ||r_c + J_c w||^2
 
-The draw that leaves least is where a descent may begin, with the noise that is left. A
-descent does not find a shape that turns suddenly, as the width of a dead zone: it is
-tried over its prior's range, the others held.
+A descent may begin there, with the noise that is left. It does not find a shape that
+turns suddenly, as the width of a dead zone: that is tried over its prior's range.
 """
 
 import jax
@@ -18,32 +17,23 @@ from jaxtyping import Array, Float
 
 from sim2gp.inference.likelihood import AbstractLikelihood
 from sim2gp.inference.prior import ParameterPrior
-from sim2gp.types import Key
 
 ROUNDS = 15  # of weights given noise, and noise given weights
-#: Of each shape, in prior sds, and of draws so many times as many.
-SHAPES = np.linspace(-2.0, 2.0, 24)
-DRAWS = 2
+SHAPES = np.linspace(-2.0, 2.0, 24)  # tried of each shape, in prior sds
 
 
 def projected(
     likelihood: AbstractLikelihood,
     prior: ParameterPrior,
-    key: Key,
-    also: Float[Array, " p"] | None = None,
+    also: Float[Array, " p"],
 ) -> tuple[Float[Array, " p"], Float[Array, " c"]]:
-    """The best of some draws: a whitened start, and the noise sd there.
+    """A whitened start with its weights of groups, and the noise sd that they leave.
 
-    Linear are the weights of groups. The first draw is the prior's mean, the second
-    ``also`` (whitened). Each shape of a function is then searched along its own axis.
+    The better of the prior's mean and ``also`` (whitened), for which the weights are
+    solved; then each shape of a function in turn, searched along its own axis.
     """
     places, about = np.asarray(prior.linear), prior.gaussian
     p, shapes = about.mean.size, np.flatnonzero([p.shape for p in prior.table.free])
-    z = jax.random.normal(key, (DRAWS + len(shapes), len(SHAPES), p))
-    z = z.at[0, 0].set(0.0)
-    z = z if also is None else z.at[0, 1].set(also)
-    axes = np.zeros((len(z), p))
-    axes[np.arange(DRAWS, len(z)), shapes] = 1.0
     counts, first = likelihood.counts, likelihood.first_noise()
     N, e = jnp.sum(counts, axis=0), jnp.zeros((len(counts), likelihood.n_nuisances))
     n = likelihood.n_nuisances
@@ -66,17 +56,22 @@ def projected(
         cost = 0.5 * (N @ jnp.log(s2) + w @ w + z @ z)
         return cost, z.at[places].set(w), jnp.sqrt(s2)
 
-    def better(best: tuple, plan: tuple) -> tuple[tuple, None]:
-        """The best so far and some more: draws, or itself with one of its shapes."""
-        tried, axis = plan
-        along = (best[1] * (1.0 - axis))[None] + SHAPES[:, None] * axis[None]
-        tried = jnp.where(jnp.any(axis > 0.0), along, tried).at[:, places].set(0.0)
-        found = jax.lax.map(one, tried)
-        k = jnp.argmin(jnp.where(jnp.isfinite(found[0]), found[0], jnp.inf))
-        new = jax.tree.map(lambda x: x[k], found)
-        less = new[0] < best[0]
-        return jax.tree.map(lambda x, y: jnp.where(less, x, y), new, best), None
+    def better(carry: tuple, plan: tuple) -> tuple[tuple, None]:
+        """The best so far and one more: some of its entries have other values."""
+        about, best = carry
+        value, replaced, begins = plan
+        about = jnp.where(begins, best[1], about)
+        found = one(jnp.where(replaced, value, about).at[places].set(0.0))
+        less = found[0] < best[0]
+        best = jax.tree.map(lambda x, y: jnp.where(less, x, y), found, best)
+        return (about, best), None
 
+    axes = np.repeat(np.eye(p)[shapes], len(SHAPES), axis=0)
+    sizes = np.tile(SHAPES, len(shapes))[:, None]
+    values = jnp.concatenate([jnp.zeros((1, p)), also[None], sizes * axes])
+    replaced = np.concatenate([np.ones((2, p), bool), axes > 0.0])
+    begins = np.arange(len(values)) % len(SHAPES) == 2  # the search of a shape
     best = jnp.asarray(jnp.inf), jnp.zeros(p), first.sd
-    (_, start, noise), _ = jax.lax.scan(better, best, (z, jnp.asarray(axes)))
+    plans = values, jnp.asarray(replaced), jnp.asarray(begins)
+    (_, (_, start, noise)), _ = jax.lax.scan(better, (best[1], best), plans)
     return start, noise

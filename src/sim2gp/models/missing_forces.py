@@ -118,9 +118,9 @@ class MissingForces(AbstractModel):
         rows = jax.tree.map(jnp.asarray, data)
         belief = belief if self._same_ranges(belief.system) else self.init(key)
         if not _has_friction(belief.system):
-            belief = self._fitted(self.wide, belief, rows, key)
+            belief = self._fitted(self.wide, belief, rows)
         if _has_friction(belief.system):
-            belief = self._fitted(self.sim, belief, rows, key)
+            belief = self._fitted(self.sim, belief, rows)
         if not belief.system.parameters.groups:
             return belief
         likelihood = OneStepLikelihood(belief.system, rows, belief.dt)
@@ -129,20 +129,20 @@ class MissingForces(AbstractModel):
         return belief
 
     def _fitted(
-        self, sim: Sim2GP, belief: Sim2GPBelief, rows: Transitions, key: Key
+        self, sim: Sim2GP, belief: Sim2GPBelief, rows: Transitions
     ) -> Sim2GPBelief:
         """With the forces of ``sim``, about the machine with those that are on."""
-        found = self._estimate(sim, belief, rows, key)
+        found = self._estimate(sim, belief, rows)
         found.convergence.check(
             self.system.parameters.names, f"{rows.count} transitions"
         )
         return self._needed(belief_of(sim, found, rows))
 
     def _estimate(
-        self, sim: Sim2GP, belief: Sim2GPBelief, rows: Transitions, key: Key
+        self, sim: Sim2GP, belief: Sim2GPBelief, rows: Transitions
     ) -> Estimate:
         prior, start = self._prior(), self._start(belief)
-        return estimate_forces(sim.system, rows, sim.dt, prior, start, key)
+        return estimate_forces(sim.system, rows, sim.dt, prior, start)
 
     def update(
         self, belief: AbstractBelief, s: State, a: Action, s2: State

@@ -70,7 +70,7 @@ def curves_of(
     units = {c.name: c.unit for c in (*plant.physical_states, *plant.actions)}
     by: dict[tuple[str, str], list[AbstractUnknownFunction]] = {}
     for f in functions:
-        of = f"{f.where}.velocity" if _of_velocity(f) else f.where
+        of = f"{f.where}.velocity" if by_velocity(f) else f.where
         by.setdefault((f.where, of), []).append(f)
     found = []
     for (where, of), own in by.items():
@@ -97,7 +97,8 @@ def force_arrays(curves: Sequence[Curve]) -> dict[str, np.ndarray]:
     return {f"forces/{c.name}": np.stack([c.at, c.mean, c.sd]) for c in curves}
 
 
-def _of_velocity(f: AbstractUnknownFunction) -> bool:
+def by_velocity(f: AbstractUnknownFunction) -> bool:
+    """Whether it is a function of the velocity."""
     return isinstance(f, MissingForce) and f.of_velocity
 
 

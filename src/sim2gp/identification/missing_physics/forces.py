@@ -1,44 +1,62 @@
 """Forces that the simulator of a run lacks: of one-step data, and of windows of logs.
 
-Windows have the corrected intervals (`sim2gp.identification.intervals`), with functions
-that have details. Of one-step data the functions are fitted (`estimate_groups`), and
-each that is on is tried without: where a machine has a pendulum, a force that acts as
-its gravity lets all masses and forces grow together, and choices on a linear model
-alone do not undo it.
+All functions that may be missing are fitted (`estimate_groups`), and each that is on is
+tried without: where a machine has a pendulum, a force that acts as its gravity lets all
+masses and forces grow together, and choices on a linear model alone do not undo it.
+Errors of windows may be coloured: what a function gains counts as often as their
+samples do, and bands are as wide as windows scatter
+(`sim2gp.identification.intervals`). A simulator on the host has the corrected intervals
+alone, whose noise has in it what is missing.
 """
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from sim2gp.data.one_step import OneStepLikelihood, estimate_forces
+from sim2gp.data.one_step import ROWS, OneStepLikelihood
+from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.identification.intervals.averaging import NONE, NOTHING
 from sim2gp.identification.intervals.discrepancy import corrected_windows
+from sim2gp.identification.intervals.pulls import pulls_of_windows
+from sim2gp.identification.intervals.scatter import CorrectedFit, correct_posterior
 from sim2gp.identification.missing_physics.at_zero import at_zero
-from sim2gp.identification.missing_physics.curves import Curve, curves_of
+from sim2gp.identification.missing_physics.curves import (
+    Curve,
+    by_velocity,
+    curves_of,
+)
 from sim2gp.identification.missing_physics.data import (
     FREE,
     AbstractData,
     OneStepData,
     WindowData,
 )
-from sim2gp.identification.missing_physics.reach import box_of, box_of_rows
+from sim2gp.identification.missing_physics.reach import (
+    Range,
+    box_of,
+    box_of_rows,
+)
 from sim2gp.identification.missing_physics.shapes import is_nothing
 from sim2gp.inference.estimate import Estimate, estimate
-from sim2gp.inference.groups import Start
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.groups import Start, estimate_groups
+from sim2gp.inference.likelihood import AbstractLikelihood
+from sim2gp.inference.parameters import Parameters
 from sim2gp.inference.prior import ParameterPrior
 from sim2gp.inference.relevance import EARNED, OFF, ON, price
 from sim2gp.systems.assemble import free_parts
+from sim2gp.systems.effects.forces import AbstractUnknownFunction
 from sim2gp.systems.effects.missing import missing_forces
 from sim2gp.systems.machine import plant_of
 from sim2gp.systems.mechanism import takes_forces
 from sim2gp.types import in_float64
+
+SHARE = 0.3  # of a force, that its shape may be another
 
 
 @dataclass(frozen=True)
@@ -68,34 +86,43 @@ def find_forces(data: AbstractData, bare: Estimate) -> FoundForces:
     """
     if not takes_forces(plant_of(data.system)):
         return FoundForces()
-    if isinstance(data, OneStepData):
-        return _of_transitions(data)
-    assert isinstance(data, WindowData)
-    box = box_of(data.system, data.windows)
+    box = _box(data)
     forces = missing_forces(data.system, box, fine=True, closely=True)
     likelihood = data.likelihood(data.system)
+    if not likelihood.on_host:
+        return _fitted(data, forces, box)
+    assert isinstance(data, WindowData)
+    assert isinstance(likelihood, WindowsLikelihood)
     found = corrected_windows(at_zero(likelihood, bare, forces), data.recording)
     return FoundForces(found.each, found.curves)
 
 
-@in_float64
-def _of_transitions(data: OneStepData) -> FoundForces:
-    """The functions that are on in the fit of highest evidence, sizes left free."""
-    machine = data.system
+def _box(data: AbstractData) -> dict[str, Range]:
+    """Where the machine has been."""
+    if isinstance(data, WindowData):
+        return box_of(data.system, data.windows)
+    assert isinstance(data, OneStepData)
     states, inputs = (np.concatenate(x) for x in zip(*data.episodes, strict=True))
-    box = box_of_rows(machine, states, inputs)
-    forces = missing_forces(machine, box, fine=True, closely=True)
-    system = free_parts(machine, forces, period=data.period)
+    return box_of_rows(data.system, states, inputs)
+
+
+@in_float64
+def _fitted(
+    data: AbstractData,
+    forces: Sequence[AbstractUnknownFunction],
+    box: Mapping[str, Range],
+) -> FoundForces:
+    """The functions that are on in the fit of highest evidence, sizes left free."""
+    system = free_parts(data.system, forces, period=data.period or None)
     table = system.parameters
-    names = tuple(table.groups)
-    rows = jax.tree.map(jnp.asarray, data.transitions(system.history))
-    prior = ParameterPrior(table.prior(), table, jnp.ones(len(table.groups)))
-    key, zero = jax.random.key(data.seed), jnp.zeros(len(table))
+    names, p = tuple(table.groups), len(table)
+    prior = ParameterPrior(table.prior(), table, jnp.ones(len(names)))
+    likelihood = data.likelihood(system)
+    first = likelihood.first_noise().sd
 
     def fit(last: Start) -> _Fit:
-        args = rows, data.period, prior, last, key
-        found = estimate_forces(system, *args)
-        found.convergence.check(table.names, "transitions")
+        found = estimate_groups(likelihood, _some(likelihood), prior, last)
+        found.convergence.check(table.names, "the data")
         return _Fit(found, np.asarray(prior.scales_in(found.prior)))
 
     def without(best: _Fit, name: str) -> _Fit:
@@ -105,27 +132,74 @@ def _of_transitions(data: OneStepData) -> FoundForces:
         z = z.at[table.groups[name]].set(0.0)
         scales = jnp.where(off, OFF, jnp.asarray(best.scales))
         # Only this start: what has no more noise than nothing at all is enough.
-        noise = jnp.maximum(likelihood.first_noise().sd, best.found.noise.sd)
+        noise = jnp.maximum(first, best.found.noise.sd)
         return fit(Start(z, noise, scales, jnp.ones((), bool)))
 
-    likelihood = data.likelihood(system)
-    start = Start(
-        zero, likelihood.first_noise().sd, jnp.zeros(len(names)), jnp.zeros((), bool)
-    )
-    best, gains = fit(start), dict[str, float]()
+    none = jnp.zeros((), bool)
+    best = fit(Start(jnp.zeros(p), first, jnp.zeros(len(names)), none))
+    alike = _corrected(data, likelihood, best.found, best.kept(table)).inflation
     while True:
         on = [n for n, s in zip(names, best.scales, strict=True) if s > ON]
         tried = {name: without(best, name) for name in on}
-        gains = {name: best.nats - less.nats for name, less in tried.items()}
+        gains = {n: (best.nats - x.nats) / alike for n, x in tried.items()}
         if not gains or min(gains.values()) >= 0.0:
             break
         best = tried[min(gains, key=gains.__getitem__)]
     each = {n: 1.0 / (1.0 + math.exp(-min(g + EARNED, 50.0))) for n, g in gains.items()}
-    nothing = math.prod(1.0 - p for p in each.values())
-    wide = [best.scales[k] / (FREE if n in each else 1.0) for k, n in enumerate(names)]
-    free = _with_free_sizes(likelihood, best.found, prior.scaled(jnp.asarray(wide)))
-    curves = curves_of(system, forces, box, free.posterior)
+    nothing = math.prod((1.0 - p for p in each.values()), start=1.0)
+    best = replace(best, scales=_of_free_size(best.scales, forces))
+    wide, kept = prior.scaled(jnp.asarray(best.scales)), best.kept(table)
+    free = _with_free_sizes(likelihood, best.found, wide)
+    known = _corrected(data, likelihood, free, kept).posterior
+    curves = curves_of(system, forces, box, free.prior.with_block(kept, known))
     return FoundForces({NONE: nothing} | each, curves)
+
+
+def _of_free_size(
+    scales: Float[np.ndarray, " g"], forces: Sequence[AbstractUnknownFunction]
+) -> Float[np.ndarray, " g"]:
+    """Scales with which functions that are on may be of any size.
+
+    Others of the same variable are part of the curve then, of a share of its size: a
+    force is hardly ever exactly of the shape that explains most of it.
+    """
+    sizes = scales * [f.magnitude for f in forces]
+    found = np.where(scales > ON, scales / FREE, scales)
+    for k, f in enumerate(forces):
+        alike = [
+            g.where == f.where and by_velocity(g) == by_velocity(f) for g in forces
+        ]
+        most = np.max(sizes, where=np.asarray(alike) & (scales > ON), initial=0.0)
+        if scales[k] <= ON < most / f.magnitude:
+            found[k] = SHARE * most / f.magnitude
+    return found
+
+
+def _some(likelihood: AbstractLikelihood) -> AbstractLikelihood:
+    """As many rows as tell one start from another."""
+    if isinstance(likelihood, OneStepLikelihood):
+        return likelihood.thinned(ROWS)
+    return likelihood
+
+
+def _corrected(
+    data: AbstractData,
+    likelihood: AbstractLikelihood,
+    found: Estimate,
+    kept: Int[np.ndarray, " k"],
+) -> CorrectedFit:
+    """What a fit says of the parameters at some places; of windows, corrected."""
+    about, at = found.prior, np.ix_(kept, kept)
+    mine = Gaussian(found.posterior.mean[kept], found.posterior.scale[kept])
+    if isinstance(data, WindowData) and isinstance(likelihood, WindowsLikelihood):
+        pulls = pulls_of_windows(likelihood, found, data.recording)
+        pulls = pulls.onto(np.eye(about.mean.size)[:, kept])
+        prior = Gaussian(about.mean[kept], about.scale[at])
+        corrected = correct_posterior(prior, mine, pulls)
+        if corrected.enough:
+            return replace(corrected, inflation=max(corrected.inflation, 1.0))
+    square = Gaussian(mine.mean, mine.triangular())
+    return CorrectedFit(square, 1.0, 1, math.inf, enough=False)
 
 
 @dataclass(frozen=True)
@@ -140,10 +214,15 @@ class _Fit:
         """Evidence, less what functions that are on must earn."""
         return float(self.found.log_evidence - price(jnp.asarray(self.scales)))
 
+    def kept(self, table: Parameters) -> Int[np.ndarray, " k"]:
+        """Places of the machine's own parameters, and of functions that are on."""
+        off = {n for n, s in zip(table.groups, self.scales, strict=True) if s <= ON}
+        return np.flatnonzero([p.group not in off for p in table.free])
+
 
 @eqx.filter_jit
 def _with_free_sizes(
-    likelihood: OneStepLikelihood, best: Estimate, prior: ParameterPrior
+    likelihood: AbstractLikelihood, best: Estimate, prior: ParameterPrior
 ) -> Estimate:
     """The fit where functions that are on may be of any size.
 

@@ -41,7 +41,7 @@ def box_of(system: AbstractSystem, windows: Windows) -> dict[str, Range]:
 
 def box_of_rows(
     system: AbstractSystem,
-    states: Float[AnyArray, "T n"],
+    states: Float[AnyArray, "N n"],
     inputs: Float[AnyArray, "T m"],
 ) -> dict[str, Range]:
     """The range of each channel in rows of states and inputs, as it is."""
