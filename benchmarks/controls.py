@@ -16,12 +16,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from residual_models import Ensemble, ProcessResidual
-from sim2gp.data.one_step import ROWS, OneStepLikelihood
+from sim2gp.data.one_step import OneStepLikelihood
 from sim2gp.data.transitions import Transitions
 from sim2gp.inference.arrowhead import Noise
 from sim2gp.inference.estimate import Estimate, estimate
 from sim2gp.inference.gaussian import Gaussian
-from sim2gp.inference.groups import BROAD, Start
+from sim2gp.inference.groups import BROAD, ROWS, Start
 from sim2gp.inference.least_squares import prior_rows
 from sim2gp.inference.parameters import Parameter
 from sim2gp.inference.prior import AbstractPrior, ParameterPrior

@@ -23,7 +23,6 @@ from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import in_float64
 
 BLOCK = 250  # rows: an episode
-ROWS = 64  # that judge draws of parameters
 FLOOR = 1e-3  # prior guess of the noise, relative to each channel's rms change
 
 
@@ -112,7 +111,7 @@ def estimate_forces(
 ) -> Estimate:
     """Of a machine whose forces are groups of parameters: `estimate_groups`."""
     likelihood = OneStepLikelihood(system, data, dt)
-    return estimate_groups(likelihood, likelihood.thinned(ROWS), prior, last)
+    return estimate_groups(likelihood, prior, last)
 
 
 def _rms_change(data: Transitions, d: int) -> Float[Array, " d"]:

@@ -47,6 +47,11 @@ class Gaussian(eqx.Module):
         """The distribution of ``x + scale @ eps``, eps independent of ``x``."""
         return Gaussian(self.mean, jnp.concatenate([self.scale, scale], axis=1))
 
+    def marginal(self, at: Int[np.ndarray, " m"]) -> "Gaussian":
+        """That of the coordinates at some places, with a square scale."""
+        mine = Gaussian(self.mean[at], self.scale[at])
+        return Gaussian(mine.mean, mine.triangular())
+
     def with_block(self, at: Int[np.ndarray, " m"], other: "Gaussian") -> "Gaussian":
         """``other`` at these places, the rest as it was, independent of it.
 

@@ -24,6 +24,7 @@ from sim2gp.inference.relevance import OFF
 from sim2gp.inference.variable_projection import projected
 
 BROAD = 3.0  # scale of every group in a first descent
+ROWS = 64  # that judge starts
 SAME = 1.2  # times the last noise: the last fit still explains the data
 
 
@@ -44,22 +45,21 @@ class Start(NamedTuple):
 @eqx.filter_jit
 def estimate_groups(
     likelihood: AbstractLikelihood,
-    some: AbstractLikelihood,
     prior: ParameterPrior,
     last: Start,
 ) -> Estimate:
     """From the last fit; where that no longer explains the data, the fit of highest
     evidence with all groups off, and from projected parameters.
 
-    Starts are judged by ``some`` of the data. What did not converge is reported by
-    `Convergence.check`.
+    What did not converge is reported by `Convergence.check`.
     """
     prior = prior.scaled(jnp.full(len(prior.scales), BROAD))
-    first, no = likelihood.first_noise().sd, jnp.zeros((), bool)
+    some, first = likelihood.thinned(ROWS), likelihood.first_noise()
+    no = jnp.zeros((), bool)
     off = last.z.at[np.asarray(prior.linear)].set(0.0)
     fitted = last._replace(z=jnp.where(last.enough, last.z, jnp.nan))
-    plain = Start(off, first, OFF / BROAD * prior.scales, no)
-    each = fitted, plain, Start(off, first, prior.scales, no, True)
+    plain = Start(off, first.sd, OFF / BROAD * prior.scales, no)
+    each = fitted, plain, Start(off, first.sd, prior.scales, no, True)
 
     def descend(start: Start, before: Array) -> Estimate:
         z, sd = jax.lax.cond(
@@ -67,7 +67,7 @@ def estimate_groups(
             lambda: projected(some, prior, before),
             lambda: (start.z, start.noise),
         )
-        noise = Noise(sd, likelihood.first_noise().weights)
+        noise = Noise(sd, first.weights)
         about = prior.scaled(start.scales)
         return estimate(likelihood, about, starts=z[None], noise=noise)
 

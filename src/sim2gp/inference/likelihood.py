@@ -49,6 +49,11 @@ class AbstractLikelihood(eqx.Module):
         """Whether `blocks` asks a simulator on the host, outside compiled programs."""
         return False
 
+    def thinned(self, count: int) -> "AbstractLikelihood":
+        """That of about so many rows, for a first look; where rows are few, itself."""
+        del count
+        return self
+
     @abstractmethod
     def first_noise(self) -> Noise:
         """The noise that a new fit begins with: a large one traps no first MAP."""

@@ -158,10 +158,9 @@ class MissingForces(AbstractModel):
         assert isinstance(draw, LinearizedDraw)
         sim = self.sim if _has_friction(draw.system) else self.wide
         own = {e.name: e for e in as_machine(draw.system).effects}
-        effects = tuple(own.get(e.name, e) for e in as_machine(sim.system).effects)
-        system = replace(
-            as_machine(sim.system), effects=effects
-        )  # ranges may be others
+        whole = as_machine(sim.system)  # whose functions may have other ranges
+        effects = tuple(own.get(e.name, e) for e in whole.effects)
+        system = replace(whole, effects=effects)
         at, mean = self._places(draw.system), sim.prior.mean.astype(jnp.float32)
         delta = jnp.zeros_like(mean).at[at].set(draw.delta)
         return LinearizedDraw(system, mean.at[at].set(draw.tt), delta, draw.dt)

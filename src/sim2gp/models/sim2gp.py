@@ -108,10 +108,7 @@ class Sim2GPBelief(AbstractBelief):
         A, r = self.information, len(rest)
         rows = jnp.concatenate([A, jnp.eye(A.shape[1], dtype=A.dtype)[rest]])
         left = triangular(rows[:, np.concatenate([rest, kept])])[r:, r:]
-        prior, posterior = (
-            Gaussian(g.mean[kept], Gaussian(g.mean[kept], g.scale[kept]).triangular())
-            for g in (self.prior, self.posterior)
-        )
+        prior, posterior = self.prior.marginal(kept), self.posterior.marginal(kept)
         new = system, prior, posterior, left
         return eqx.tree_at(
             lambda b: (b.system, b.prior, b.posterior, b.information), self, new

@@ -132,10 +132,9 @@ def one_variant(
         index_of(name, ())
         return system, belief
     table, places = own_table(system.parameters, system.variants, name)
-    at = np.asarray(places, int)
-    own = Gaussian(jnp.asarray(belief.mean)[at], jnp.asarray(belief.scale)[at])
-    square = Gaussian(own.mean, own.triangular())
-    return replace(system, variants=(), parameters=table), square
+    whole = Gaussian(jnp.asarray(belief.mean), jnp.asarray(belief.scale))
+    own = whole.marginal(np.asarray(places, int))
+    return replace(system, variants=(), parameters=table), own
 
 
 def _check_delays(machine: Machine, table: Parameters, variant: Variant) -> None:

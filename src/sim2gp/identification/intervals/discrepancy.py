@@ -97,10 +97,9 @@ def corrected_windows(start: AtZero, group: Int[np.ndarray, " W"]) -> CorrectedF
     both = Gaussian(
         jnp.asarray(onto(at)), jnp.asarray(onto.scale) @ found.posterior.scale
     )
-    mine = Gaussian(both.mean[own], both.scale[own])
     return replace(
         found,
-        posterior=Gaussian(mine.mean, mine.triangular()),
+        posterior=both.marginal(own),
         curves=curves_of(system, start.forces, start.box, both),
     )
 

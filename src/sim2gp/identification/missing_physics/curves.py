@@ -9,7 +9,7 @@ from jaxtyping import Float
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.parameters import Parameters
 from sim2gp.systems.base import AbstractSystem
-from sim2gp.systems.effects.forces import AbstractUnknownFunction, MissingForce
+from sim2gp.systems.effects.forces import AbstractUnknownFunction
 from sim2gp.systems.machine import Machine, plant_of
 
 POINTS = 201
@@ -70,8 +70,7 @@ def curves_of(
     units = {c.name: c.unit for c in (*plant.physical_states, *plant.actions)}
     by: dict[tuple[str, str], list[AbstractUnknownFunction]] = {}
     for f in functions:
-        of = f"{f.where}.velocity" if by_velocity(f) else f.where
-        by.setdefault((f.where, of), []).append(f)
+        by.setdefault((f.where, f.of), []).append(f)
     found = []
     for (where, of), own in by.items():
         at = np.linspace(*box[of], POINTS)
@@ -95,11 +94,6 @@ def functions_of(system: AbstractSystem) -> tuple[AbstractUnknownFunction, ...]:
 def force_arrays(curves: Sequence[Curve]) -> dict[str, np.ndarray]:
     """Of a run: ``forces/NAME``, rows of the variable, the mean and the sd."""
     return {f"forces/{c.name}": np.stack([c.at, c.mean, c.sd]) for c in curves}
-
-
-def by_velocity(f: AbstractUnknownFunction) -> bool:
-    """Whether it is a function of the velocity."""
-    return isinstance(f, MissingForce) and f.of_velocity
 
 
 def _features(

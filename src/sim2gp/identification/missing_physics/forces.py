@@ -18,18 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from sim2gp.data.one_step import ROWS, OneStepLikelihood
 from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.identification.intervals.averaging import NONE, NOTHING
 from sim2gp.identification.intervals.discrepancy import corrected_windows
 from sim2gp.identification.intervals.pulls import pulls_of_windows
-from sim2gp.identification.intervals.scatter import CorrectedFit, correct_posterior
+from sim2gp.identification.intervals.scatter import correct_posterior
 from sim2gp.identification.missing_physics.at_zero import at_zero
-from sim2gp.identification.missing_physics.curves import (
-    Curve,
-    by_velocity,
-    curves_of,
-)
+from sim2gp.identification.missing_physics.curves import Curve, curves_of
 from sim2gp.identification.missing_physics.data import (
     FREE,
     AbstractData,
@@ -121,7 +116,7 @@ def _fitted(
     first = likelihood.first_noise().sd
 
     def fit(last: Start) -> _Fit:
-        found = estimate_groups(likelihood, _some(likelihood), prior, last)
+        found = estimate_groups(likelihood, prior, last)
         found.convergence.check(table.names, "the data")
         return _Fit(found, np.asarray(prior.scales_in(found.prior)))
 
@@ -137,7 +132,7 @@ def _fitted(
 
     none = jnp.zeros((), bool)
     best = fit(Start(jnp.zeros(p), first, jnp.zeros(len(names)), none))
-    alike = _corrected(data, likelihood, best.found, best.kept(table)).inflation
+    alike = _corrected(data, likelihood, best.found, best.kept(table))[1]
     while True:
         on = [n for n, s in zip(names, best.scales, strict=True) if s > ON]
         tried = {name: without(best, name) for name in on}
@@ -150,7 +145,7 @@ def _fitted(
     best = replace(best, scales=_of_free_size(best.scales, forces))
     wide, kept = prior.scaled(jnp.asarray(best.scales)), best.kept(table)
     free = _with_free_sizes(likelihood, best.found, wide)
-    known = _corrected(data, likelihood, free, kept).posterior
+    known, _ = _corrected(data, likelihood, free, kept)
     curves = curves_of(system, forces, box, free.prior.with_block(kept, known))
     return FoundForces({NONE: nothing} | each, curves)
 
@@ -166,20 +161,11 @@ def _of_free_size(
     sizes = scales * [f.magnitude for f in forces]
     found = np.where(scales > ON, scales / FREE, scales)
     for k, f in enumerate(forces):
-        alike = [
-            g.where == f.where and by_velocity(g) == by_velocity(f) for g in forces
-        ]
-        most = np.max(sizes, where=np.asarray(alike) & (scales > ON), initial=0.0)
+        alike = (scales > ON) & [g.of == f.of for g in forces]
+        most = np.max(sizes, where=alike, initial=0.0)
         if scales[k] <= ON < most / f.magnitude:
             found[k] = SHARE * most / f.magnitude
     return found
-
-
-def _some(likelihood: AbstractLikelihood) -> AbstractLikelihood:
-    """As many rows as tell one start from another."""
-    if isinstance(likelihood, OneStepLikelihood):
-        return likelihood.thinned(ROWS)
-    return likelihood
 
 
 def _corrected(
@@ -187,19 +173,20 @@ def _corrected(
     likelihood: AbstractLikelihood,
     found: Estimate,
     kept: Int[np.ndarray, " k"],
-) -> CorrectedFit:
-    """What a fit says of the parameters at some places; of windows, corrected."""
-    about, at = found.prior, np.ix_(kept, kept)
-    mine = Gaussian(found.posterior.mean[kept], found.posterior.scale[kept])
+) -> tuple[Gaussian, float]:
+    """What a fit says of the parameters at some places; how many samples count as one.
+
+    Of windows both are corrected for errors that are coloured.
+    """
+    about, mine = found.prior, found.posterior.marginal(kept)
     if isinstance(data, WindowData) and isinstance(likelihood, WindowsLikelihood):
         pulls = pulls_of_windows(likelihood, found, data.recording)
         pulls = pulls.onto(np.eye(about.mean.size)[:, kept])
-        prior = Gaussian(about.mean[kept], about.scale[at])
+        prior = Gaussian(about.mean[kept], about.scale[np.ix_(kept, kept)])
         corrected = correct_posterior(prior, mine, pulls)
         if corrected.enough:
-            return replace(corrected, inflation=max(corrected.inflation, 1.0))
-    square = Gaussian(mine.mean, mine.triangular())
-    return CorrectedFit(square, 1.0, 1, math.inf, enough=False)
+            return corrected.posterior, max(corrected.inflation, 1.0)
+    return mine, 1.0
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,8 @@ Range = tuple[float, float]
 def box_of(system: AbstractSystem, windows: Windows) -> dict[str, Range]:
     """The range of each channel; of one that no recording tells, its limits, or one.
 
-    Ends are rounded outwards, so that recordings that are alike ask for one program.
+    Ends are rounded outwards: recordings that are alike share a program that has them
+    in it (`FixedSines`).
     """
     channels = (*system.physical_states, *system.actions)
     limits = {c.name: (c.low, c.high) for c in channels}

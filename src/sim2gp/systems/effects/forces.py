@@ -48,6 +48,11 @@ class AbstractUnknownFunction(AbstractEffect):
     basis: AbstractVar[Basis]
     weights: AbstractVar[tuple[float, ...]]
 
+    @property
+    def of(self) -> str:
+        """The channel that it is a function of."""
+        return self.where
+
     def __check_init__(self) -> None:
         size = len(self.basis.sds)
         if self.weights:
@@ -96,6 +101,10 @@ class MissingForce(AbstractUnknownFunction):
     weights: tuple[float, ...] = eqx.field(static=True, default=())
     meaning: ClassVar[str] = "force that is missing"
     max_substep: ClassVar[float] = math.inf
+
+    @property
+    def of(self) -> str:
+        return f"{self.where}.velocity" if self.of_velocity else self.where
 
     def unit(self, plant: AbstractPlant) -> str:
         return force_unit(plant, self.where)
