@@ -1,5 +1,6 @@
 """Scales of groups, against the closed form of the evidence and scipy's optimum."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,11 +14,21 @@ from sim2gp.inference.least_squares import factor
 from sim2gp.inference.linear_likelihood import LinearLikelihood
 from sim2gp.inference.parameters import Parameter, Parameters
 from sim2gp.inference.prior import ParameterPrior
-from sim2gp.inference.relevance import EARNED, OFF, Linear, relevant
+from sim2gp.inference.relevance import (
+    EARNED,
+    NEVER,
+    OFF,
+    ON,
+    TRIED,
+    Linear,
+    gains_if_on,
+)
+from sim2gp.inference.relevance import relevant as choose
 
 pytestmark = pytest.mark.usefixtures("float64")
 N, SIZES = 60, (1, 4, 4)  # rows, and parameters: one alone, two groups
 NOISE = 0.3
+relevant = eqx.filter_jit(choose)
 
 
 def table() -> Parameters:
@@ -112,6 +123,41 @@ def test_a_group_that_is_not_needed_goes_off():
     on, off = np.asarray(prior.scales)
     assert on > 1.0
     assert off == pytest.approx(OFF)
+
+
+def test_the_gain_of_a_group_that_is_off_is_the_closed_form():
+    """Its evidence at each scale, less that at zero, the rest marginalised."""
+    J, y = problem((2.0, 0.4))
+    prior = ParameterPrior(table().prior(), table()).scaled(jnp.asarray([2.0, OFF]))
+    sd = np.asarray(prior.gaussian.sd())
+    A, known = J * sd / NOISE, 1.0 / np.asarray(prior.each()) ** 2
+    S = np.linalg.inv(A.T @ A + np.diag(known))
+    x = S @ A.T @ y / NOISE
+    gradient = A.T @ (y / NOISE - A @ x)
+    found = gains_if_on(*map(jnp.asarray, (A.T @ A, gradient, S)), prior.members)
+    off = log_evidence(J, y, [2.0, 0.0], NOISE)
+    gains = [log_evidence(J, y, [2.0, t], NOISE) - off for t in TRIED]
+    np.testing.assert_allclose(found[1], gains, rtol=1e-4, atol=1e-4)
+    assert max(gains) > EARNED
+
+
+@pytest.mark.parametrize("never", [False, True])
+def test_of_two_groups_that_do_the_same_one_is_turned_on(never: bool):
+    """Both are off, as where neither earns its place beside the other."""
+    J, y = problem((2.0, 0.0))
+    rng = np.random.default_rng(8)
+    J[:, 5:] = J[:, 1:5] + 0.05 * rng.normal(size=(N, 4))
+    begun = jnp.asarray([NEVER if never else OFF, OFF])
+    prior = ParameterPrior(table().prior(), table()).scaled(begun)
+    noise = Noise(jnp.ones(1), jnp.ones(1))
+    for _ in range(8):
+        linear = linear_at(J, y, prior, np.zeros(sum(SIZES)))
+        noise, prior = relevant(linear, jnp.zeros(sum(SIZES)), noise, prior)
+    on = np.asarray(prior.scales) > ON
+    assert on.sum() == 1
+    assert float(noise.sd[0]) < 1.5 * NOISE
+    if never:
+        assert on.tolist() == [False, True]
 
 
 def test_a_fit_with_groups_is_the_conjugate_one_at_its_scales():

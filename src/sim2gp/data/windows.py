@@ -56,9 +56,11 @@ class Windows(Pieces):
     def some(self, which: Bool[np.ndarray, " W"] | Int[np.ndarray, " w"]) -> "Windows":
         """The windows chosen by a mask or by number; the floor belongs to all."""
         bare = eqx.tree_at(lambda w: w.floor, self, None)
+        if not isinstance(self.y, jax.core.Tracer):
+            bare = jax.tree.map(np.asarray, bare)  # which asks for no program
         chosen: Windows = eqx.tree_at(
             lambda w: w.floor,
-            jax.tree.map(lambda x: np.asarray(x)[which], bare),
+            jax.tree.map(lambda x: x[which], bare),
             self.floor,
             is_leaf=lambda x: x is None,
         )

@@ -44,6 +44,7 @@ class WindowsLikelihood(AbstractLikelihood):
     windows: Windows
     counts: Float[AnyArray, "W c"]
     floor: Float[AnyArray, " c"]
+    most: int = eqx.field(static=True)  # samples of a channel in a window
 
     @in_float64
     def __init__(self, system: AbstractSystem, windows: Windows) -> None:
@@ -51,6 +52,7 @@ class WindowsLikelihood(AbstractLikelihood):
         self.system, self.windows = system, jax.tree.map(keep, windows)
         counts = np.sum(windows.mask, axis=1, dtype=float)
         self.counts, self.floor = keep(counts), self.windows.floor
+        self.most = int(counts.max(initial=0.0))
 
     @property
     def n_nuisances(self) -> int:
@@ -63,6 +65,16 @@ class WindowsLikelihood(AbstractLikelihood):
     def some(self, which: Int[np.ndarray, " w"]) -> "WindowsLikelihood":
         """The likelihood of some of the windows, by number."""
         return WindowsLikelihood(self.system, self.windows.some(which))
+
+    def thinned(self, count: int) -> "WindowsLikelihood":
+        """Of a quarter as many windows, evenly spread: each has several rows."""
+        W = len(self.windows)
+        which = np.linspace(0, W - 1, min(W, count // 4)).round().astype(int)
+        some = self.windows.some(which), self.counts[which]
+        thin: WindowsLikelihood = eqx.tree_at(
+            lambda one: (one.windows, one.counts), self, some
+        )
+        return thin
 
     def simulated(
         self, window: Windows, tt: Float[Array, " p"], e: Float[Array, " n"]
@@ -91,7 +103,11 @@ class WindowsLikelihood(AbstractLikelihood):
                 return self.simulated(window, tt + scale @ x[n:], e + x[:n])[0]
 
             r, J = value_and_jacobian(residual, jnp.zeros(n + p))
-            return jax.vmap(factor, in_axes=1)(J, r)
+            rows = jnp.concatenate([J, r[..., None]], axis=-1)
+            # What was measured, before rows of zeros.
+            order = jnp.argsort(~window.mask, axis=0, stable=True)[: self.most]
+            some = jnp.take_along_axis(rows, order[..., None], axis=0)
+            return jax.vmap(factor, in_axes=1)(some[..., :-1], some[..., -1])
 
         found: Array = self.windows.each(one, e)
         return found
@@ -108,17 +124,17 @@ class WindowsLikelihood(AbstractLikelihood):
         outputs = list(windows.outputs)
         r = _residual(windows, run.states)
 
-        def blocks() -> Float[np.ndarray, "W c k k"]:
+        def blocks() -> Float[np.ndarray, "W c b k"]:
             J, mask = run.slopes()[:, :, outputs], windows.mask
-            return np.stack(
-                [
-                    [
-                        factor(J[w, mask[w, :, c], c], r[w, mask[w, :, c], c])
-                        for c in range(len(outputs))
-                    ]
-                    for w in range(len(r))
-                ]
-            )
+
+            def one(w: int, c: int) -> Float[np.ndarray, "b k"]:
+                i = mask[w, :, c]
+                more = self.most - int(i.sum())
+                rows = np.pad(J[w, i, c], ((0, more), (0, 0)))
+                return factor(rows, np.pad(r[w, i, c], (0, more)))
+
+            channels = range(len(outputs))
+            return np.stack([[one(w, c) for c in channels] for w in range(len(r))])
 
         return Trial(np.sum(r**2, axis=1), blocks)
 

@@ -17,11 +17,17 @@ import equinox as eqx
 from jaxtyping import Float
 
 from sim2gp.inference.least_squares import Factor
-from sim2gp.inference.linalg import each_window, library, solve_triangular, triangular
+from sim2gp.inference.linalg import (
+    each_window,
+    library,
+    solve_triangular,
+    trapezoidal,
+    triangular,
+)
 from sim2gp.types import AnyArray, AnyScalar
 
-#: Triangular factors of ``[J_e J_z r]`` per window and channel; k = n + p + 1.
-Blocks = Float[AnyArray, "W c k k"]
+#: Factors of ``[J_e J_z r]`` per window and channel; k = n + p + 1, and at most k rows.
+Blocks = Float[AnyArray, "W c b k"]
 
 
 class Noise(eqx.Module):
@@ -54,7 +60,7 @@ def eliminate(
     damping: AnyScalar = 0.0,
 ) -> Elimination:
     """The QR of the module's equation in every window; all ``R22`` stacked."""
-    (W, n), k = e.shape, blocks.shape[-1]
+    n, k = e.shape[1], blocks.shape[-1]
 
     xp = library(blocks, e)
 
@@ -62,9 +68,9 @@ def eliminate(
         identity = xp.eye(n, k, dtype=block.dtype)
         prior = xp.concatenate([identity[:, :-1], e[:, None]], axis=1)
         damped = xp.sqrt(damping) * identity
-        return triangular(xp.concatenate([block.reshape(-1, k), prior, damped]))
+        return trapezoidal(xp.concatenate([block.reshape(-1, k), prior, damped]))
 
     R = each_window(one, noise.scale(blocks), e)
     R11 = R[:, :n, :n]
-    data = triangular(R[:, n:, n:].reshape(W * (k - n), k - n))
+    data = triangular(R[:, n:, n:].reshape(-1, k - n))
     return Elimination(data, R11, each_window(solve_triangular, R11, R[:, :n, n:]))

@@ -99,16 +99,17 @@ def estimate(
     learn: bool = True,
     freedom: float | Scalar = jnp.inf,
     report: Report | None = None,
-    until: float = SMALL,
+    until: float | None = None,
 ) -> Estimate:
     """Descend from each of the whitened ``starts``; from the best, the noise as well.
 
     ``nuisances`` and ``noise`` are those of another fit to begin with; zeros and the
     likelihood's own first noise without. The noise is learned in turns with the steps
     until both rest, or stays where it is not to ``learn``. Starts that are no number
-    are compiled and not taken. A simulator on the host keeps the scales of a prior,
-    rests at a step of ``until`` posterior sd, and calls ``report`` after each. What did
-    not converge is reported by `Convergence.check`.
+    are compiled and not taken. A descent rests at a step of ``until`` posterior sd: by
+    default `SMALL` on the host, and far less of what is compiled. A simulator on the
+    host keeps the scales of a prior, and calls ``report`` after each step. What did not
+    converge is reported by `Convergence.check`.
     """
     if nuisances is None:
         shape = len(likelihood.counts), likelihood.n_nuisances
@@ -117,9 +118,9 @@ def estimate(
         noise = likelihood.first_noise()
     start = starts, nuisances, noise
     if likelihood.on_host:
-        how = learn, report, until
+        how = learn, report, SMALL if until is None else until
         return _estimate_on_host(likelihood, prior, start, freedom, *how)
-    return _estimate(likelihood, prior, *start, freedom, learn)
+    return _estimate(likelihood, prior, *start, freedom, learn, until)
 
 
 # As in JAX, what is not finite is judged and not warned of.
@@ -201,6 +202,7 @@ def _estimate(
     noise: Noise,
     freedom: float | Scalar,
     learn: bool,
+    until: float | None,
 ) -> Estimate:
     """The whole fit as one program, of simulators that JAX can compile."""
     counts, floor = likelihood.counts, likelihood.floor
@@ -225,10 +227,10 @@ def _estimate(
 
     start, learning = (starts, nuisances, noise), Learning()
     if learn:
-        learning = Learning(learned)
-        if _is_scaled(prior):
-            scales = Scales(choose, score)
-            learning = Learning(learned, scales, until=NEAR, still=STILL)
+        scales = Scales(choose, score) if _is_scaled(prior) else None
+        until = NEAR if scales else until
+        near = {"until": until, "still": STILL} if until else {}
+        learning = Learning(learned, scales, **near)
     at, noise, prior, steps, _ = multi_start(likelihood, prior, *start, learning)
     return _about(laplace(at, noise), noise, prior, counts, steps)
 

@@ -1,10 +1,11 @@
 """The fit of a machine with groups of parameters that the data may not need.
 
 The model is linear in the groups, as functions of unknown shape are in their weights.
-Where they explain much, a descent from the prior's mean ends at parameters that explain
-little with much noise. Fits start where all groups are off, and from the best of that
-fit's parameters and the prior's mean, for which the groups are solved linearly
-(`sim2gp.inference.variable_projection`), with the noise that is left there.
+A fit starts where all groups are off; one after the other is turned on. Where they
+explain much, that ends at parameters that explain little with much noise. So the groups
+are also solved for linearly (`sim2gp.inference.variable_projection`) at the better of
+that fit's parameters and the prior's mean. Where this leaves less noise, a fit starts
+there with all groups on.
 """
 
 from typing import Any, NamedTuple
@@ -25,7 +26,7 @@ from sim2gp.inference.variable_projection import projected
 
 BROAD = 3.0  # scale of every group in a first descent
 ROWS = 64  # that judge starts
-SAME = 1.2  # times the last noise: the last fit still explains the data
+SAME = 1.2  # times another noise: no more than that, or no less
 
 
 class Start(NamedTuple):
@@ -49,7 +50,7 @@ def estimate_groups(
     last: Start,
 ) -> Estimate:
     """From the last fit; where that no longer explains the data, the fit of highest
-    evidence with all groups off, and from projected parameters.
+    evidence from all groups off, and from projected parameters.
 
     What did not converge is reported by `Convergence.check`.
     """
@@ -61,31 +62,33 @@ def estimate_groups(
     plain = Start(off, first.sd, OFF / BROAD * prior.scales, no)
     each = fitted, plain, Start(off, first.sd, prior.scales, no, True)
 
-    def descend(start: Start, before: Array) -> Estimate:
-        z, sd = jax.lax.cond(
-            start.project,
-            lambda: projected(some, prior, before),
-            lambda: (start.z, start.noise),
-        )
-        noise = Noise(sd, first.weights)
+    def descend(start: Start) -> Estimate:
+        noise = Noise(start.noise, first.weights)
         about = prior.scaled(start.scales)
-        return estimate(likelihood, about, starts=z[None], noise=noise)
+        return estimate(likelihood, about, starts=start.z[None], noise=noise)
 
-    def skip(start: Start, before: Array) -> Estimate:
-        shapes = jax.eval_shape(descend, start, before)
+    def skip(start: Start) -> Estimate:
+        shapes = jax.eval_shape(descend, start)
         none: Estimate = jax.tree.map(lambda x: jnp.full(x.shape, -1, x.dtype), shapes)
         return none
 
-    def turn(carry: tuple[Array, Array], start: Start) -> tuple[Any, Estimate]:
-        done, before = carry
-        found = jax.lax.cond(done, skip, descend, start, before)
+    def turn(carry: tuple[Array, Array, Array], start: Start) -> tuple[Any, Estimate]:
+        done, before, left = carry
+        z, sd = jax.lax.cond(
+            start.project & ~done,
+            lambda: projected(some, prior, before),
+            lambda: (start.z, start.noise),
+        )
+        done = done | (start.project & jnp.all(SAME * sd >= left))
+        found = jax.lax.cond(done, skip, descend, start._replace(z=z, noise=sd))
         same = jnp.all(found.noise.sd <= SAME * start.noise)
         ended = found.convergence.status == CONVERGED
         now = prior.gaussian.whitened(found.posterior.mean)
-        return (done | (start.enough & same & ended), now), found
+        done = done | (start.enough & same & ended)
+        return (done, now, found.noise.sd), found
 
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *each)
-    _, found = jax.lax.scan(turn, (no, off), stacked)
+    _, found = jax.lax.scan(turn, (no, off, first.sd), stacked)
     there = found.convergence.status == CONVERGED
     there = there & jnp.isfinite(found.log_evidence)
     ranked = jnp.where(there, found.log_evidence, -jnp.inf)

@@ -6,8 +6,8 @@ posterior is a sum of squares,
     L(z) = 1/2 ||r(z)||^2 + 1/2 ||z||^2,          J = dr/dz.
 
 All that a descent, the posterior, and the evidence need of the data is the triangular
-factor ``R`` of ``[J r]`` (`factor`): it has ``p + 1`` rows however many rows the data
-have, it stacks (streaming, windows, prior), and
+factor ``R`` of ``[J r]`` (`factor`): it has no more than ``p + 1`` rows, whatever the
+data have, it stacks (streaming, windows, prior), and
 
     [J r; I z] = Q [R c; 0 rho],     Sigma_z = R^-1 R^-T,     ||r||^2 = ||c||^2 + rho^2.
 
@@ -29,9 +29,15 @@ Factor = Float[AnyArray, "p1 p1"]
 RANK_TOLERANCE = 1e-8  # singular values below this share of the largest count as zero
 
 
-def factor(J: Float[AnyArray, "N p"], r: Float[AnyArray, " N"]) -> Factor:
-    """Triangular factor of ``[J r]``: the data's square-root information."""
-    return triangular(library(J, r).concatenate([J, r[:, None]], axis=1))
+def factor(
+    J: Float[AnyArray, "N p"], r: Float[AnyArray, " N"]
+) -> Float[AnyArray, "_ p1"]:
+    """Triangular factor of ``[J r]``: the data's square-root information.
+
+    Where rows are no more than columns they are one as they are.
+    """
+    rows = library(J, r).concatenate([J, r[:, None]], axis=1)
+    return rows if rows.shape[0] <= rows.shape[1] else triangular(rows)
 
 
 def stack(*factors: Float[AnyArray, "_ k"]) -> Float[AnyArray, "k k"]:
@@ -45,7 +51,7 @@ def prior_rows(z: Float[AnyArray, " p"]) -> Float[AnyArray, "p p1"]:
     return xp.concatenate([xp.eye(z.size, dtype=z.dtype), z[:, None]], axis=1)
 
 
-def with_prior(data: Factor, z: Float[AnyArray, " p"]) -> Factor:
+def with_prior(data: Float[AnyArray, "_ p1"], z: Float[AnyArray, " p"]) -> Factor:
     """The factor of the data and the prior."""
     return stack(data, prior_rows(z))
 

@@ -26,7 +26,7 @@ class Trial(NamedTuple):
     """
 
     squares: Float[np.ndarray, "W c"]
-    blocks: Callable[[], Float[np.ndarray, "W c k k"]]
+    blocks: Callable[[], Float[np.ndarray, "W c b k"]]
 
 
 class AbstractLikelihood(eqx.Module):

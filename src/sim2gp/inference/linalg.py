@@ -56,8 +56,13 @@ def triangular(rows: Float[AnyArray, "N k"]) -> Float[AnyArray, "k k"]:
     xp, (N, k) = library(rows), rows.shape
     if N < k:
         rows = xp.concatenate([rows, xp.zeros((k - N, k), rows.dtype)])
+    return trapezoidal(rows)
+
+
+def trapezoidal(rows: Float[AnyArray, "N k"]) -> Float[AnyArray, "_ k"]:
+    """The same in ``min(N, k)`` rows."""
     R = qr(rows)
-    return xp.where(xp.diag(R) < 0.0, -1.0, 1.0)[:, None] * R
+    return library(R).where(library(R).diag(R) < 0.0, -1.0, 1.0)[:, None] * R
 
 
 def cholesky(A: Float[AnyArray, "n n"]) -> Float[AnyArray, "n n"]:

@@ -15,15 +15,23 @@ evidence: a group stays on where that is `EARNED` nats more than without it,
 
     log p(y | tau) / p(y | 0) = 1/2 (x^T S^-1 x + log |S / tau^2|)
 
-(the ratio of prior and posterior density at zero: Dickey 1971). Only scales and noise
-are taken from here, never a posterior, so that normal equations do: a round costs a
-Cholesky factor of the parameters' number.
+(the ratio of prior and posterior density at zero: Dickey 1971). Two groups that can do
+the same both go off so, and neither round turns one on again. So, of the groups that
+are off, the one that would earn most is turned on. With ``s`` the Fisher information of
+its weights and ``q`` the gradient of the log likelihood at zero, the others
+marginalised (Tipping and Faul 2003, AISTATS),
+
+    log p(y | tau) / p(y | 0) = 1/2 q^T (1/tau^2 + s)^-1 q - 1/2 log |1 + tau^2 s|
+
+Only scales and noise are taken from here, never a posterior, so that normal equations
+do: a round costs a Cholesky factor of the parameters' number.
 """
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Float
 
@@ -39,6 +47,8 @@ EARNED = 3.0  # nats: noise alone gives one group as much in 1 of 400 cases
 #: Of a group that is off, and of one that is as strong as it may be, in prior sd.
 OFF, MOST = 1e-4, 20.0
 ON = 10.0 * OFF  # from here on a group is on
+NEVER = 0.1 * OFF  # a group of this scale stays off
+TRIED = np.geomspace(0.01, MOST, 24)  # scales of a group that may be turned on
 
 
 class Linear(NamedTuple):
@@ -65,7 +75,7 @@ def relevant(
     ``trust`` is a precision that keeps the other parameters where they are, in that of
     their prior: far away the linear model is not true.
     """
-    members = jnp.asarray(prior.members)
+    members, may = jnp.asarray(prior.members), prior.scales > NEVER
     held = trust * (1.0 - jnp.sum(members, axis=0))
 
     def unfinished(carry: tuple) -> Array:
@@ -85,7 +95,7 @@ def relevant(
         determined = jnp.sum(members, axis=1) - members @ own / tau2
         fixed_point = members @ x**2 / jnp.maximum(determined, 1e-6)
         new = jnp.where(i < EM_ROUNDS, em, jnp.minimum(em, fixed_point))
-        new = jnp.clip(new, OFF**2, MOST**2)
+        new = jnp.where(may, jnp.clip(new, OFF**2, MOST**2), NEVER**2)
         change = jnp.max(jnp.abs(jnp.log(new / tau2)), initial=0.0)
         settled = (i < EM_ROUNDS) & (change < SLOW)
         return jnp.where(settled, EM_ROUNDS, i + 1), (variance, new, change)
@@ -99,8 +109,55 @@ def relevant(
     # Where the linear model would go far to do without it, a group stays.
     gain = jax.vmap(_gained, (0, None, None))
     earned = jnp.maximum(*(gain(members, w / each, whitened) for w in (x, z)))
-    scales = jnp.where(earned > EARNED, jnp.sqrt(tau2), OFF)
+    scales = jnp.where(earned > EARNED, jnp.sqrt(tau2), jnp.where(may, OFF, NEVER))
+    scales = _one_more(linear, z, variance, prior.scaled(scales), held)
     return Noise(jnp.sqrt(variance), noise.weights), prior.scaled(scales)
+
+
+def _one_more(
+    linear: Linear,
+    z: Float[Array, " p"],
+    variance: Float[Array, " c"],
+    prior: ParameterPrior,
+    held: Float[Array, " p"],
+) -> Float[Array, " g"]:
+    """The scales, with the group on that earns most of those that are off."""
+    each, scales = prior.each(), prior.scales
+    x, S = _posterior(linear, z, variance, each, held)
+    total = jnp.sum(linear.grams / variance[:, None, None], axis=0)
+    gradient = -(total[:-1, :-1] @ (x - z) + total[:-1, -1])
+    gains = gains_if_on(total[:-1, :-1], gradient, S, prior.members)
+    off = (scales > NEVER) & (scales <= ON)
+    group, k = jnp.unravel_index(
+        jnp.argmax(jnp.where(off[:, None], gains, -jnp.inf)), gains.shape
+    )
+    earns = off[group] & (gains[group, k] > EARNED)
+    more = jnp.where(earns, jnp.asarray(TRIED)[k], scales[group])
+    return scales.at[group].set(more)
+
+
+def gains_if_on(
+    information: Float[Array, "p p"],
+    gradient: Float[Array, " p"],
+    covariance: Float[Array, "p p"],
+    members: Float[np.ndarray, "g p"],
+) -> Float[Array, "g t"]:
+    """The evidence for each group that is off at the scales `TRIED`, nats.
+
+    ``information`` is the data's, ``gradient`` that of the log likelihood at the
+    posterior mean, ``covariance`` the posterior's, all of whitened parameters.
+    """
+    sizes = members.sum(axis=1).astype(int)
+    places = np.argsort(-members, axis=1, kind="stable")[:, : sizes.max(initial=0)]
+    own = np.take_along_axis(members, places, axis=1)
+    rest = information - information @ covariance @ information
+    s = rest[places[:, :, None], places[:, None]] * own[:, :, None] * own[:, None]
+    known, U = jnp.linalg.eigh(s)
+    q = jnp.einsum("gij,gi->gj", U, gradient[places] * own)
+    tau2 = jnp.asarray(TRIED**2)[None, :, None]
+    known, q = jnp.maximum(known, 0.0)[:, None], q[:, None]
+    one = 1.0 + tau2 * known
+    return 0.5 * jnp.sum(tau2 * q**2 / one - jnp.log(one), axis=2)
 
 
 def price(scales: Float[Array, " g"]) -> Scalar:

@@ -64,13 +64,18 @@ class Stacked(AbstractLikelihood):
     ) -> Blocks:
         (W, c), n = self.counts.shape, e.shape[1]
         k = n + scale.shape[1] + 1
-        found, w, i = jnp.zeros((W, c, k, k), e.dtype), 0, 0
+        blocks, w = [], 0
         for each in self.likelihoods:
-            rows, columns = each.counts.shape
+            own = e[w : w + len(each.counts), : each.n_nuisances]
+            blocks.append(each.blocks(tt, own, scale))
+            w += len(own)
+        most = max(block.shape[2] for block in blocks)
+        found, w, i = jnp.zeros((W, c, most, k), e.dtype), 0, 0
+        for each, block in zip(self.likelihoods, blocks, strict=True):
+            rows, columns, size, _ = block.shape
             windows, channels = w + np.arange(rows), i + np.arange(columns)
-            own = np.arange(each.n_nuisances)
-            block = each.blocks(tt, e[windows, : own.size], scale)
-            place = np.concatenate([own, np.arange(n, k)])
-            found = found.at[np.ix_(windows, channels, place, place)].set(block)
+            place = np.concatenate([np.arange(each.n_nuisances), np.arange(n, k)])
+            at = np.ix_(windows, channels, np.arange(size), place)
+            found = found.at[at].set(block)
             w, i = w + rows, i + columns
         return found

@@ -64,7 +64,7 @@ from sim2gp.identification.missing_physics.curves import Curve
 from sim2gp.identification.words import digits
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.least_squares import RANK_TOLERANCE
-from sim2gp.types import in_float64
+from sim2gp.types import AnyArray, in_float64
 
 #: Below so many degrees of freedom nothing is said about the windows' scatter.
 FEWEST = 4.0
@@ -153,6 +153,17 @@ def correct_posterior(
     centre, scale, each = averaged(root, rest, groups or {}, alone)
     found = Gaussian(jnp.asarray(mu0 + L0 @ centre), jnp.asarray(L0 @ scale))
     return CorrectedFit(found, kappa2, b, nu, True, each)
+
+
+@in_float64
+def posterior_of(prior: Gaussian, at: Float[AnyArray, " p"], pulls: Pulls) -> Gaussian:
+    """Of a linear machine whose every sample is new; pulls were taken at ``at``."""
+    L0, p = np.asarray(prior.scale), prior.mean.size
+    A = np.concatenate([*pulls.factors, np.eye(p)])
+    R = np.asarray(np.linalg.qr(A, mode="r"))
+    z, _ = _at_the_map(np.linalg.solve(L0, np.asarray(at - prior.mean)), pulls, R)
+    scale = np.linalg.solve(R.T, L0.T).T
+    return Gaussian(prior.mean + jnp.asarray(L0 @ z), jnp.asarray(scale))
 
 
 def describe_intervals(

@@ -93,7 +93,7 @@ class AbstractData(abc.ABC):
         system: AbstractSystem,
         z: Float[np.ndarray, "G p"],
         nuisances: Float[Array, "W n"],
-    ) -> Float[Array, "G W c k k"]:
+    ) -> Float[Array, "G W c b k"]:
         """`Blocks` at points of the parameters, whitened by the prior."""
         prior, likelihood = system.parameters.prior(), self.likelihood(system)
         if likelihood.on_host:

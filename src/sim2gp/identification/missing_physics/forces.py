@@ -12,6 +12,7 @@ alone, whose noise has in it what is missing.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -21,8 +22,8 @@ from jaxtyping import Float, Int
 from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.identification.intervals.averaging import NONE, NOTHING
 from sim2gp.identification.intervals.discrepancy import corrected_windows
-from sim2gp.identification.intervals.pulls import pulls_of_windows
-from sim2gp.identification.intervals.scatter import correct_posterior
+from sim2gp.identification.intervals.pulls import Pulls, pulls_of_windows
+from sim2gp.identification.intervals.scatter import correct_posterior, posterior_of
 from sim2gp.identification.missing_physics.at_zero import at_zero
 from sim2gp.identification.missing_physics.curves import Curve, curves_of
 from sim2gp.identification.missing_physics.data import (
@@ -37,13 +38,22 @@ from sim2gp.identification.missing_physics.reach import (
     box_of_rows,
 )
 from sim2gp.identification.missing_physics.shapes import is_nothing
+from sim2gp.inference.convergence import NEAR
 from sim2gp.inference.estimate import Estimate, estimate
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.groups import Start, estimate_groups
 from sim2gp.inference.likelihood import AbstractLikelihood
 from sim2gp.inference.parameters import Parameters
 from sim2gp.inference.prior import ParameterPrior
-from sim2gp.inference.relevance import EARNED, OFF, ON, price
+from sim2gp.inference.relevance import (
+    EARNED,
+    NEVER,
+    OFF,
+    ON,
+    TRIED,
+    gains_if_on,
+    price,
+)
 from sim2gp.systems.assemble import free_parts
 from sim2gp.systems.effects.forces import AbstractUnknownFunction
 from sim2gp.systems.effects.missing import missing_forces
@@ -52,6 +62,7 @@ from sim2gp.systems.mechanism import takes_forces
 from sim2gp.types import in_float64
 
 SHARE = 0.3  # of a force, that its shape may be another
+EXCLUDED = 2.0  # nats less than without it: the data exclude a force of this size
 
 
 @dataclass(frozen=True)
@@ -125,14 +136,15 @@ def _fitted(
         off = np.asarray(names) == name
         z = prior.gaussian.whitened(best.found.posterior.mean)
         z = z.at[table.groups[name]].set(0.0)
-        scales = jnp.where(off, OFF, jnp.asarray(best.scales))
+        scales = jnp.where(off, NEVER, jnp.asarray(best.scales))
         # Only this start: what has no more noise than nothing at all is enough.
         noise = jnp.maximum(first, best.found.noise.sd)
         return fit(Start(z, noise, scales, jnp.ones((), bool)))
 
     none = jnp.zeros((), bool)
-    best = fit(Start(jnp.zeros(p), first, jnp.zeros(len(names)), none))
-    alike = _corrected(data, likelihood, best.found, best.kept(table))[1]
+    best = fit(Start(jnp.zeros(p), first, jnp.ones(len(names)), none))
+    about = _Linear.of(data, likelihood, best.found)
+    alike = about.posterior(best.kept(table))[1]
     while True:
         on = [n for n, s in zip(names, best.scales, strict=True) if s > ON]
         tried = {name: without(best, name) for name in on}
@@ -142,12 +154,33 @@ def _fitted(
         best = tried[min(gains, key=gains.__getitem__)]
     each = {n: 1.0 / (1.0 + math.exp(-min(g + EARNED, 50.0))) for n, g in gains.items()}
     nothing = math.prod((1.0 - p for p in each.values()), start=1.0)
+    most = _largest(best.found, prior.scaled(jnp.asarray(best.scales)), alike)
     best = replace(best, scales=_of_free_size(best.scales, forces))
-    wide, kept = prior.scaled(jnp.asarray(best.scales)), best.kept(table)
-    free = _with_free_sizes(likelihood, best.found, wide)
-    known, _ = _corrected(data, likelihood, free, kept)
-    curves = curves_of(system, forces, box, free.prior.with_block(kept, known))
-    return FoundForces({NONE: nothing} | each, curves)
+    wide = prior.scaled(jnp.asarray(best.scales))
+    free = _Linear.of(data, likelihood, _with_free_sizes(likelihood, best.found, wide))
+    curves: list[Curve] = []
+    for own in dict.fromkeys((f.where, f.of) for f in forces):
+        mine = np.asarray([(f.where, f.of) == own for f in forces])
+        some = np.where(mine & (best.scales <= ON), most, best.scales)
+        wider = prior.each(some) / prior.each(best.scales)
+        kept = replace(best, scales=some).kept(table)
+        known, _ = free.posterior(kept, wider)
+        virtual = free.found.prior.with_block(kept, known)
+        own_forces = [f for f, x in zip(forces, mine, strict=True) if x]
+        curves += curves_of(system, own_forces, box, virtual)
+    return FoundForces({NONE: nothing} | each, tuple(curves))
+
+
+def _largest(
+    found: Estimate, prior: ParameterPrior, alike: float
+) -> Float[np.ndarray, " g"]:
+    """The largest scale of each function that is off which the data do not exclude."""
+    each, about = prior.each(), prior.gaussian
+    R, gradient = found.information / each, -found.scores.sum(axis=0) / each
+    root = jnp.linalg.solve(about.scale, found.posterior.scale)
+    gains = gains_if_on(R.T @ R, gradient, root @ root.T, prior.members)
+    possible = np.asarray(gains) >= -EXCLUDED * alike
+    return np.max(np.where(possible, TRIED, OFF), axis=1)
 
 
 def _of_free_size(
@@ -168,25 +201,44 @@ def _of_free_size(
     return found
 
 
-def _corrected(
-    data: AbstractData,
-    likelihood: AbstractLikelihood,
-    found: Estimate,
-    kept: Int[np.ndarray, " k"],
-) -> tuple[Gaussian, float]:
-    """What a fit says of the parameters at some places; how many samples count as one.
+class _Linear(NamedTuple):
+    """A fit, and what its windows say of a machine that is linear about it.
 
-    Of windows both are corrected for errors that are coloured.
+    One-step data are one window.
     """
-    about, mine = found.prior, found.posterior.marginal(kept)
-    if isinstance(data, WindowData) and isinstance(likelihood, WindowsLikelihood):
-        pulls = pulls_of_windows(likelihood, found, data.recording)
-        pulls = pulls.onto(np.eye(about.mean.size)[:, kept])
-        prior = Gaussian(about.mean[kept], about.scale[np.ix_(kept, kept)])
-        corrected = correct_posterior(prior, mine, pulls)
+
+    found: Estimate
+    pulls: Pulls
+
+    @classmethod
+    def of(
+        cls, data: AbstractData, likelihood: AbstractLikelihood, found: Estimate
+    ) -> "_Linear":
+        """Linearised at the fit."""
+        if isinstance(data, WindowData) and isinstance(likelihood, WindowsLikelihood):
+            return cls(found, pulls_of_windows(likelihood, found, data.recording))
+        scores = np.asarray(found.scores).sum(axis=0)
+        one = np.asarray(found.information)[None], scores[None], np.zeros(1, int)
+        return cls(found, Pulls(*one))
+
+    def posterior(
+        self, kept: Int[np.ndarray, " k"], wider: Float[np.ndarray, " p"] | None = None
+    ) -> tuple[Gaussian, float]:
+        """Of the parameters at some places; how many samples count as one.
+
+        The others are held, and ``wider`` multiplies the prior's sd. Of windows both
+        are corrected for errors that are coloured.
+        """
+        about, p = self.found.prior, self.found.prior.mean.size
+        wider = np.ones(p) if wider is None else np.asarray(wider)
+        pulls = self.pulls.onto((np.eye(p) * wider)[:, kept])
+        scale = (np.asarray(about.scale) * wider)[np.ix_(kept, kept)]
+        prior = Gaussian(about.mean[kept], jnp.asarray(scale))
+        plain = posterior_of(prior, self.found.posterior.mean[kept], pulls)
+        corrected = correct_posterior(prior, plain, pulls)
         if corrected.enough:
             return corrected.posterior, max(corrected.inflation, 1.0)
-    return mine, 1.0
+        return plain, 1.0
 
 
 @dataclass(frozen=True)
@@ -220,4 +272,4 @@ def _with_free_sizes(
     wide = prior.as_gaussian()
     start = wide.whitened(best.posterior.mean)[None]
     about = ParameterPrior(wide, prior.table.without_groups())
-    return estimate(likelihood, about, starts=start, noise=best.noise)
+    return estimate(likelihood, about, starts=start, noise=best.noise, until=NEAR)
