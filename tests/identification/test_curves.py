@@ -7,7 +7,13 @@ import pytest
 
 from sim2gp.data.logs import Log
 from sim2gp.data.split_log import cut
-from sim2gp.identification.missing_physics.curves import curves_of, functions_of
+from sim2gp.identification.missing_physics.curves import (
+    LEVEL,
+    SHARE,
+    band_width,
+    curves_of,
+    functions_of,
+)
 from sim2gp.identification.missing_physics.reach import box_of
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.systems import Furuta, UniformRodArm, free_parts
@@ -53,6 +59,27 @@ def test_curves_are_the_functions_of_drawn_weights():
         noise = curve.sd[7] / np.sqrt(len(drawn))
         assert abs(total.mean() - curve.mean[7]) < 4.0 * noise
         assert total.std() == pytest.approx(curve.sd[7], rel=0.06)
+
+
+@pytest.mark.parametrize("length", [0.05, 0.2, 1.0])
+def test_a_band_holds_nine_tenths_of_a_curve_with_its_probability(length: float):
+    """Of other draws; two-sided sd, which hold for a value, hold fewer curves."""
+    x, rng = np.linspace(0.0, 1.0, 101), np.random.default_rng(1)
+    C = (
+        np.exp(-0.5 * (x[:, None] - x[None]) ** 2 / length**2)
+        * (1.0 + x[:, None])
+        * (1.0 + x[None])
+    )
+    values, vectors = np.linalg.eigh(C)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    away = np.abs(root @ rng.standard_normal((101, 4000))) / (1.0 + x)[:, None]
+    inside = lambda width: np.mean(np.mean(away <= width, axis=0) >= SHARE)  # noqa: E731
+    assert inside(band_width(root)) == pytest.approx(LEVEL, abs=0.02)
+    assert inside(1.96) < LEVEL - 0.02
+
+
+def test_a_band_of_one_direction_is_two_sided():
+    assert band_width(np.ones((50, 1))) == pytest.approx(1.96, rel=0.05)
 
 
 def test_a_box_holds_where_the_recordings_have_been():

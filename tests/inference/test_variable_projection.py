@@ -20,6 +20,7 @@ from sim2gp.inference.variable_projection import SHAPES, projected
 pytestmark = pytest.mark.usefixtures("float64")
 T = np.linspace(0.0, 4.0, 80)
 RATE, WEIGHTS, NOISE = 5.0, (0.8, -1.3), 0.05
+ANY = jnp.full(1, jnp.inf)  # known noise: whatever is found is less
 TABLE = Parameters(
     (
         Parameter("rate", "1/s", "", "bounded", 0.5, 6.0),
@@ -70,7 +71,7 @@ def at_rate(rate):
 def test_a_start_has_its_weights_and_noise_at_the_profile():
     """As scipy finds them at the same rate: the given one, which explains more."""
     likelihood = waves()
-    start, noise = projected(likelihood, prior(), at_rate(RATE + 0.1))
+    start, noise = projected(likelihood, prior(), at_rate(RATE + 0.1), ANY)
     about = prior().gaussian
     tt = np.asarray(about.at(start))
     assert float(TABLE.constrain(jnp.asarray(tt))[0]) == pytest.approx(RATE + 0.1)
@@ -91,7 +92,7 @@ def test_a_start_has_its_weights_and_noise_at_the_profile():
 
 def test_a_descent_from_there_finds_what_one_from_the_mean_does_not():
     likelihood, unit = waves(), jnp.ones(1)
-    start, left = projected(likelihood, prior(), at_rate(RATE + 0.1))
+    start, left = projected(likelihood, prior(), at_rate(RATE + 0.1), ANY)
 
     @eqx.filter_jit
     def fit(z, sd):
@@ -106,7 +107,7 @@ def test_a_descent_from_there_finds_what_one_from_the_mean_does_not():
 
 @pytest.mark.parametrize("rate", [0.7, np.nan])
 def test_the_mean_is_better_than_a_start_that_explains_less(rate):
-    start, noise = projected(waves(), prior(), at_rate(rate))
+    start, noise = projected(waves(), prior(), at_rate(rate), ANY)
     assert float(start[0]) == 0.0
     assert np.isfinite(float(noise[0]))
 
@@ -156,10 +157,26 @@ def test_a_shape_is_searched_from_the_parameters_that_are_given():
     about = ParameterPrior(ABRUPT.prior(), ABRUPT)
     true = about.gaussian.whitened(ABRUPT.unconstrain(jnp.asarray([47.0, 0.8, EDGE])))
     also = true.at[1:].set(0.0)
-    start, noise = projected(likelihood, about, also)
+    start, noise = projected(likelihood, about, also, ANY)
     assert float(start[0]) == pytest.approx(float(also[0]))
     spacing = float(SHAPES[1] - SHAPES[0])
     assert abs(float(start[2] - true[2])) < 0.51 * spacing
     assert float(start[1]) == pytest.approx(float(true[1]), rel=0.2)
-    alone = projected(likelihood, about, jnp.zeros(3))[1]
+    alone = projected(likelihood, about, jnp.zeros(3), ANY)[1]
     assert float(noise[0]) < 0.5 * float(alone[0])
+
+
+def test_no_shape_is_searched_where_a_fit_is_as_good():
+    """The usual shape at the better of two places, with the noise that it leaves."""
+    rng = np.random.default_rng(0)
+    y = 0.8 * (T > EDGE) * np.sin(47.0 * T) + 0.02 * rng.normal(size=T.size)
+    likelihood = Late(
+        jnp.full((1, 1), float(T.size)), jnp.full(1, 1e-6), jnp.asarray(y)
+    )
+    about = ParameterPrior(ABRUPT.prior(), ABRUPT)
+    true = about.gaussian.whitened(ABRUPT.unconstrain(jnp.asarray([47.0, 0.8, EDGE])))
+    also = true.at[1:].set(0.0)
+    start, noise = projected(likelihood, about, also, jnp.zeros(1))
+    assert float(start[2]) == 0.0
+    searched = projected(likelihood, about, also, noise + 1e-9)
+    assert float(searched[0][2]) != 0.0

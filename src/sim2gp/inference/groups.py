@@ -76,10 +76,10 @@ def estimate_groups(
         done, before, left = carry
         z, sd = jax.lax.cond(
             start.project & ~done,
-            lambda: projected(some, prior, before),
+            lambda: projected(some, prior, before, left / SAME),
             lambda: (start.z, start.noise),
         )
-        done = done | (start.project & jnp.all(SAME * sd >= left))
+        done = done | (start.project & jnp.all(sd >= left / SAME))
         found = jax.lax.cond(done, skip, descend, start._replace(z=z, noise=sd))
         same = jnp.all(found.noise.sd <= SAME * start.noise)
         ended = found.convergence.status == CONVERGED

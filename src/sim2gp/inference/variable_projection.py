@@ -6,7 +6,8 @@ Pereyra 1973, SIAM Journal on Numerical Analysis 10):
     w = argmin sum_c N_c log s_c(w) + 1/2 ||w||^2,    s_c^2 = mean ||r_c + J_c w||^2
 
 A descent may begin there, with the noise that is left. It does not find a shape that
-turns suddenly, as the width of a dead zone: that is tried over its prior's range.
+turns suddenly, as the width of a dead zone: where the usual shapes already explain what
+another fit does not, each is tried over its prior's range.
 """
 
 import jax
@@ -26,11 +27,13 @@ def projected(
     likelihood: AbstractLikelihood,
     prior: ParameterPrior,
     also: Float[Array, " p"],
+    known: Float[Array, " c"],
 ) -> tuple[Float[Array, " p"], Float[Array, " c"]]:
     """A whitened start with its weights of groups, and the noise sd that they leave.
 
     The better of the prior's mean and ``also`` (whitened), for which the weights are
-    solved; then each shape of a function in turn, searched along its own axis.
+    solved. Where that leaves some channel less noise than is ``known``, each shape of a
+    function in turn is searched along its own axis.
     """
     places, about = np.asarray(prior.linear), prior.gaussian
     p, shapes = about.mean.size, np.flatnonzero([p.shape for p in prior.table.free])
@@ -56,22 +59,26 @@ def projected(
         cost = 0.5 * (N @ jnp.log(s2) + w @ w + z @ z)
         return cost, z.at[places].set(w), jnp.sqrt(s2)
 
-    def better(carry: tuple, plan: tuple) -> tuple[tuple, None]:
+    def unfinished(carry: tuple) -> Array:
+        i, _, best = carry
+        return (i < 2) | ((i < len(values)) & jnp.any(best[2] < known))
+
+    def better(carry: tuple) -> tuple:
         """The best so far and one more: some of its entries have other values."""
-        about, best = carry
-        value, replaced, begins = plan
-        about = jnp.where(begins, best[1], about)
-        found = one(jnp.where(replaced, value, about).at[places].set(0.0))
+        i, about, best = carry
+        about = jnp.where(begins[i], best[1], about)
+        found = one(jnp.where(replaced[i], values[i], about).at[places].set(0.0))
         less = found[0] < best[0]
         best = jax.tree.map(lambda x, y: jnp.where(less, x, y), found, best)
-        return (about, best), None
+        return i + 1, about, best
 
     axes = np.repeat(np.eye(p)[shapes], len(SHAPES), axis=0)
     sizes = np.tile(SHAPES, len(shapes))[:, None]
     values = jnp.concatenate([jnp.zeros((1, p)), also[None], sizes * axes])
-    replaced = np.concatenate([np.ones((2, p), bool), axes > 0.0])
-    begins = np.arange(len(values)) % len(SHAPES) == 2  # the search of a shape
+    replaced = jnp.asarray(np.concatenate([np.ones((2, p), bool), axes > 0.0]))
+    # The search of a shape begins where the last one ended.
+    begins = jnp.asarray(np.arange(len(values)) % len(SHAPES) == 2)
     best = jnp.asarray(jnp.inf), jnp.zeros(p), first.sd
-    plans = values, jnp.asarray(replaced), jnp.asarray(begins)
-    (_, (_, start, noise)), _ = jax.lax.scan(better, (best[1], best), plans)
-    return start, noise
+    start = jnp.zeros((), int), best[1], best
+    _, _, (_, found, noise) = jax.lax.while_loop(unfinished, better, start)
+    return found, noise

@@ -6,7 +6,6 @@ from sim2gp.reports import svg
 from sim2gp.reports.parameters import Arrays, Section, Summary
 
 _SIZE = 420.0, 190.0
-TWO_SIDED = 1.96  # sd of a 95 % band
 
 
 def missing_forces(summary: Summary, arrays: Arrays) -> Section:
@@ -16,8 +15,8 @@ def missing_forces(summary: Summary, arrays: Arrays) -> Section:
     for name, about in known.items():
         if f"forces/{name}" not in arrays:
             continue
-        at, mean, sd = np.asarray(arrays[f"forces/{name}"], float)
-        ends = mean - TWO_SIDED * sd, mean + TWO_SIDED * sd
+        at, mean, _, half = np.asarray(arrays[f"forces/{name}"], float)
+        ends = mean - half, mean + half
         x = float(at[0]), float(at[-1])
         axes = svg.Axes(
             x, svg.span(*ends, np.zeros(1)), *_SIZE, x_label=about["of_unit"]

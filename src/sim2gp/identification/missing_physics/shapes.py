@@ -31,7 +31,7 @@ import numpy as np
 import scipy.stats
 from jaxtyping import Float
 
-from sim2gp.identification.missing_physics.curves import Curve
+from sim2gp.identification.missing_physics.curves import SHARE, Curve
 from sim2gp.identification.words import digits
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.effects.base import AbstractEffect, AbstractJointForce
@@ -45,8 +45,7 @@ from sim2gp.systems.effects.tables import (
 from sim2gp.systems.machine import plant_of
 from sim2gp.types import in_float64
 
-TWO_SIDED = 1.96  # sd of a 95 % band
-LEVEL, SHARE = 0.99, 0.9  # of the chi-square law; of the range, inside the band
+LEVEL = 0.99  # of the chi-square law
 RESOLVED = 1.0 / 3.0  # of the band's rms sd
 CLEAR = 2.0  # sd of a magnitude
 ABOUT = 0.05  # of a range: where a spring still pulls to zero
@@ -230,6 +229,6 @@ def _fit(
     left = curve.mean - (Phi / size) @ weights
     chi2 = float(np.sum((white[:, -1] - white[:, :-1] @ weights) ** 2))
     freedom = float(np.trace(np.linalg.solve(S, C)))
-    inside = float(np.mean(np.abs(left) <= TWO_SIDED * sd))
+    inside = float(np.mean(np.abs(left) <= curve.half_band))
     about = weights / size, float(spread[0]), chi2, freedom, inside, shaped
     return Fit(effect, *about)
