@@ -4,15 +4,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.stats
 
 import planted_forces as study
 from sim2gp.data.one_step import OneStepLikelihood
 from sim2gp.data.transitions import Transitions
 from sim2gp.identification.missing_physics.curves import Curve
-from sim2gp.identification.missing_physics.data import FREE
+from sim2gp.identification.missing_physics.data import FREE, OneStepData
 from sim2gp.identification.missing_physics.forces import (
+    EXCLUDED,
     SHARE,
     FoundForces,
+    _largest,
+    _Linear,
     _of_free_size,
     _with_free_sizes,
     find_forces,
@@ -20,7 +24,7 @@ from sim2gp.identification.missing_physics.forces import (
 from sim2gp.inference.estimate import estimate
 from sim2gp.inference.parameters import Parameter, Parameters
 from sim2gp.inference.prior import ParameterPrior
-from sim2gp.inference.relevance import OFF
+from sim2gp.inference.relevance import OFF, TRIED
 from sim2gp.systems import ODE, Channel, UniformRodArm
 from sim2gp.systems.effects.missing import missing_forces
 
@@ -35,13 +39,13 @@ MACHINES = Parameters(
 )
 
 
-def pushed() -> OneStepLikelihood:
+def pushed(weight: float = LARGE) -> OneStepLikelihood:
     """A mass that twelve weights push, of which one is there.
 
     Weights over the mass are what data determine; the mass has its prior.
     """
     rng = np.random.default_rng(1)
-    after = SHAPE[:, 0] * LARGE + SD * rng.normal(size=400)
+    after = SHAPE[:, 0] * weight + SD * rng.normal(size=400)
 
     def slope(k, s, a):
         weights = jnp.stack([k[f"w{i}"] for i in range(COUNT)])
@@ -74,6 +78,37 @@ def test_free_sizes_are_not_drawn_to_zero_with_the_mass() -> None:
     assert ratio == pytest.approx(LARGE, abs=0.02)
     # The band of the weight has the mass's.
     assert float(wide.posterior.sd()[1]) == pytest.approx(0.4, rel=0.1)
+
+
+@pytest.mark.usefixtures("float64")
+def test_a_force_that_is_off_has_the_band_that_data_leave() -> None:
+    """At the largest scale that costs no more than two nats: both by closed forms."""
+    likelihood = pushed(0.0)
+    about = ParameterPrior(MACHINES.prior(), MACHINES, jnp.full(1, OFF))
+    zero = jnp.zeros((1, COUNT + 1))
+    found = jax.jit(lambda z: estimate(likelihood, about, starts=z))(zero)
+    off, prior_sd = about.scaled(about.scales_in(found.prior)), MACHINES.free[1].sd
+    assert float(off.scales[0]) == pytest.approx(OFF)
+    y, sd = np.asarray(likelihood.data.next_state)[:, 0], float(found.noise.sd[0])
+
+    def gain(scale: float) -> float:
+        C = sd**2 * np.eye(len(y)) + (scale * prior_sd) ** 2 * SHAPE @ SHAPE.T
+        log = scipy.stats.multivariate_normal(cov=C).logpdf(y)
+        return float(log - scipy.stats.norm(scale=sd).logpdf(y).sum())
+
+    largest = float(_largest(found, off, 1.0)[0])
+    assert largest == max(t for t in TRIED if gain(t) >= -EXCLUDED)
+    assert float(_largest(found, off, 4.0)[0]) > largest
+    wider = np.where(np.arange(COUNT + 1) > 0, largest / OFF, 1.0)
+    data = OneStepData(likelihood.system, [(np.zeros((401, 1)), SHAPE)])
+    linear = _Linear.of(data, likelihood, found)
+    band, alike = linear.posterior(np.arange(COUNT + 1), wider)
+    precision = SHAPE.T @ SHAPE / sd**2 + np.eye(COUNT) / (largest * prior_sd) ** 2
+    covariance = np.linalg.inv(precision)
+    np.testing.assert_allclose(band.covariance()[1:, 1:], covariance, rtol=1e-3)
+    mean = covariance @ SHAPE.T @ y / sd**2
+    np.testing.assert_allclose(band.mean[1:], mean, rtol=1e-3, atol=1e-6)
+    assert alike == 1.0
 
 
 def test_a_force_is_as_probable_as_the_functions_it_is_the_sum_of() -> None:

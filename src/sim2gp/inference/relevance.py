@@ -48,7 +48,7 @@ EARNED = 3.0  # nats: noise alone gives one group as much in 1 of 400 cases
 OFF, MOST = 1e-4, 20.0
 ON = 10.0 * OFF  # from here on a group is on
 NEVER = 0.1 * OFF  # a group of this scale stays off
-TRIED = np.geomspace(0.01, MOST, 24)  # scales of a group that may be turned on
+TRIED = np.geomspace(1.2 * ON, MOST, 32)  # scales of a group that may be turned on
 
 
 class Linear(NamedTuple):

@@ -176,7 +176,7 @@ def _largest(
 ) -> Float[np.ndarray, " g"]:
     """The largest scale of each function that is off which the data do not exclude."""
     each, about = prior.each(), prior.gaussian
-    R, gradient = found.information / each, -found.scores.sum(axis=0) / each
+    R, gradient = found.information / each[None], -found.scores.sum(axis=0) / each
     root = jnp.linalg.solve(about.scale, found.posterior.scale)
     gains = gains_if_on(R.T @ R, gradient, root @ root.T, prior.members)
     possible = np.asarray(gains) >= -EXCLUDED * alike
