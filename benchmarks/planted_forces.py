@@ -39,7 +39,7 @@ from interval_arms import FREQUENCIES, NOISE, PERIOD, SECONDS, TORQUE
 from planted_effects import data_of
 from sim2gp.data.logs import Log
 from sim2gp.data.split_log import cut
-from sim2gp.identification.missing_physics.curves import Curve, band_width
+from sim2gp.identification.missing_physics.curves import SHARE, Curve, band_width
 from sim2gp.identification.missing_physics.data import AbstractData, WindowData
 from sim2gp.identification.missing_physics.forces import find_forces
 from sim2gp.planning.tasks import MACHINES
@@ -53,7 +53,6 @@ ROOT = Path(__file__).resolve().parents[1]
 NOTHING = "nothing"
 ARM = "arm"
 POINTS, WINDOW = 200, 0.2
-SHARE = 0.9  # of the range, inside the band
 #: Per machine: on which joint (or input) and how large, for each kind of variable.
 PLACES: dict[str, dict[str, tuple[str, float]]] = {
     "furuta": {"position": ("theta", 6e-3), "velocity": ("theta", 4e-3)},

@@ -147,8 +147,8 @@ class Late(Waves):
         return w * began * jnp.sin(rate * T) - self.y
 
 
-def test_a_shape_is_searched_from_the_parameters_that_are_given():
-    """To the nearest point of the search; the rate is that of ``also``."""
+def late() -> tuple[Late, ParameterPrior, Array]:
+    """Data, the prior, and the true parameters, whitened."""
     rng = np.random.default_rng(0)
     y = 0.8 * (T > EDGE) * np.sin(47.0 * T) + 0.02 * rng.normal(size=T.size)
     likelihood = Late(
@@ -156,6 +156,12 @@ def test_a_shape_is_searched_from_the_parameters_that_are_given():
     )
     about = ParameterPrior(ABRUPT.prior(), ABRUPT)
     true = about.gaussian.whitened(ABRUPT.unconstrain(jnp.asarray([47.0, 0.8, EDGE])))
+    return likelihood, about, true
+
+
+def test_a_shape_is_searched_from_the_parameters_that_are_given():
+    """To the nearest point of the search; the rate is that of ``also``."""
+    likelihood, about, true = late()
     also = true.at[1:].set(0.0)
     start, noise = projected(likelihood, about, also, ANY)
     assert float(start[0]) == pytest.approx(float(also[0]))
@@ -168,13 +174,7 @@ def test_a_shape_is_searched_from_the_parameters_that_are_given():
 
 def test_no_shape_is_searched_where_a_fit_is_as_good():
     """The usual shape at the better of two places, with the noise that it leaves."""
-    rng = np.random.default_rng(0)
-    y = 0.8 * (T > EDGE) * np.sin(47.0 * T) + 0.02 * rng.normal(size=T.size)
-    likelihood = Late(
-        jnp.full((1, 1), float(T.size)), jnp.full(1, 1e-6), jnp.asarray(y)
-    )
-    about = ParameterPrior(ABRUPT.prior(), ABRUPT)
-    true = about.gaussian.whitened(ABRUPT.unconstrain(jnp.asarray([47.0, 0.8, EDGE])))
+    likelihood, about, true = late()
     also = true.at[1:].set(0.0)
     start, noise = projected(likelihood, about, also, jnp.zeros(1))
     assert float(start[2]) == 0.0

@@ -103,11 +103,11 @@ class WindowsLikelihood(AbstractLikelihood):
                 return self.simulated(window, tt + scale @ x[n:], e + x[:n])[0]
 
             r, J = value_and_jacobian(residual, jnp.zeros(n + p))
-            rows = jnp.concatenate([J, r[..., None]], axis=-1)
             # What was measured, before rows of zeros.
             order = jnp.argsort(~window.mask, axis=0, stable=True)[: self.most]
-            some = jnp.take_along_axis(rows, order[..., None], axis=0)
-            return jax.vmap(factor, in_axes=1)(some[..., :-1], some[..., -1])
+            r = jnp.take_along_axis(r, order, axis=0)
+            J = jnp.take_along_axis(J, order[..., None], axis=0)
+            return jax.vmap(factor, in_axes=1)(J, r)
 
         found: Array = self.windows.each(one, e)
         return found

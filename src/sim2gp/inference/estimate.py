@@ -228,9 +228,9 @@ def _estimate(
     start, learning = (starts, nuisances, noise), Learning()
     if learn:
         scales = Scales(choose, score) if _is_scaled(prior) else None
-        until = NEAR if scales else until
-        near = {"until": until, "still": STILL} if until else {}
-        learning = Learning(learned, scales, **near)
+        learning = Learning(learned, scales)
+        if scales or until:
+            learning = learning._replace(until=until or NEAR, still=STILL)
     at, noise, prior, steps, _ = multi_start(likelihood, prior, *start, learning)
     return _about(laplace(at, noise), noise, prior, counts, steps)
 

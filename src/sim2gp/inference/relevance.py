@@ -37,6 +37,7 @@ from jaxtyping import Array, Float
 
 from sim2gp.inference.arrowhead import Noise
 from sim2gp.inference.laplace import Laplace
+from sim2gp.inference.linalg import eigh
 from sim2gp.inference.prior import ParameterPrior
 from sim2gp.types import AnyScalar, Scalar
 
@@ -128,9 +129,8 @@ def _one_more(
     gradient = -(total[:-1, :-1] @ (x - z) + total[:-1, -1])
     gains = gains_if_on(total[:-1, :-1], gradient, S, prior.members)
     off = (scales > NEVER) & (scales <= ON)
-    group, k = jnp.unravel_index(
-        jnp.argmax(jnp.where(off[:, None], gains, -jnp.inf)), gains.shape
-    )
+    best = jnp.argmax(jnp.where(off[:, None], gains, -jnp.inf))
+    group, k = jnp.unravel_index(best, gains.shape)
     earns = off[group] & (gains[group, k] > EARNED)
     more = jnp.where(earns, jnp.asarray(TRIED)[k], scales[group])
     return scales.at[group].set(more)
@@ -152,7 +152,7 @@ def gains_if_on(
     own = np.take_along_axis(members, places, axis=1)
     rest = information - information @ covariance @ information
     s = rest[places[:, :, None], places[:, None]] * own[:, :, None] * own[:, None]
-    known, U = jnp.linalg.eigh(s)
+    known, U = jax.vmap(eigh)(s)
     q = jnp.einsum("gij,gi->gj", U, gradient[places] * own)
     tau2 = jnp.asarray(TRIED**2)[None, :, None]
     known, q = jnp.maximum(known, 0.0)[:, None], q[:, None]

@@ -63,7 +63,7 @@ from sim2gp.identification.misfit.tests import must_be_finite
 from sim2gp.identification.missing_physics.curves import Curve
 from sim2gp.identification.words import digits
 from sim2gp.inference.gaussian import Gaussian
-from sim2gp.inference.least_squares import RANK_TOLERANCE
+from sim2gp.inference.least_squares import RANK_TOLERANCE, over
 from sim2gp.types import AnyArray, in_float64
 
 #: Below so many degrees of freedom nothing is said about the windows' scatter.
@@ -125,10 +125,8 @@ def correct_posterior(
     for what in (pulls.factors, pulls.scores):
         must_be_finite("pulls of windows", what, "the intervals")
     L0, mu0 = np.asarray(prior.scale), np.asarray(prior.mean)
-    z, p = np.linalg.solve(L0, np.asarray(plain.mean) - mu0), len(mu0)
-    A = np.concatenate(list(pulls.factors))
-    R = np.asarray(np.linalg.qr(np.concatenate([A, np.eye(p)]), mode="r"))
-    z, pulls = _at_the_map(z, pulls, R)
+    z, pulls, A, R = _at_the_map(prior, plain.mean, pulls)
+    p = len(mu0)
     _, s, Vt = np.linalg.svd(A, full_matrices=False)
     seen = ~(s <= RANK_TOLERANCE * s.max(initial=0.0))
     s, Vt = s[seen], Vt[seen]
@@ -158,12 +156,9 @@ def correct_posterior(
 @in_float64
 def posterior_of(prior: Gaussian, at: Float[AnyArray, " p"], pulls: Pulls) -> Gaussian:
     """Of a linear machine whose every sample is new; pulls were taken at ``at``."""
-    L0, p = np.asarray(prior.scale), prior.mean.size
-    A = np.concatenate([*pulls.factors, np.eye(p)])
-    R = np.asarray(np.linalg.qr(A, mode="r"))
-    z, _ = _at_the_map(np.linalg.solve(L0, np.asarray(at - prior.mean)), pulls, R)
-    scale = np.linalg.solve(R.T, L0.T).T
-    return Gaussian(prior.mean + jnp.asarray(L0 @ z), jnp.asarray(scale))
+    z, _, _, R = _at_the_map(prior, at, pulls)
+    scale = over(np.asarray(prior.scale), R)
+    return Gaussian(prior.at(jnp.asarray(z)), jnp.asarray(scale))
 
 
 def describe_intervals(
@@ -256,11 +251,20 @@ def _missing_physics_remark(found: CorrectedFit) -> str:
 
 
 def _at_the_map(
-    z: Float[np.ndarray, " p"], pulls: Pulls, R: Float[np.ndarray, "p p"]
-) -> tuple[Float[np.ndarray, " p"], Pulls]:
-    """The MAP of what is linear, and the pulls there: the same where ``z`` is it."""
+    prior: Gaussian, at: Float[AnyArray, " p"], pulls: Pulls
+) -> tuple[
+    Float[np.ndarray, " p"],
+    Pulls,
+    Float[np.ndarray, "r p"],
+    Float[np.ndarray, "p p"],
+]:
+    """The MAP of what is linear, whitened, and the pulls there: the same where ``at``
+    is it; the rows of all windows, and R."""
+    z = np.asarray(prior.whitened(jnp.asarray(at)))
+    A = np.concatenate(list(pulls.factors))
+    R = np.asarray(np.linalg.qr(np.concatenate([A, np.eye(len(z))]), mode="r"))
     step = -np.linalg.solve(R, np.linalg.solve(R.T, z + pulls.scores.sum(axis=0)))
-    return z + step, pulls.at(step)
+    return z + step, pulls.at(step), A, R
 
 
 def _whitened(
