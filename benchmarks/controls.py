@@ -88,8 +88,8 @@ class WithoutRelevance(AbstractLessForces):
         prior: ParameterPrior,
         last: Start,
     ) -> Estimate:
-        some, any_noise = likelihood.thinned(ROWS), jnp.full(last.noise.shape, jnp.inf)
-        z, sd = eqx.filter_jit(projected)(some, prior, last.z, any_noise)
+        some = likelihood.thinned(ROWS)
+        z, sd, _ = eqx.filter_jit(projected)(some, prior, last.z)
         given = GivenScales(prior)
         noise = Noise(sd, jnp.ones(1))
         return estimate(likelihood, given, starts=z[None], noise=noise)

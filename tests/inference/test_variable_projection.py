@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
+import scipy.stats
 from jaxtyping import Array
 
 from sim2gp.inference.arrowhead import Noise
@@ -20,7 +21,6 @@ from sim2gp.inference.variable_projection import SHAPES, projected
 pytestmark = pytest.mark.usefixtures("float64")
 T = np.linspace(0.0, 4.0, 80)
 RATE, WEIGHTS, NOISE = 5.0, (0.8, -1.3), 0.05
-ANY = jnp.full(1, jnp.inf)  # known noise: whatever is found is less
 TABLE = Parameters(
     (
         Parameter("rate", "1/s", "", "bounded", 0.5, 6.0),
@@ -69,30 +69,52 @@ def at_rate(rate):
 
 
 def test_a_start_has_its_weights_and_noise_at_the_profile():
-    """As scipy finds them at the same rate: the given one, which explains more."""
+    """The noise of highest evidence, and the ridge solution under it, at the better
+    rate: the given one."""
     likelihood = waves()
-    start, noise = projected(likelihood, prior(), at_rate(RATE + 0.1), ANY)
+    start, noise, less = projected(likelihood, prior(), at_rate(RATE + 0.1))
     about = prior().gaussian
-    tt = np.asarray(about.at(start))
-    assert float(TABLE.constrain(jnp.asarray(tt))[0]) == pytest.approx(RATE + 0.1)
+    rate = float(TABLE.constrain(about.at(start))[0])
+    assert rate == pytest.approx(RATE + 0.1)
+    assert bool(less)
+    A = 2.0 * np.stack([np.sin(rate * T), np.cos(rate * T)], axis=1)
+    y = np.asarray(likelihood.y)
 
-    def cost(x):
-        z = np.asarray(start).copy()
-        z[1:] = x[:2]
-        r = np.asarray(likelihood.residual(about.at(jnp.asarray(z))))
+    def cost(log_variance):
+        C = A @ A.T + np.exp(log_variance) * np.eye(T.size)
         # Two more samples at the floor, as everywhere.
-        scatter = (2e-12 + r @ r) / (2.0 + r.size)
-        return 0.5 * r.size * np.log(scatter) + 0.5 * (x[:2] @ x[:2])
+        floor = log_variance + 1e-12 / np.exp(log_variance)
+        return -scipy.stats.multivariate_normal(cov=C).logpdf(y) + floor
 
-    best = scipy.optimize.minimize(cost, np.asarray(start)[1:], tol=1e-12)
-    np.testing.assert_allclose(start[1:], best.x, atol=1e-4)
-    r = likelihood.residual(jnp.asarray(tt))
-    assert float(noise[0]) == pytest.approx(float(jnp.sqrt(jnp.mean(r**2))), rel=0.02)
+    best = scipy.optimize.minimize_scalar(cost, (-6.0, 0.0), tol=1e-12).x
+    assert float(noise[0]) == pytest.approx(np.exp(0.5 * best), rel=1e-5)
+    ridge = np.linalg.solve(A.T @ A + np.exp(best) * np.eye(2), A.T @ y)
+    np.testing.assert_allclose(start[1:], ridge, atol=1e-6)
+
+
+def test_many_weights_do_not_leave_few_rows_less_noise():
+    """Of noise alone: forty weights, sixty rows."""
+    rng = np.random.default_rng(1)
+    free = (
+        Parameter(f"w{k}", "1", "", "identity", sd=2.0, group="w") for k in range(40)
+    )
+    table, y = Parameters(tuple(free)), jnp.asarray(rng.normal(size=60))
+    A = jnp.asarray(rng.normal(size=(60, 40)))
+
+    class Noisy(Waves):
+        def residual(self, tt):
+            return A @ tt - self.y
+
+    likelihood = Noisy(jnp.full((1, 1), 60.0), jnp.full(1, 1e-6), y)
+    about = ParameterPrior(table.prior(), table)
+    _, noise, less = projected(likelihood, about, jnp.zeros(40))
+    assert not bool(less)
+    assert float(noise[0]) > 0.9 * float(jnp.std(y))
 
 
 def test_a_descent_from_there_finds_what_one_from_the_mean_does_not():
     likelihood, unit = waves(), jnp.ones(1)
-    start, left = projected(likelihood, prior(), at_rate(RATE + 0.1), ANY)
+    start, left, _ = projected(likelihood, prior(), at_rate(RATE + 0.1))
 
     @eqx.filter_jit
     def fit(z, sd):
@@ -107,7 +129,7 @@ def test_a_descent_from_there_finds_what_one_from_the_mean_does_not():
 
 @pytest.mark.parametrize("rate", [0.7, np.nan])
 def test_the_mean_is_better_than_a_start_that_explains_less(rate):
-    start, noise = projected(waves(), prior(), at_rate(rate), ANY)
+    start, noise, _ = projected(waves(), prior(), at_rate(rate))
     assert float(start[0]) == 0.0
     assert np.isfinite(float(noise[0]))
 
@@ -163,20 +185,21 @@ def test_a_shape_is_searched_from_the_parameters_that_are_given():
     """To the nearest point of the search; the rate is that of ``also``."""
     likelihood, about, true = late()
     also = true.at[1:].set(0.0)
-    start, noise = projected(likelihood, about, also, ANY)
+    start, noise, _ = projected(likelihood, about, also)
     assert float(start[0]) == pytest.approx(float(also[0]))
     spacing = float(SHAPES[1] - SHAPES[0])
     assert abs(float(start[2] - true[2])) < 0.51 * spacing
     assert float(start[1]) == pytest.approx(float(true[1]), rel=0.2)
-    alone = projected(likelihood, about, jnp.zeros(3), ANY)[1]
+    alone = projected(likelihood, about, jnp.zeros(3)).noise
     assert float(noise[0]) < 0.5 * float(alone[0])
 
 
 def test_no_shape_is_searched_where_a_fit_is_as_good():
-    """The usual shape at the better of two places, with the noise that it leaves."""
+    """The shape is the fit's where it has no more noise than that leaves."""
     likelihood, about, true = late()
-    also = true.at[1:].set(0.0)
-    start, noise = projected(likelihood, about, also, jnp.zeros(1))
-    assert float(start[2]) == 0.0
-    searched = projected(likelihood, about, also, noise + 1e-9)
-    assert float(searched[0][2]) != 0.0
+    z, _, less = projected(likelihood, about, true)
+    assert float(z[2]) == float(true[2])
+    assert not bool(less)
+    z, _, less = projected(likelihood, about, true.at[1:].set(0.0))
+    assert float(z[2]) not in (0.0, float(true[2]))
+    assert bool(less)

@@ -22,11 +22,10 @@ from sim2gp.inference.estimate import Estimate, estimate
 from sim2gp.inference.likelihood import AbstractLikelihood
 from sim2gp.inference.prior import ParameterPrior
 from sim2gp.inference.relevance import OFF
-from sim2gp.inference.variable_projection import projected
+from sim2gp.inference.variable_projection import SAME, Projected, projected
 
 BROAD = 3.0  # scale of every group in a first descent
 ROWS = 64  # that judge starts
-SAME = 1.2  # times another noise: no more than that, or no less
 
 
 class Start(NamedTuple):
@@ -72,23 +71,23 @@ def estimate_groups(
         none: Estimate = jax.tree.map(lambda x: jnp.full(x.shape, -1, x.dtype), shapes)
         return none
 
-    def turn(carry: tuple[Array, Array, Array], start: Start) -> tuple[Any, Estimate]:
-        done, before, left = carry
-        z, sd = jax.lax.cond(
+    def turn(carry: tuple[Array, Array], start: Start) -> tuple[Any, Estimate]:
+        done, before = carry
+        z, sd, less = jax.lax.cond(
             start.project & ~done,
-            lambda: projected(some, prior, before, left / SAME),
-            lambda: (start.z, start.noise),
+            lambda: projected(some, prior, before),
+            lambda: Projected(start.z, start.noise, ~no),
         )
-        done = done | (start.project & jnp.all(sd >= left / SAME))
+        done = done | ~less
         found = jax.lax.cond(done, skip, descend, start._replace(z=z, noise=sd))
         same = jnp.all(found.noise.sd <= SAME * start.noise)
         ended = found.convergence.status == CONVERGED
         now = prior.gaussian.whitened(found.posterior.mean)
         done = done | (start.enough & same & ended)
-        return (done, now, found.noise.sd), found
+        return (done, now), found
 
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *each)
-    _, found = jax.lax.scan(turn, (no, off, first.sd), stacked)
+    _, found = jax.lax.scan(turn, (no, off), stacked)
     there = found.convergence.status == CONVERGED
     there = there & jnp.isfinite(found.log_evidence)
     ranked = jnp.where(there, found.log_evidence, -jnp.inf)

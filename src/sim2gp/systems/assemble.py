@@ -37,11 +37,11 @@ def with_parts(
         return system
     machine, given = as_machine(system), dict(parameters or {})
     table, places = machine.parameters, {part.place for part in parts}
-    for part in (p for p in parts if p.name == p.place):
-        new = {k: v for k, v in part.values.items() if k not in names_of(table)}
-        table = table.merge(Parameters((), tuple(new.items())))
-        own = {name: given.get(name, value) for name, value in part.values.items()}
-        table = table.replace(**own)
+    own = (part.values for part in parts if part.name == part.place)
+    values = {name: value for each in own for name, value in each.items()}
+    new = {k: v for k, v in values.items() if k not in names_of(table)}
+    table = table.merge(Parameters((), tuple(new.items())))
+    table = table.replace(**{name: given.get(name, x) for name, x in values.items()})
     every = [*(p for p in machine.parts if p.place not in places), *parts]
     return Machine(
         machine.plant,

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from sim2gp.systems.base import LONGEST_MEAN, AbstractPlant
 from sim2gp.systems.effects.units import joints_of, velocity_of
@@ -43,16 +44,15 @@ def drives(plant: AbstractPlant) -> dict[str, Drive]:
     low = [c.low if math.isfinite(c.low) else -1.0 for c in plant.actions]
     inputs = [np.zeros(len(high)), *np.diag(high), *np.diag(low)]
 
-    def each(s: np.ndarray, a: np.ndarray) -> list[float]:
+    def each(s: Array, a: Array) -> Array:
         if isinstance(plant, AbstractMechanism):
-            at = jnp.asarray(s[:2]), jnp.zeros(2), jnp.asarray(a)
-            return [float(f) for f in plant.forces(params, *at)]
-        moved = flow(jnp.asarray(s), jnp.asarray(a))
-        return [float(moved[velocity_of(plant, c.name)]) for c in joints]
+            return jnp.stack(plant.forces(params, s[:2], jnp.zeros(2), a))
+        moved = (plant.flow(params, s, a, h) - s) / h
+        return moved[np.asarray([velocity_of(plant, c.name) for c in joints], int)]
 
     h = LONGEST_MEAN
-    flow = jax.jit(lambda s, a: (plant.flow(params, s, a, h) - s) / h)
-    found = np.abs([each(s, a) for s in (rest, away) for a in inputs])
+    pairs = [(s, a) for s in (rest, away) for a in inputs]
+    found = np.abs(jax.vmap(each)(*(jnp.asarray(x) for x in zip(*pairs, strict=True))))
     most = np.max(found, axis=0)
     forces = accelerations = np.where((most > 0.0) & np.isfinite(most), most, 1.0)
     if isinstance(plant, AbstractMechanism):
