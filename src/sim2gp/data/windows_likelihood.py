@@ -30,7 +30,7 @@ from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.least_squares import factor
 from sim2gp.inference.likelihood import AbstractLikelihood, Trial
 from sim2gp.inference.linalg import library
-from sim2gp.inference.linearized import jacobian_by_columns, value_and_jacobian
+from sim2gp.inference.linearized import value_and_jacobian
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.host import simulator_of
 from sim2gp.systems.simulate import inputs_of, simulate
@@ -229,17 +229,17 @@ def _linearise(
 ) -> Linearised:
     n, p = e.shape[1], scale.shape[1]
 
-    def rows(x: Array) -> tuple[Array, ...]:
-        def one(window: Windows, e: Array) -> tuple[Array, ...]:
+    def one(window: Windows, e: Array) -> Linearised:
+        def rows(x: Array) -> tuple[Array, ...]:
             at = tt + scale @ x[:p], e + x[p:]
             r, states, delays = likelihood.simulated(window, *at)
             return r, states, inputs_of(window, delays)
 
-        found: tuple[Array, ...] = likelihood.windows.each(one, e)
-        return found
+        (r, states, inputs), J = value_and_jacobian(rows, jnp.zeros(p + n))
+        return Linearised(r, J[0], states, inputs)
 
-    J, (r, states, inputs) = jacobian_by_columns(rows, jnp.zeros(p + n))
-    return Linearised(r, J, states, inputs)
+    found: Linearised = likelihood.windows.each(one, e)
+    return found
 
 
 def information_at(
