@@ -8,6 +8,7 @@ damping that grows with position.
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any, ClassVar
 
@@ -19,6 +20,7 @@ from residual_models import Ensemble, ProcessResidual
 from sim2gp.data.one_step import OneStepLikelihood
 from sim2gp.data.transitions import Transitions
 from sim2gp.inference.arrowhead import Noise
+from sim2gp.inference.convergence import converged
 from sim2gp.inference.estimate import Estimate, estimate
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.groups import BROAD, ROWS, Start
@@ -80,7 +82,11 @@ class WithoutProjection(AbstractLessForces):
 
 
 class WithoutRelevance(AbstractLessForces):
-    """All functions at the scale of their prior, always."""
+    """All functions at the scale of their prior, always.
+
+    The fit counts where it ended: the width of a dead zone that does nothing has a
+    valley without a bottom.
+    """
 
     def found(
         self,
@@ -92,7 +98,8 @@ class WithoutRelevance(AbstractLessForces):
         z, sd, _ = eqx.filter_jit(projected)(some, prior, last.z)
         given = GivenScales(prior)
         noise = Noise(sd, jnp.ones(1))
-        return estimate(likelihood, given, starts=z[None], noise=noise)
+        found = estimate(likelihood, given, starts=z[None], noise=noise)
+        return replace(found, convergence=converged(len(prior.table)))
 
 
 class GivenScales(AbstractPrior):

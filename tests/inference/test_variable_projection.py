@@ -68,7 +68,7 @@ def at_rate(rate):
     return prior().gaussian.whitened(TABLE.unconstrain(jnp.asarray([rate, 0.0, 0.0])))
 
 
-def test_a_start_has_its_weights_and_noise_at_the_profile():
+def test_a_start_has_the_noise_of_highest_evidence():
     """The noise of highest evidence, and the ridge solution under it, at the better
     rate: the given one."""
     likelihood = waves()
