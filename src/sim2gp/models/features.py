@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from sim2gp import checks
 from sim2gp.data.transitions import Transitions
 from sim2gp.systems.base import AbstractSystem, index_of
+from sim2gp.systems.trigonometry import cosine, sine
 from sim2gp.types import Action, Key, State
 
 #: Half-width of a channel without limits, by its unit: how far a small machine moves.
@@ -72,7 +73,7 @@ class Encoding(eqx.Module):
         parts = []
         for i, x in enumerate([*s, *a]):
             if self.angle[i]:
-                parts += [jnp.sin(x), jnp.cos(x)]
+                parts += [sine(x), cosine(x)]
             else:
                 middle = 0.5 * (self.low[i] + self.high[i])
                 parts.append((x - middle) / (0.5 * (self.high[i] - self.low[i])))

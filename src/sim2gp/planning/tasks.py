@@ -29,6 +29,7 @@ from sim2gp.systems import (
     Furuta,
     with_parts,
 )
+from sim2gp.systems.trigonometry import cosine
 from sim2gp.types import (
     Action,
     Box,
@@ -159,7 +160,7 @@ class PoleUpright(eqx.Module):
     pole: int = eqx.field(static=True)
 
     def __call__(self, s: State) -> Bool[Array, ""]:
-        return jnp.cos(s[self.pole]) < UPRIGHT_COSINE
+        return cosine(s[self.pole]) < UPRIGHT_COSINE
 
 
 class FurutaReward(eqx.Module):
@@ -172,7 +173,7 @@ class FurutaReward(eqx.Module):
         """The terms of the exponent, each at most zero; their sum is the log."""
         theta, alpha, arm_speed, pole_speed = s2[0], s2[1], s2[2], s2[3]
         return {
-            "height": -(1.0 + jnp.cos(alpha)),
+            "height": -(1.0 + cosine(alpha)),
             "arm": -0.1 * theta**2,
             "input": -3e-3 * a[0] ** 2,
             "arm_speed": -5e-3 * arm_speed**2,
@@ -194,7 +195,7 @@ class CartPoleReward(eqx.Module):
         x, theta, pole_speed = s2[0], s2[1], s2[3]
         rail = 0.1 * x**2 + 10.0 * jnp.maximum(jnp.abs(x) - 0.3, 0.0)
         return {
-            "height": 0.5 * (1.0 - jnp.cos(theta)),
+            "height": 0.5 * (1.0 - cosine(theta)),
             "rail": -rail,
             "pole_speed": -1e-4 * pole_speed**2,
             "input": -1e-3 * (a[0] / 3.0) ** 2,

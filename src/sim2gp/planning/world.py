@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from sim2gp import checks
+from sim2gp.systems.trigonometry import cosine, sine
 from sim2gp.types import Action, Box, Dynamics, Key, Reward, Scalar, State, check_reward
 
 #: A rollout beyond this magnitude has diverged, in any units.
@@ -110,7 +111,7 @@ class Observation(eqx.Module):
         scaled = s[: self.scale.size] / self.scale
         if self.angle is None:
             return scaled
-        turn = jnp.stack([jnp.sin(s[self.angle]), jnp.cos(s[self.angle])])
+        turn = jnp.stack([sine(s[self.angle]), cosine(s[self.angle])])
         rest = jnp.concatenate([scaled[: self.angle], scaled[self.angle + 1 :]])
         return jnp.concatenate([rest, turn])
 

@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 
 from sim2gp.inference.linalg import library
 from sim2gp.systems.effects.friction_laws import dead_zone
+from sim2gp.systems.trigonometry import cosine, sine
 from sim2gp.types import AnyArray
 
 #: Of the interval and of the kernel's length, in half-widths of where a machine moves.
@@ -59,31 +60,31 @@ class AbstractHarmonics(eqx.Module):
 
     def value(self, x: Float[AnyArray, "k *b"], z: Points) -> Points:
         """The function with weights ``x``."""
-        xp, (angle, _), half = library(z), self.angle(z), len(self.sines)
-        sine, cosine = xp.sin(angle), xp.cos(angle)
-        found: Points = sine * _clenshaw(x[:half], cosine)[0]
+        (angle, _), half = self.angle(z), len(self.sines)
+        sin, cos = sine(angle), cosine(angle)
+        found: Points = sin * _clenshaw(x[:half], cos)[0]
         if self.cosines:
-            first, second = _clenshaw(x[half:], cosine)
-            found = found + cosine * first - second
+            first, second = _clenshaw(x[half:], cos)
+            found = found + cos * first - second
         return found
 
     def slope(self, x: Float[AnyArray, "k *b"], z: Points) -> Points:
         """Its derivative."""
-        xp, (angle, rate), half = library(z), self.angle(z), len(self.sines)
-        sine, cosine = xp.sin(angle), xp.cos(angle)
-        first, second = _clenshaw(_times_order(x[:half]), cosine)
-        slope = cosine * first - second
+        (angle, rate), half = self.angle(z), len(self.sines)
+        sin, cos = sine(angle), cosine(angle)
+        first, second = _clenshaw(_times_order(x[:half]), cos)
+        slope = cos * first - second
         if self.cosines:
-            slope = slope - sine * _clenshaw(_times_order(x[half:]), cosine)[0]
+            slope = slope - sin * _clenshaw(_times_order(x[half:]), cos)[0]
         return rate * slope
 
     def features(self, z: Float[AnyArray, "*b"]) -> Float[AnyArray, "*b k"]:
         """Its values for each weight alone."""
         xp, (angle, _) = library(z), self.angle(z)
-        sine, cosine = xp.sin(angle), xp.cos(angle)
-        found = _multiples(xp.zeros_like(sine), sine, cosine, len(self.sines))
+        sin, cos = sine(angle), cosine(angle)
+        found = _multiples(xp.zeros_like(sin), sin, cos, len(self.sines))
         if self.cosines:
-            found += _multiples(xp.ones_like(sine), cosine, cosine, len(self.cosines))
+            found += _multiples(xp.ones_like(sin), cos, cos, len(self.cosines))
         return xp.stack(found, axis=-1)
 
 
@@ -135,27 +136,26 @@ def _times_order(x: Float[AnyArray, "k *b"]) -> Float[AnyArray, "k *b"]:
     return (x.T * k).T
 
 
-def _clenshaw(x: Float[AnyArray, "k *b"], cosine: Points) -> tuple[Points, Points]:
+def _clenshaw(x: Float[AnyArray, "k *b"], cos: Points) -> tuple[Points, Points]:
     """``b_1`` and ``b_2`` of Clenshaw's recurrence.
 
     ``sum x_k sin(k a) = b_1 sin(a)`` and ``sum x_k cos(k a) = b_1 cos(a) - b_2``: one
-    sine and one cosine, and nothing that must be kept.
+    sin and one cos, and nothing that must be kept.
     """
-    first, second = x[-1] + 0.0 * cosine, 0.0 * cosine
+    first, second = x[-1] + 0.0 * cos, 0.0 * cos
     for k in range(len(x) - 2, -1, -1):
-        first, second = x[k] + 2.0 * cosine * first - second, first
+        first, second = x[k] + 2.0 * cos * first - second, first
     return first, second
 
 
-def _multiples(none: Points, one: Points, cosine: Points, count: int) -> list[Points]:
+def _multiples(none: Points, one: Points, cos: Points, count: int) -> list[Points]:
     """``sin(k a)`` or ``cos(k a)`` for ``k = 1..count``, by Chebyshev's recurrence.
 
-    From those of ``k = 0`` and ``1``: XLA takes one sine at a time, eight times as long
-    as a product.
+    From those of ``k = 0`` and ``1``: no sine of each is taken.
     """
     found = [none, one]
     for _ in range(count - 1):
-        found.append(2.0 * cosine * found[-1] - found[-2])
+        found.append(2.0 * cos * found[-1] - found[-2])
     return found[1:]
 
 

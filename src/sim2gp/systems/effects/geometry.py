@@ -11,6 +11,7 @@ from sim2gp.systems.effects.units import gravity_of, only_on
 from sim2gp.systems.mechanism import AbstractMechanism, Inertia, Pair
 from sim2gp.systems.plants.cartpole import CartPole
 from sim2gp.systems.plants.furuta import Furuta
+from sim2gp.systems.trigonometry import cosine, sine
 from sim2gp.types import Scalar
 
 
@@ -35,12 +36,12 @@ class RodInertia(AbstractJointEffect):
         self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair
     ) -> Inertia:
         none = jnp.zeros_like(x)
-        return self._inertia(params, x) * jnp.sin(q[1]) ** 2, none, none
+        return self._inertia(params, x) * sine(q[1]) ** 2, none, none
 
     def force(
         self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
     ) -> Pair:
-        slope = self._inertia(params, x) * jnp.sin(2.0 * q[1])
+        slope = self._inertia(params, x) * sine(2.0 * q[1])
         return slope * jnp.stack([-v[0] * v[1], 0.5 * v[0] ** 2])
 
     @staticmethod
@@ -71,10 +72,10 @@ class PoleGeometry(AbstractJointEffect):
     ) -> Inertia:
         m, l = params.pole_mass, params.pole_half_length
         moved = m * x * (2.0 * l + x)  # m (l + x)^2 - m l^2
-        return jnp.zeros_like(x), m * x * jnp.cos(q[1]), moved
+        return jnp.zeros_like(x), m * x * cosine(q[1]), moved
 
     def force(
         self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
     ) -> Pair:
-        first = params.pole_mass * x * jnp.sin(q[1])
+        first = params.pole_mass * x * sine(q[1])
         return jnp.stack([first * v[1] ** 2, -first * gravity_of(system)])

@@ -13,6 +13,7 @@ from sim2gp.systems.effects.units import gravity_of, only_on
 from sim2gp.systems.mechanism import AbstractMechanism, Inertia, Pair
 from sim2gp.systems.plants.cartpole import CartPole
 from sim2gp.systems.plants.furuta import Furuta
+from sim2gp.systems.trigonometry import cosine, sine
 from sim2gp.types import Scalar
 
 
@@ -38,8 +39,8 @@ class RailTilt(AbstractForce):
         self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
     ) -> Pair:
         p, g = params, gravity_of(system)
-        up, lost = jnp.sin(x), 2.0 * jnp.sin(0.5 * x) ** 2
-        lever = lost * jnp.sin(q[1]) - up * jnp.cos(q[1])
+        up, lost = sine(x), 2.0 * sine(0.5 * x) ** 2
+        lever = lost * sine(q[1]) - up * cosine(q[1])
         return g * jnp.stack(
             [
                 -up * (p.cart_mass + p.pole_mass),
@@ -71,10 +72,10 @@ class AbstractBaseTilt(AbstractForce):
         p, turned = params, q[0] - self.towards
         weight = p.pendulum_mass * gravity_of(system)
         l = 0.5 * p.pendulum_length
-        sin, cos = jnp.sin(q[1]), jnp.cos(q[1])
-        up, lost = weight * jnp.sin(x), weight * 2.0 * jnp.sin(0.5 * x) ** 2
-        arm = p.arm_length * jnp.sin(turned) + l * sin * jnp.cos(turned)
-        return jnp.stack([up * arm, l * (up * cos * jnp.sin(turned) + lost * sin)])
+        sin, cos = sine(q[1]), cosine(q[1])
+        up, lost = weight * sine(x), weight * 2.0 * sine(0.5 * x) ** 2
+        arm = p.arm_length * sine(turned) + l * sin * cosine(turned)
+        return jnp.stack([up * arm, l * (up * cos * sine(turned) + lost * sin)])
 
 
 class BaseTilt(AbstractBaseTilt):
@@ -113,7 +114,7 @@ class Payload(AbstractJointEffect):
     def inertia(
         self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair
     ) -> Inertia:
-        cos, sin = jnp.cos(q[1]), jnp.sin(q[1])
+        cos, sin = cosine(q[1]), sine(q[1])
         if isinstance(system, Furuta):
             r, end = params.arm_length, params.pendulum_length
             return x * (r**2 + end**2 * sin**2), x * end * r * cos, x * end**2
@@ -123,7 +124,7 @@ class Payload(AbstractJointEffect):
     def force(
         self, system: AbstractMechanism, params: Any, x: Scalar, q: Pair, v: Pair
     ) -> Pair:
-        cos, sin = jnp.cos(q[1]), jnp.sin(q[1])
+        cos, sin = cosine(q[1]), sine(q[1])
         if isinstance(system, Furuta):
             r, end = params.arm_length, params.pendulum_length
             slope = 2.0 * x * end**2 * sin * cos

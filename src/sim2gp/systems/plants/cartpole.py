@@ -26,6 +26,7 @@ from sim2gp import checks
 from sim2gp.inference.parameters import Parameters, bounded, log_bounded
 from sim2gp.systems.base import Channel, record_from, table_for
 from sim2gp.systems.mechanism import AbstractMechanism, Inertia
+from sim2gp.systems.trigonometry import cosine, sine
 from sim2gp.types import Action, Scalar
 
 
@@ -119,7 +120,7 @@ class CartPole(AbstractMechanism):
         reflected = self.motor_inertia * (self.gear_ratio / self.pinion_radius) ** 2
         return (
             p.pole_mass + p.cart_mass + self.gear_efficiency * reflected,
-            p.pole_mass * l * jnp.cos(q[1]),
+            p.pole_mass * l * cosine(q[1]),
             4.0 / 3.0 * p.pole_mass * l**2,
         )
 
@@ -131,7 +132,7 @@ class CartPole(AbstractMechanism):
         a: Action,
     ) -> Float[Array, " 2"]:
         """Right-hand side of the module's equations, in N and N m."""
-        p, sin = params, jnp.sin(q[1])
+        p, sin = params, sine(q[1])
         first = p.pole_mass * p.pole_half_length
         return jnp.stack(
             [

@@ -29,6 +29,7 @@ from sim2gp import checks
 from sim2gp.inference.parameters import Parameters, bounded, log_bounded
 from sim2gp.systems.base import Channel, record_from, table_for
 from sim2gp.systems.mechanism import AbstractMechanism, Inertia
+from sim2gp.systems.trigonometry import cosine, sine
 from sim2gp.types import Action, Scalar
 
 
@@ -107,8 +108,8 @@ class Furuta(AbstractMechanism):
         Jp = p.pendulum_mass * p.pendulum_length**2 / 12.0
         first, second = p.pendulum_mass * l, p.pendulum_mass * l**2
         return (
-            Jr + p.pendulum_mass * p.arm_length**2 + second * jnp.sin(alpha) ** 2,
-            first * p.arm_length * jnp.cos(alpha),
+            Jr + p.pendulum_mass * p.arm_length**2 + second * sine(alpha) ** 2,
+            first * p.arm_length * cosine(alpha),
             Jp + second,
         )
 
@@ -121,7 +122,7 @@ class Furuta(AbstractMechanism):
     ) -> Float[Array, " 2"]:
         """Right-hand side of the module's equations, in N m."""
         p = params
-        sin, cos = jnp.sin(q[1]), jnp.cos(q[1])
+        sin, cos = sine(q[1]), cosine(q[1])
         l = 0.5 * p.pendulum_length
         first, second = p.pendulum_mass * l, p.pendulum_mass * l**2
         torque = p.motor_constant * (a[0] - p.motor_constant * v[0])

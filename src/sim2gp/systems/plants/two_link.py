@@ -33,6 +33,7 @@ from sim2gp.systems.effects.friction_laws import (
     coulomb_arctangent,
 )
 from sim2gp.systems.mechanism import AbstractMechanism, Inertia
+from sim2gp.systems.trigonometry import cosine, sine
 from sim2gp.types import Action, Scalar
 
 STATES = (
@@ -155,8 +156,8 @@ class TwoLink(AbstractMechanism):
     ) -> Float[Array, " 2"]:
         """Right-hand side of the module's equations, in N m."""
         p, dry, width = params, _SHAPES[self.coulomb_shape], self.coulomb_width
-        first = (p.m1r1 + p.m2 * self.length1) * jnp.sin(q[0])
-        second = p.m2r2 * jnp.sin(q[0] + q[1])
+        first = (p.m1r1 + p.m2 * self.length1) * sine(q[0])
+        second = p.m2r2 * sine(q[0] + q[1])
         friction = jnp.stack(
             [
                 p.b1 * v[0] + dry(v[0], p.cf1, width),
@@ -269,11 +270,11 @@ class UniformRodArm(AbstractMechanism):
 
 def links_inertia(link1: Scalar, I2: Scalar, h: Scalar, q2: Scalar) -> Inertia:
     """Inertia of two links: ``link1 = I1 + m2 l1^2``, ``I2`` about joint 2, ``h``."""
-    b = I2 + h * jnp.cos(q2)
-    return link1 + b + h * jnp.cos(q2), b, I2
+    b = I2 + h * cosine(q2)
+    return link1 + b + h * cosine(q2), b, I2
 
 
 def gyroscopic(h: Scalar, q2: Scalar, v: Float[Array, " 2"]) -> Float[Array, " 2"]:
     """Centrifugal and Coriolis torques of two links, in N m."""
-    hs = h * jnp.sin(q2)
+    hs = h * sine(q2)
     return jnp.stack([hs * (2.0 * v[0] * v[1] + v[1] ** 2), -hs * v[0] ** 2])
