@@ -48,6 +48,7 @@ from sim2gp.systems.plants.two_link import (
     UniformRodParams,
 )
 from sim2gp.systems.sensors import EncoderOffset
+from sim2gp.systems.trigonometry import cosine, sine
 from sim2gp.systems.variants import Variant
 
 __all__ = [
@@ -95,6 +96,7 @@ __all__ = [
     "Viscous",
     "candidates",
     "catalogue",
+    "cosine",
     "delayed_means",
     "effect",
     "free_parts",
@@ -104,6 +106,7 @@ __all__ = [
     "plant_of",
     "read_sysid",
     "rk4",
+    "sine",
     "with_parts",
     "with_variants",
     "write_sysid",
