@@ -6,7 +6,9 @@
 
 Each setting is an effect of the mismatch map with its strength ("spring strong"),
 ``nominal`` or ``mismatch`` of figure 2, or physics that no force of one variable is;
-learners are those of the studies, and the controls (`controls.py`). Cells are stored
+learners are those of the studies, and the controls (`controls.py`). A first episode in
+which the pole stays up for the last second has solved the task, whatever the time until
+then has cost. Cells are stored
 next to ``--out`` and not computed again; on a GPU those of a learner are one program.
 """
 
@@ -68,17 +70,24 @@ def main() -> None:
         best = best_seen(score)
         middle = np.median(best, axis=0)
         solved = int(np.sum(best[:, min(1, asked.episodes - 1)] >= SOLVED))
+        cells = [values[cell] for cell in rows[asked.machine, setting, learner]]
+        first = sum(cell["reached"][:1] == [True] for cell in cells)
         found.append(
             {
                 "setting": setting,
                 "learner": learner,
                 "solved_in_two": solved,
+                "up_in_first": first,
                 "median_best": [round(float(x), 3) for x in middle],
                 "scores": np.round(score, 3).tolist(),
             }
         )
         each = " ".join(f"{x:5.2f}" for x in middle)
-        print(f"{setting:20} {learner:20} {solved}/{len(score)} {each}", flush=True)
+        print(
+            f"{setting:20} {learner:20} {solved}/{len(score)} {each} "
+            f"up in the first: {first}",
+            flush=True,
+        )
     asked.out.mkdir(parents=True, exist_ok=True)
     text = json.dumps({"seeds": list(asked.seeds), "rows": found, **about}, indent=1)
     (asked.out / "summary.json").write_text(text + "\n")

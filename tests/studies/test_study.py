@@ -71,7 +71,10 @@ def test_an_accelerator_computes_a_row_as_one(
 def test_a_cell_has_what_its_last_fit_found(
     fails: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of a fit that failed nothing but the failure; together with others the same."""
+    """Of a fit that failed nothing but the failure; together with others the same.
+
+    The pole hangs in the first episode, and in the second it is up.
+    """
     before = Sim2GP(Furuta()).init(jax.random.key(0))
     after = eqx.tree_at(lambda b: b.count, before, jnp.asarray(250))
     nothing, rows = np.zeros((0, 1)), np.ones((1, 1))
@@ -79,10 +82,12 @@ def test_a_cell_has_what_its_last_fit_found(
     class Run(SamplingRun):
         def __init__(self) -> None:
             self.trajectories, self.belief = [], before
+            self.task = swingup.task_and_model(cell, "SIM2GP", 0)[0]
             self.data = Transitions.of(nothing, nothing, nothing)
 
         def next(self, update_every: int | None = None) -> Trajectory:
-            self.trajectories.append(Trajectory(rows, rows, rows[0], rows[0] > 2.0))
+            states = np.pi * len(self.trajectories) * np.ones((60, 4))
+            self.trajectories.append(Trajectory(states, rows, rows[0], rows[0] > 2.0))
             return self.trajectories[-1]
 
         def fit(self) -> None:
@@ -90,6 +95,7 @@ def test_a_cell_has_what_its_last_fit_found(
                 raise NotConverged("E201", "no MAP")
             self.belief = after
 
+    cell = Cell("furuta", "nominal", "SIM2GP", 0, 2)
     run = Run()
 
     def misfit(belief: Any, data: Any) -> SimpleNamespace:
@@ -99,7 +105,6 @@ def test_a_cell_has_what_its_last_fit_found(
 
     monkeypatch.setattr(swingup, "_sampling", lambda cell, redrawn: run)
     monkeypatch.setattr(swingup, "misfit_of_belief", misfit)
-    cell = Cell("furuta", "nominal", "SIM2GP", 0, 2)
     values = swingup.learner_cell(cell, 0)
     run.belief = after
     ended = run.trajectories, values["failure"] or ""
@@ -108,7 +113,9 @@ def test_a_cell_has_what_its_last_fit_found(
     del values["seconds"], together["seconds"]
     assert together == values
     if fails:
-        assert values == {"returns": [1.0], "failure": "E201 no MAP."}
+        ended = {"returns": [1.0], "reached": [False], "failure": "E201 no MAP."}
+        assert values == ended
     else:
         found = {"forces": [], "contradicted": True}
-        assert values == {"returns": [1.0, 1.0], "failure": None} | found
+        both = {"returns": [1.0, 1.0], "reached": [False, True], "failure": None}
+        assert values == both | found

@@ -11,6 +11,7 @@ from functools import partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -20,7 +21,7 @@ from sim2gp.planning import MPC, AbstractPlanner, MarkovObjective
 from sim2gp.planning.episode import Trajectory
 from sim2gp.planning.loop import SamplingRun
 from sim2gp.planning.oracle import AcceptedTruth, accept_truth, episodes_in
-from sim2gp.planning.tasks import MACHINES, hanging_return, score
+from sim2gp.planning.tasks import MACHINES, Task, hanging_return, score
 from sim2gp.planning.together import accept_together, host, learn_together
 from sim2gp.studies.learners import (
     CONDITIONS,
@@ -193,7 +194,8 @@ def learner_cell(cell: Cell, redrawn: int) -> Values:
             found = found_by(run)
     except (NotConverged, NotFinite) as error:
         failure = str(error)
-    return _learned(seen, failure, time.perf_counter() - started) | found
+    task, _ = task_and_model(cell, "SIM2GP", redrawn)
+    return _learned(task, seen, failure, time.perf_counter() - started) | found
 
 
 def learner_cells(cells: Sequence[Cell], redrawn: Sequence[int]) -> list[Values]:
@@ -205,13 +207,23 @@ def learner_cells(cells: Sequence[Cell], redrawn: Sequence[int]) -> list[Values]
     found = [{} if failure else found_by(run) for run, (_, failure) in pairs]
     seconds = (time.perf_counter() - started) / len(cells)
     return [
-        _learned(*each, seconds) | more for each, more in zip(ended, found, strict=True)
+        _learned(run.task, *each, seconds) | more
+        for (run, each), more in zip(pairs, found, strict=True)
     ]
 
 
-def _learned(seen: Sequence[Trajectory], failure: str, seconds: float) -> Values:
-    returns = [float(trajectory.total) for trajectory in seen]
-    return {"returns": returns, "failure": failure or None, "seconds": seconds}
+def _learned(
+    task: Task, seen: Sequence[Trajectory], failure: str, seconds: float
+) -> Values:
+    """Of each episode its return, and whether the pole stayed up in its last second."""
+    return {
+        "returns": [float(trajectory.total) for trajectory in seen],
+        "reached": [
+            bool(task.reached(jnp.asarray(trajectory.state))) for trajectory in seen
+        ],
+        "failure": failure or None,
+        "seconds": seconds,
+    }
 
 
 def found_by(run: SamplingRun) -> Values:
