@@ -49,16 +49,13 @@ class _Solved(NamedTuple):
 def projected(
     likelihood: AbstractLikelihood, prior: ParameterPrior, also: Float[Array, " p"]
 ) -> Projected:
-    """The better of the prior's mean and a fit's ``also`` (whitened), for which weights
-    of groups are solved.
+    """Weights at the better of the prior's mean and a fit's ``also`` (whitened).
 
-    Where that leaves some channel less noise than ``also`` does itself, each shape of a
+    Where they leave some channel less noise than ``also`` does itself, each shape of a
     function in turn is searched along its own axis.
     """
-    p, shapes = (
-        prior.gaussian.mean.size,
-        np.flatnonzero([p.shape for p in prior.table.free]),
-    )
+    p = prior.gaussian.mean.size
+    shapes = np.flatnonzero([each.shape for each in prior.table.free])
 
     def unfinished(carry: tuple) -> Array:
         i, _, best, known = carry

@@ -37,7 +37,7 @@ class _Precision(NamedTuple):
 
 
 def _lambert(levels: int) -> tuple[list[float], list[float]]:
-    """Coefficients of a convergent, over the first one: the tangent's own size."""
+    """Coefficients of a convergent's ``N / y`` and ``D``, scaled to begin with one."""
     y2 = np.polynomial.Polynomial([0.0, 1.0])
     before = [0.0 * y2, 0.0 * y2 + 1.0]
     now = [0.0 * y2 + 1.0] * 2

@@ -140,7 +140,7 @@ def _clenshaw(x: Float[AnyArray, "k *b"], cos: Points) -> tuple[Points, Points]:
     """``b_1`` and ``b_2`` of Clenshaw's recurrence.
 
     ``sum x_k sin(k a) = b_1 sin(a)`` and ``sum x_k cos(k a) = b_1 cos(a) - b_2``: one
-    sin and one cos, and nothing that must be kept.
+    sine and one cosine, and nothing that must be kept.
     """
     first, second = x[-1] + 0.0 * cos, 0.0 * cos
     for k in range(len(x) - 2, -1, -1):
@@ -151,7 +151,7 @@ def _clenshaw(x: Float[AnyArray, "k *b"], cos: Points) -> tuple[Points, Points]:
 def _multiples(none: Points, one: Points, cos: Points, count: int) -> list[Points]:
     """``sin(k a)`` or ``cos(k a)`` for ``k = 1..count``, by Chebyshev's recurrence.
 
-    From those of ``k = 0`` and ``1``: no sine of each is taken.
+    From those of ``k = 0`` and ``1``: two products each, and no sine.
     """
     found = [none, one]
     for _ in range(count - 1):
