@@ -113,8 +113,8 @@ def test_a_cell_has_what_its_last_fit_found(
     del values["seconds"], together["seconds"]
     assert together == values
     if fails:
-        ended = {"returns": [1.0], "reached": [False], "failure": "E201 no MAP."}
-        assert values == ended
+        one = {"returns": [1.0], "reached": [False], "failure": "E201 no MAP."}
+        assert values == one
     else:
         found = {"forces": [], "contradicted": True}
         both = {"returns": [1.0, 1.0], "reached": [False, True], "failure": None}

@@ -57,18 +57,20 @@ def projected(
     p = prior.gaussian.mean.size
     shapes = np.flatnonzero([each.shape for each in prior.table.free])
 
+    def less(best: _Solved, known: Array) -> Array:
+        return ~jnp.all(best.noise >= known / SAME)
+
     def unfinished(carry: tuple) -> Array:
         i, _, best, known = carry
-        less = ~jnp.all(best.noise >= known / SAME)
-        return (i < 2) | ((i < len(values)) & less)
+        return (i < 2) | ((i < len(values)) & less(best, known))
 
     def better(carry: tuple) -> tuple:
         """The best so far and one more: some of its entries have other values."""
         i, about, best, known = carry
         about = jnp.where(begins[i], best.z, about)
         found = _solved(likelihood, prior, jnp.where(replaced[i], values[i], about))
-        less = found.cost < best.cost
-        best = jax.tree.map(lambda x, y: jnp.where(less, x, y), found, best)
+        cheaper = found.cost < best.cost
+        best = jax.tree.map(lambda x, y: jnp.where(cheaper, x, y), found, best)
         return i + 1, about, best, jnp.where(i == 1, found.given, known)
 
     axes = np.repeat(np.eye(p)[shapes], len(SHAPES), axis=0)
@@ -81,7 +83,7 @@ def projected(
     best = _Solved(jnp.asarray(jnp.inf), jnp.zeros(p), none, none)
     start = jnp.zeros((), int), best.z, best, none
     _, _, best, known = jax.lax.while_loop(unfinished, better, start)
-    return Projected(best.z, best.noise, ~jnp.all(best.noise >= known / SAME))
+    return Projected(best.z, best.noise, less(best, known))
 
 
 def _solved(

@@ -47,10 +47,10 @@ def drives(plant: AbstractPlant) -> dict[str, Drive]:
     def each(s: Array, a: Array) -> Array:
         if isinstance(plant, AbstractMechanism):
             return jnp.stack(plant.forces(params, s[:2], jnp.zeros(2), a))
-        moved = (plant.flow(params, s, a, h) - s) / h
-        return moved[np.asarray([velocity_of(plant, c.name) for c in joints], int)]
+        return flow(s, a)[np.asarray([velocity_of(plant, c.name) for c in joints], int)]
 
     h = LONGEST_MEAN
+    flow = jax.jit(lambda s, a: (plant.flow(params, s, a, h) - s) / h)
     pairs = [(s, a) for s in (rest, away) for a in inputs]
     found = np.abs(jax.vmap(each)(*(jnp.asarray(x) for x in zip(*pairs, strict=True))))
     most = np.max(found, axis=0)

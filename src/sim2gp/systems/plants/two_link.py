@@ -270,8 +270,9 @@ class UniformRodArm(AbstractMechanism):
 
 def links_inertia(link1: Scalar, I2: Scalar, h: Scalar, q2: Scalar) -> Inertia:
     """Inertia of two links: ``link1 = I1 + m2 l1^2``, ``I2`` about joint 2, ``h``."""
-    b = I2 + h * cosine(q2)
-    return link1 + b + h * cosine(q2), b, I2
+    coupling = h * cosine(q2)
+    b = I2 + coupling
+    return link1 + b + coupling, b, I2
 
 
 def gyroscopic(h: Scalar, q2: Scalar, v: Float[Array, " 2"]) -> Float[Array, " 2"]:
