@@ -67,6 +67,8 @@ def test_claims_see_what_was_planted():
     assert holds(table, "sampling_beats_the_point_estimate_somewhere")
     assert holds(table, "cartpole_physics_learns_twice_as_fast")
     assert holds(table, "cartpole_RES_FS_solves_mismatch_in_three")
+    assert holds(table, "cartpole_MissingForces_solves_mismatch_in_two")
+    assert not holds(table, "cartpole_MissingForces_is_best_under_mismatch")
     assert not holds(table, "cartpole_literal_function_space_is_best_under_mismatch")
     assert not holds(table, "cartpole_physics_alone_fails_under_mismatch")
     for claim in figure2.swing_up_claims(table, np.random.default_rng(1)).values():

@@ -78,6 +78,7 @@ METHODS: dict[str, Explorer] = {
     "FS literal": Explorer("FS literal"),
     "FS": Explorer("FS"),
     "RES-FS": Explorer("RES-FS"),
+    "MissingForces": Explorer("MissingForces"),
     "SIM2GP, step by step": Explorer("SIM2GP", together=False),
     "SIM2GP, random": Explorer("SIM2GP", RandomInput()),
     "SIM2GP, chirp": Explorer("SIM2GP", Chirp()),

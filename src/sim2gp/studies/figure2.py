@@ -144,11 +144,19 @@ def swing_up_claims(
         out[f"{machine}_literal_function_space_is_best_under_mismatch"] = _best(
             "FS literal", {m: early[*wrong, m] for m in RIVALS}, rng, "under mismatch"
         )
-        needed = median_episode(reached[*wrong, "RES-FS"])
-        out[f"{machine}_RES_FS_solves_mismatch_in_three"] = claim(
-            needed <= 3.0,
-            f"median episode {needed:g}",
-            "under mismatch RES-FS reaches 95 % in at most 3 episodes",
+        for name, most, words in (("RES-FS", 3, "three"), ("MissingForces", 2, "two")):
+            needed = median_episode(reached[*wrong, name])
+            about = f"{name.replace('-', '_')}_solves_mismatch_in_{words}"
+            out[f"{machine}_{about}"] = claim(
+                needed <= most,
+                f"median episode {needed:g}",
+                f"under mismatch {name} reaches 95 % in at most {most} episodes",
+            )
+        out[f"{machine}_MissingForces_is_best_under_mismatch"] = _best(
+            "MissingForces",
+            {m: early[*wrong, m] for m in RIVALS},
+            rng,
+            "under mismatch",
         )
     return out | _sampling_pays(early, rng)
 

@@ -162,7 +162,7 @@ def exploration_claims(
             and explorer.together
             and (machine, "mismatch", m) in table
         }
-        for name in ("FS", "RES-FS"):
+        for name in ("FS", "RES-FS", "MissingForces"):
             out[f"{machine}_{name}_predicts_best_under_mismatch".replace("-", "_")] = (
                 at_least_as_good(
                     name,
