@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 
 from report_example import full_run
+from sim2gp.identification.words import bound_warnings
 from sim2gp.reports.document import write_report
 from sim2gp.reports.glance import glance, unique
 
@@ -52,8 +53,7 @@ def test_each_question_has_its_answer() -> None:
             "sim2gp design RUN: an experiment that tells more of mass.",
         ),
         ({"longer": {"advised": True, "text": "window = 1"}}, "window = 1"),
-        ({"parameters": {"mass": PRESSED}}, "upper end of its range, 3 kg"),
-        ({"parameters": {"mass": PRESSED | {"mean": 1.0}}}, "a smaller "),
+        ({"parameters": {"mass": PRESSED}}, "Write a wider range of mass"),
         ({"parameters": {"lag": PRESSED | {"mean": 0.0, "low": 0.0}}}, "evaluate RUN"),
     ],
 )
@@ -61,6 +61,22 @@ def test_the_next_step_is_the_one_that_helps(
     change: dict[str, Any], words: str
 ) -> None:
     assert words in answers(SUMMARY | change)["What next"]
+
+
+@pytest.mark.parametrize(
+    ("entry", "words"),
+    [
+        (PRESSED, "upper end of its range, 3 kg"),
+        (PRESSED, "a larger `high`"),
+        (PRESSED | {"mean": 1.0}, "a smaller `low`"),
+        (PRESSED | {"mean": 0.0, "low": 0.0}, ""),
+    ],
+)
+def test_an_end_of_a_range_is_a_warning_that_says_which(
+    entry: dict[str, Any], words: str
+) -> None:
+    said = bound_warnings({"mass": entry})
+    assert words in said["mass"] if words else not said
 
 
 def test_what_is_not_known_is_not_claimed() -> None:

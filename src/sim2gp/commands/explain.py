@@ -141,7 +141,7 @@ def explain(
         "log_evidence": float(found.search.bare.log_evidence),
         "added": None,
         "warnings": [
-            *bound_warnings(run.summary.get("parameters") or {}),
+            *bound_warnings(run.summary.get("parameters") or {}).values(),
             *(f"no fit with {name}" for name in found.search.failed),
         ],
         "tables": [*force_table(forces), candidate_table(found, candidates)],

@@ -211,7 +211,7 @@ def posterior_entries(summary: Mapping[str, Any], which: Width) -> dict[str, Any
         "posterior": which,
         "widened": [min(ratios), max(ratios)] if ratios else None,
         "why": about.get("why"),
-        "warnings": bound_warnings(summary["parameters"]),
+        "warnings": list(bound_warnings(summary["parameters"]).values()),
     }
 
 

@@ -187,7 +187,7 @@ def _identification_summary(
             "inflation": band.inflation,
         },
         "warnings": [
-            *bound_warnings(found["parameters"]),
+            *bound_warnings(found["parameters"]).values(),
             *note_lines(logs),
             *clock_warnings(logs, system),
         ],

@@ -91,12 +91,12 @@ def unit_product(terms: Iterable[tuple[float, str]]) -> str:
     return " ".join(s if p == 1.0 else f"{s}^{digits(p, 3)}" for s, p in kept)
 
 
-def bound_warnings(entries: Mapping[str, Mapping[str, Any]]) -> list[str]:
+def bound_warnings(entries: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
     """What to do about each parameter that the data press against an end of its range.
 
     At zero nothing: less than nothing cannot be, and the data show none of it.
     """
-    found = []
+    found = {}
     for name, entry in entries.items():
         low, high = entry.get("low"), entry.get("high")
         if entry.get("verdict") != "at_bound" or low is None or high is None:
@@ -106,7 +106,7 @@ def bound_warnings(entries: Mapping[str, Mapping[str, Any]]) -> list[str]:
             ("upper", "high", "larger") if is_upper else ("lower", "low", "smaller")
         )
         if entry[word] != 0.0:
-            found.append(
+            found[name] = (
                 f"{name} is at the {end} end of its range, "
                 f"{quantity(entry[word], entry['unit'])}. If the true value is beyond "
                 f"it, all values of this fit are wrong: write a {way} `{word}` in the "

@@ -52,7 +52,8 @@ def _report_problems(summary: Summary) -> list[tuple[str, str]]:
         found.append(("bad", "The fit did not converge; its numbers are not a result."))
     elif status and str(status) not in ("ok", "done", "converged", "complete"):
         found.append(("bad", f"Status: {status}."))
-    found += [("bad", w) for w in bound_warnings(summary.get("parameters") or {})]
+    at_ends = bound_warnings(summary.get("parameters") or {})
+    found += [("bad", words) for words in at_ends.values()]
     idle = _names_with_verdict(summary, "dead")
     if idle:
         found.append(("bad", f"The data do not depend on: {idle}."))

@@ -78,7 +78,8 @@ def _next_command(summary: Summary) -> str:
     """The command that helps most."""
     misfit, entries = summary.get("misfit") or {}, _entries(summary)
     if pressed := bound_warnings(entries):
-        return " ".join(pressed)
+        names = _first_names(list(pressed))
+        return f"Write a wider range of {names} in the project file; identify again."
     if misfit.get("alarm"):
         return "sim2gp explain RUN says which physics may be missing."
     settled = "identified", "dead", "at_bound"
