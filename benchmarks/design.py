@@ -43,7 +43,7 @@ from sim2gp.identification.fit import fit_windows
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.parameters import prior_from_moments
 from sim2gp.runs.cells import Cells, Old, add_options
-from sim2gp.runs.workers import cores, spread
+from sim2gp.runs.executors import Processes, cores
 from sim2gp.studies.claims import bootstrap_median
 from sim2gp.systems import TwoLink
 from sim2gp.types import in_float64
@@ -326,7 +326,7 @@ def main() -> None:
     cells = Cells(options.out, __file__, options.old)
     cells.check((designed(job), {}) for group in groups for job in group)
     found: dict[str, list[Any]] = {m: [None] * len(seeds) for m in METHODS}
-    for job, result in spread(work, groups, options.workers):
+    for job, result in Processes(options.workers).spread(work, groups):
         found[job.method][job.seed] = result
         print(f"{job.method}, arm {job.seed}", file=sys.stderr)
     text = "\n".join(lines(found))

@@ -50,7 +50,7 @@ from sim2gp.identification.misfit.residuals import misfit_of_windows
 from sim2gp.identification.missing_physics.at_zero import at_zero
 from sim2gp.inference.estimate import Estimate
 from sim2gp.runs.cells import Cells, add_options
-from sim2gp.runs.workers import cores, spread
+from sim2gp.runs.executors import Processes, cores
 from sim2gp.systems import AbstractSystem, UniformRodArm
 from sim2gp.types import in_float64
 
@@ -312,7 +312,7 @@ def main() -> None:
             if not missing or also in ("", *options.also):
                 found |= {j: v for j, v in done.items() if v is not None}
                 groups.append(missing)
-    for job, values in spread(work, groups, options.workers):
+    for job, values in Processes(options.workers).spread(work, groups):
         found[job] = cells.save(job.name, job.arguments, values)
         print(f"{len(found)}", end="\r", file=sys.stderr)
     about = cells.summary((job.name, job.arguments) for job in found)

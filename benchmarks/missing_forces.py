@@ -22,7 +22,7 @@ from controls import ControlCell
 from sim2gp.planning.tasks import SOLVED
 from sim2gp.runs import Progress
 from sim2gp.runs.cells import add_options
-from sim2gp.runs.workers import cores
+from sim2gp.runs.executors import cores
 from sim2gp.studies.learners import WITH_TERM
 from sim2gp.studies.study import run_cells
 from sim2gp.studies.swingup import best_seen, scores_of

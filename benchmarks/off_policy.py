@@ -34,8 +34,8 @@ from sim2gp.planning.episode import Purpose, key_for, oracle_world
 from sim2gp.planning.mpc import from_unit
 from sim2gp.planning.sac import Learner, made
 from sim2gp.planning.tasks import MACHINES, Task
+from sim2gp.runs.cell_work import run_cell
 from sim2gp.studies.learners import task_and_model
-from sim2gp.studies.study import run_cell
 from sim2gp.studies.swingup import Cell, reference
 
 NEAR = 0.9  # of the oracle's return

@@ -27,7 +27,7 @@ from sim2gp.data.transitions import Transitions
 from sim2gp.planning.coloured_noise import coloured_noise
 from sim2gp.planning.episode import Purpose, key_for
 from sim2gp.planning.tasks import MACHINES, Task, draw_truth
-from sim2gp.runs.workers import cores, spread
+from sim2gp.runs.executors import Processes, cores
 from sim2gp.studies.exploring import forecast
 from sim2gp.studies.learners import METHODS, WITH_TERM, reach_of
 from sim2gp.systems.effects.strengths import effect
@@ -140,7 +140,7 @@ def main() -> None:
         for w in MODELS
     ]
     found: dict[Job, list[list[float]]] = {}
-    for job, result in spread(work, groups, arguments.workers):
+    for job, result in Processes(arguments.workers).spread(work, groups):
         found[job] = result
         print(f"{len(found)}/{sum(map(len, groups))}", end="\r", file=sys.stderr)
     medians = {

@@ -34,7 +34,7 @@ from sim2gp.identification.missing_physics.at_zero import at_zero
 from sim2gp.project import Project, load_project
 from sim2gp.project.training_windows import cut_logs
 from sim2gp.runs.cells import Cells, add_options
-from sim2gp.runs.workers import cores, spread
+from sim2gp.runs.executors import Processes, cores
 from sim2gp.systems import plant_of
 from sim2gp.types import in_float64
 
@@ -305,7 +305,7 @@ def main() -> None:
         done = {job: cells.load(job.name, job.arguments) for job in jobs}
         found |= {job: values for job, values in done.items() if values is not None}
         groups.append([job for job in jobs if done[job] is None])
-    for job, values in spread(work, groups, options.workers):
+    for job, values in Processes(options.workers).spread(work, groups):
         found[job] = cells.save(job.name, job.arguments, values)
         print(f"{len(found)}/{len(every)}", end="\r", file=sys.stderr)
     summary: dict[str, Any] = {"draws": options.draws, **cells.summary(named)}

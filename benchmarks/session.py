@@ -47,7 +47,7 @@ from sim2gp.experiment_design import (
 from sim2gp.experiment_design.verdict import DesignOptions, experiment_verdict
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.runs.cells import Cells, Old, add_options
-from sim2gp.runs.workers import cores, spread
+from sim2gp.runs.executors import Processes, cores
 from sim2gp.studies.claims import bootstrap_median
 from sim2gp.types import in_float64
 
@@ -169,7 +169,7 @@ def main() -> None:
     stored(cells, MULTISINE, tuned)
     groups = [jobs[i :: options.workers] for i in range(options.workers)]
     rows: list[Any] = [None] * len(jobs)
-    for job, row in spread(work, groups, options.workers):
+    for job, row in Processes(options.workers).spread(work, groups):
         rows[job.seed] = row
         print(f"arm {job.seed}: {len(row['errors'])} runs", file=sys.stderr)
     text = "\n".join(lines(rows))

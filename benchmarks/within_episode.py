@@ -18,7 +18,7 @@ import numpy as np
 from sim2gp.planning.tasks import SOLVED
 from sim2gp.runs import Progress
 from sim2gp.runs.cells import add_options
-from sim2gp.runs.workers import cores
+from sim2gp.runs.executors import cores
 from sim2gp.studies.claims import bootstrap_interval
 from sim2gp.studies.study import run_cells
 from sim2gp.studies.swingup import (

@@ -38,10 +38,16 @@ FORBIDDEN_EVENTS = frozenset(
 )
 
 
+#: Who reads what our own processes send: no data from outside.
+OF_WORKERS = (
+    multiprocessing.queues.__file__,
+    os.path.join("_private", "serialization.py"),
+)
+
+
 def from_a_worker() -> bool:
-    """Whether a queue of our own processes is being read: no data from outside."""
-    asking = sys._getframe(2)
-    return asking.f_code.co_filename == multiprocessing.queues.__file__
+    """Whether a result of one of our own processes is being read, Ray's included."""
+    return sys._getframe(2).f_code.co_filename.endswith(OF_WORKERS)
 
 
 def refuse(event: str, args: tuple[object, ...]) -> None:

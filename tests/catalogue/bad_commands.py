@@ -18,8 +18,10 @@ from sim2gp.project import load_project
 from sim2gp.reports import scenes
 from sim2gp.runs import load_run, new_run
 from sim2gp.runs.cells import Cells
+from sim2gp.runs.executors import Processes, RayCluster
+from sim2gp.runs.shares import join_shares
 from sim2gp.runs.sinks import JSONLines, TensorBoard, WandB
-from sim2gp.runs.workers import spread
+from sim2gp.studies.swingup import Cell
 from sim2gp.systems import Furuta
 from tests.catalogue.bad_files import run
 from tests.catalogue.bad_inputs import PROJECT, TEXTS, Case, Input, Patch, case, refusal
@@ -167,6 +169,16 @@ def torn(folder: Path) -> None:
     cells.save("one", {"n": 1}, {"x": 1.0})
     (cells.folder / "one.json").write_bytes(b"{}")
     cells.load("one", {"n": 1})
+
+
+def on_ray(folder: Path) -> object:
+    return list(RayCluster().spread(abs, [[1]]))
+
+
+def not_all_shares(folder: Path, patch: Patch) -> None:
+    """A study of which no share was computed."""
+    del patch
+    join_shares([Cell("furuta", "nominal", "oracle", 0, 0)], folder / "out")
 
 
 def in_a_file(make: Callable[[Path], object]) -> Callable[[Path], object]:
@@ -349,6 +361,7 @@ COMMANDS: tuple[Case, ...] = (
         without(TensorBoard, "tensorboardX.event_file_writer", "tensorboard"),
         without(WandB, "wandb", "wandb"),
         without(sampler, "blackjax", "mcmc"),
+        without(on_ray, "ray", "ray"),
     ),
     case(
         132,
@@ -363,8 +376,16 @@ COMMANDS: tuple[Case, ...] = (
             "did you mean furuta",
         ),
         refusal(
-            "worker_died", lambda: list(spread(os._exit, [[3], [3]], 2)), "exit code 3"
+            "worker_died",
+            lambda: list(Processes(2).spread(os._exit, [[3], [3]])),
+            "exit code 3",
         ),
+        refusal(
+            "no_ray_cluster",
+            lambda: list(RayCluster("nowhere").spread(abs, [[1]])),
+            "nowhere",
+        ),
+        Input("cells_missing", ("1 of 1",), not_all_shares),
         Input("no_truth_swung_up", ("MPC", "2 draws"), hopeless),
     ),
 )

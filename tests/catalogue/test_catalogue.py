@@ -19,6 +19,7 @@ OWN = {"where", "got", "expected", "fix"}
 NOT_PROVOKED = {
     "another_machine_than_fitted": "of a fit: test_project_model.py",
     "constant_not_open": "of a fit whose machine has other constants open",
+    "worker_of_other_code": "of a cluster with two versions: test_shares.py",
     "fault_of_sim2gp": "of an error that is no input's: test_cli.py",
     "simulator_not_finite_on_box": "of a training by night: test_function_space.py",
     "episode_not_finite": "of a compiled episode: test_episode.py",

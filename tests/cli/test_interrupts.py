@@ -91,13 +91,13 @@ def job(number):
         endless()(1.0).block_until_ready()
     return number
 def work():
-    from sim2gp.runs.workers import spread
+    from sim2gp.runs.executors import Processes
     program = endless().lower(1.0).compile()
     asleep = [sys.executable, "-c", "import time; time.sleep(600)"]
     with cleanup.temporary_folder(), subprocess.Popen(asleep) as other:
         with cleanup.registered(other.kill):
             try:
-                for _ in spread(job, [[0, 1], [2]], 2):
+                for _ in Processes(2).spread(job, [[0, 1], [2]]):
                     ready()
                     program(1.0).block_until_ready()
             finally:

@@ -220,7 +220,7 @@ def test_every_position_must_be_measured(folder: Path) -> None:
 def test_one_recording_leaves_out_its_last_quarter(folder: Path) -> None:
     found = load_project(project_in(folder, "cable"))
     logs = found.load_logs()[:1]
-    setup, folds = compare.prepare_comparison(found, logs, (0.2,))
+    setup, folds = compare_setup.prepare_comparison(found, logs, (0.2,))
     assert [log.name for log in setup.logs] == ["log0", "log0, last quarter"]
     assert folds == [[1]]
     # The box of states without limits holds all that was seen.
@@ -242,7 +242,7 @@ def test_many_recordings_are_left_out_in_six_groups(folder: Path) -> None:
     named = [
         replace(log, name=str(k), source=str(k // 2)) for k in range(16)
     ]  # eight files in two pieces each
-    _, folds = compare.prepare_comparison(found, named, (0.2,))
+    _, folds = compare_setup.prepare_comparison(found, named, (0.2,))
     assert len(folds) == 6
     assert sorted(k for left in folds for k in left) == list(range(16))
     assert folds[0] == [0, 1, 12, 13]

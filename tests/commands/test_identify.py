@@ -279,6 +279,32 @@ def test_leave_one_out_predicts_every_log(folder: Path, tmp_path: Path) -> None:
     assert "calibration/share/alpha" in kept
 
 
+@pytest.mark.nightly  # the same three fits in five processes
+def test_folds_are_the_same_wherever_they_are_computed(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In this process; in two; as shares on a Ray cluster, joined."""
+    project = str(project_in(folder))
+
+    def evaluated(name: str, *words: str) -> str:
+        out = str(tmp_path / name)
+        assert main(["evaluate", project, "--quiet", "--out", out, *words]) == 0
+        return capsys.readouterr().out
+
+    evaluated("two", "--workers", "2")
+    assert "share 1 of 2: 1 of 2 cells" in evaluated("a", "--shard", "1/2", "--ray")
+    assert "share 2 of 2: 1 of 2 cells" in evaluated("b", "--shard", "2/2", "--ray")
+    evaluated("joined", "--merge", str(tmp_path / "a"), str(tmp_path / "b"))
+    two, joined = (load_run(tmp_path / name) for name in ("two", "joined"))
+    assert joined.summary["tables"] == two.summary["tables"]
+    assert joined.summary["headline"] == two.summary["headline"]
+    assert joined.arrays.keys() == two.arrays.keys()
+    for name, values in two.arrays.items():
+        np.testing.assert_array_equal(joined.arrays[name], values, err_msg=name)
+    summary = evaluate(load_project(project), progress=QUIET).summary
+    assert summary["tables"] == two.summary["tables"]
+
+
 def test_effects_are_constants_of_the_machine(folder: Path) -> None:
     effect = "[effects.theta.coulomb]\nmean = 5e-4\nsd = 5e-4\nmap = 'log'\n"
     path = project_in(folder, f"\n{effect}width = 0.02\n[effects.alpha]\ndrag = 0.1\n")

@@ -4,7 +4,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import sim2gp as sg
-from sim2gp.commands.evaluate import Evaluation
+from sim2gp.commands.evaluation import Evaluation
 from sim2gp.runs import new_run
 
 

@@ -15,9 +15,9 @@ if __name__ == "__main__":
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from frozen.cases import VALUES
+from sim2gp.runs.cell_work import run_cell
 from sim2gp.studies import exploring, swingup
 from sim2gp.studies.learners import METHODS
-from sim2gp.studies.study import run_cell
 
 RECORD = VALUES / "episodes.json"
 SEEDS = range(10)

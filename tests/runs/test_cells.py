@@ -14,8 +14,9 @@ import pytest
 from sim2gp.cli import main
 from sim2gp.errors import InputError
 from sim2gp.runs import Progress, packed_cells
+from sim2gp.runs.cell_work import run_cell
 from sim2gp.studies import swingup
-from sim2gp.studies.study import run_cell, run_cells
+from sim2gp.studies.study import run_cells
 from sim2gp.studies.swingup import Cell
 
 ORACLE = {"hang_return": 50.0, "oracle_return": 150.0, "redrawn": 0, "returns": [150.0]}

@@ -12,11 +12,11 @@ from sim2gp.planning import MPC, SAC
 from sim2gp.planning.tasks import MACHINES
 from sim2gp.reports import figure2 as drawn
 from sim2gp.runs import Progress
+from sim2gp.runs.cell_work import run_cell
 from sim2gp.runs.cells import Cells
 from sim2gp.studies import figure2, learners, swingup
 from sim2gp.studies.figure2 import PosteriorSampling
 from sim2gp.studies.learners import CONDITIONS, METHODS, TRAINED
-from sim2gp.studies.study import run_cell
 from sim2gp.studies.swingup import Cell, Table
 
 ORACLE = {"hang_return": 50.0, "oracle_return": 150.0, "redrawn": 1, "returns": [150.0]}

@@ -16,12 +16,12 @@ from sim2gp.inference.gaussian import Gaussian
 from sim2gp.planning.tasks import MACHINES
 from sim2gp.reports import figure3 as drawn
 from sim2gp.runs import Progress
+from sim2gp.runs.cell_work import run_cell
 from sim2gp.runs.cells import Cells
 from sim2gp.studies import exploring, figure3
 from sim2gp.studies.exploring import METHODS, Cell, HeldOut
 from sim2gp.studies.figure3 import Exploration
 from sim2gp.studies.learners import CONDITIONS, task_and_model
-from sim2gp.studies.study import run_cell
 
 
 def test_transitions_needed_by_hand():

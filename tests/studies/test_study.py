@@ -16,8 +16,9 @@ from sim2gp.models import Sim2GP
 from sim2gp.planning.episode import Trajectory
 from sim2gp.planning.loop import SamplingRun
 from sim2gp.runs import Progress
+from sim2gp.runs.cell_work import run_cell
 from sim2gp.studies import swingup
-from sim2gp.studies.study import run_cell, run_cells
+from sim2gp.studies.study import run_cells
 from sim2gp.studies.swingup import Cell
 from sim2gp.systems import Furuta
 

@@ -4,6 +4,7 @@ A command imports its function when it runs: help and a mistyped option cost not
 """
 
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -14,8 +15,10 @@ from sim2gp.cli.arguments import pairs, parse_numbers, usage_error
 from sim2gp.cli.late import (
     Call,
     command,
+    executor_of,
     function,
     identification,
+    in_cells,
     run_directory,
 )
 from sim2gp.cli.log_commands import (
@@ -32,6 +35,7 @@ from sim2gp.cli.options import (
     Count,
     File,
     Flag,
+    InCells,
     Percent,
     Seconds,
     Seed,
@@ -212,7 +216,7 @@ class Selftest(Common):
 
 
 @dataclass(kw_only=True)
-class Reproduce(Writes):
+class Reproduce(Writes, InCells):
     """A figure of the paper: its data, the picture, and the claims checked."""
 
     figure: Annotated[
@@ -228,8 +232,6 @@ class Reproduce(Writes):
     """Episodes of each seed (not figure 1); default the paper's."""
     quick: Flag = False
     """A look: fewer seeds or arms, fewer episodes (fig2: fewer plans, too)."""
-    workers: SomeCount = None
-    """Processes; default one per core."""
     refresh: Flag = False
     """Compute stored cells again that other code or versions computed."""
     keep_old: Flag = False
@@ -240,19 +242,18 @@ class Reproduce(Writes):
             where, one = "--refresh with --keep-old", "one of them"
             raise usage_error(where, "both", one, "leave one out")
         old = "refresh" if self.refresh else "keep" if self.keep_old else "refuse"
-        found = command("reproduce")(
+        out = run_directory(self.out, self.figure)
+        study = function("commands.reproduce", "study_of")(
             self.figure,
-            run_directory(self.out, self.figure),
             seed=self.seed,
             seeds=self.seeds,
             episodes=self.episodes,
             quick=self.quick,
-            workers=self.workers,
-            old=old,
-            progress=call.progress,
         )
-        summary: dict[str, Any] = found.summary
-        return summary
+        how = {"workers": executor_of(self), "progress": call.progress, "old": old}
+        make = partial(study.run, out, **how)
+        place = study.cells_of(out)
+        return in_cells(self, call, place, study.cells, lambda _: make(), old)
 
 
 COMMANDS: dict[str, type[Common]] = {

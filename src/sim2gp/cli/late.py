@@ -3,14 +3,16 @@
 Everything heavy is imported inside: help and a mistyped option cost nothing.
 """
 
+import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from sim2gp.cli.options import Reads
+from sim2gp.cli.arguments import usage_error
+from sim2gp.cli.options import InCells, Reads, Spread
 from sim2gp.runs import Progress, new_run
 from sim2gp.runs.store import check_target, read_run
 
@@ -96,3 +98,52 @@ def function(module: str, name: str) -> Callable[..., Any]:
     """A function of a module of ours, imported when a command runs."""
     found: Callable[..., Any] = getattr(import_module(f"sim2gp.{module}"), name)
     return found
+
+
+def share_of(given: InCells) -> Any:
+    """The share that is asked for, or None (E160 for another form, or with --merge)."""
+    if given.shard is None:
+        return None
+    found = re.fullmatch(r"(\d+)/(\d+)", given.shard)
+    index, count = (int(x) for x in found.groups()) if found else (0, 0)
+    if not 1 <= index <= count:
+        raise usage_error("--shard", given.shard, "I/N, I from 1 to N", "write a share")
+    if given.merge is not None:
+        fix = "compute the shares, then join them"
+        raise usage_error("--shard with --merge", "both", "one of them", fix)
+    return function("runs.shares", "Share")(index, count)
+
+
+def executor_of(given: Spread) -> Any:
+    """Where cells are computed; None is the command's own default (E160)."""
+    if given.ray is None:
+        return given.workers
+    if len(given.ray) > 1:
+        got = " ".join(given.ray)
+        raise usage_error("--ray", got, "one address", "leave the others out")
+    address = given.ray[0] if given.ray else None
+    cluster = function("runs.executors", "RayCluster")
+    return cluster(address, given.cell_cores, given.cell_gpus)
+
+
+def in_cells(
+    given: InCells,
+    call: Call,
+    out: Path,
+    cells: Sequence[Any],
+    make: Callable[[Any], dict[str, Any]],
+    old: str = "refuse",
+) -> dict[str, Any]:
+    """A share of the cells computed, or the summary of ``make(store)``.
+
+    ``store`` has the cells of all shares where they are to be joined, else it is None.
+    """
+    share, executor = share_of(given), executor_of(given)
+    if share is not None:
+        compute = function("runs.shares", "compute_share")
+        how = {"workers": executor, "progress": call.progress, "old": old}
+        found: dict[str, Any] = compute(cells, out, share, **how)
+        return found
+    if given.merge is None:
+        return make(None)
+    return make(function("runs.shares", "join_shares")(cells, out, given.merge, old))

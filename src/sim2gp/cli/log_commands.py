@@ -12,23 +12,27 @@ from sim2gp.cli.late import (
     FirstFolder,
     budget,
     command,
+    executor_of,
     function,
     identification,
+    in_cells,
     read_project,
     run_directory,
+    share_of,
 )
 from sim2gp.cli.options import (
     Chosen,
     Common,
-    Count,
     File,
     Flag,
     Folder,
+    InCells,
     ManySeconds,
     Reads,
     Seconds,
     Seed,
     SomeSeconds,
+    Spread,
     option,
 )
 from sim2gp.runs.store import check_absent, read_run
@@ -125,7 +129,7 @@ class Identify(Reads):
 
 
 @dataclass(kw_only=True)
-class Evaluate(Reads, Chosen):
+class Evaluate(Reads, Chosen, InCells):
     """Prediction of logs that a fit has not seen."""
 
     run_or_project: Annotated[Positional[Path], arg(metavar="RUN|PROJECT")]
@@ -134,41 +138,39 @@ class Evaluate(Reads, Chosen):
     """The logs to predict (with a run)."""
     horizon: Seconds = 0.2
     """Open-loop horizon in s."""
-    workers: Count = 1
-    """Processes (with a project file)."""
 
     def run(self, call: Call) -> dict[str, Any]:
         path = self.run_or_project
         out = run_directory(self.out, f"evaluate-{path.stem}")
-        how: dict[str, Any] = {"horizon": self.horizon, "progress": call.progress}
         if path.suffix == ".toml":
             for option in ("logs", "configuration"):
                 if getattr(self, option):
                     fix = f"leave --{option} out, or name a run"
                     expected = "a project file alone: its own logs are left out"
                     raise usage_error("too much", f"--{option}", expected, fix)
-            read = read_project(path, self)
-            how["workers"] = self.workers
-            return call.saved(out, lambda: command("evaluate")(*read, **how))
+            share_of(self)
+            work = function("commands.leave_one_out", "LeaveOneOut")(
+                *read_project(path, self), self.horizon
+            )
+            return folds(self, call, out, work)
         if not self.logs:
             read_run(path)  # a folder that is no run is the first thing to say
             expected, fix = "--logs FILE...", "name the logs to predict"
             raise usage_error("no logs", "no --logs", expected, fix)
         fit = identification(path).within(budget(self.budget))
         tested = fit.read_logs(self.logs, self.configuration, strict=self.strict)
+        how = {"horizon": self.horizon, "progress": call.progress}
         return call.saved(out, lambda: command("evaluate")(fit, tested, **how))
 
 
 @dataclass(kw_only=True)
-class Explain(Reads):
+class Explain(Reads, Spread):
     """What physics a simulator lacks: nothing, an effect, or none of these."""
 
     path: Annotated[Positional[Path], arg(metavar="RUN")]
     """The folder of identify or demo."""
     add: Flag = False
     """Write the winner into the project file, so that identify fits it."""
-    workers: Count = 1
-    """Processes for the fits of the best candidates."""
 
     def run(self, call: Call) -> dict[str, Any]:
         out = run_directory(self.out, f"explain-{self.path.name}")
@@ -177,18 +179,17 @@ class Explain(Reads):
             self.path, budget(self.budget), strict=self.strict
         )
         file = function(module, "project_file")(run) if self.add else None
+        workers = executor_of(self) or 1
 
         def found() -> Any:
-            missing = command("explain")(
-                run, workers=self.workers, progress=call.progress
-            )
+            missing = command("explain")(run, workers=workers, progress=call.progress)
             return missing if file is None else missing.add_to(file)
 
         return call.saved(out, found)
 
 
 @dataclass(kw_only=True)
-class Compare(Reads):
+class Compare(Reads, InCells):
     """Which model the logs support: simulator, residual, function space, black box."""
 
     project: Annotated[Positional[Path], arg(metavar="PROJECT")]
@@ -197,16 +198,24 @@ class Compare(Reads):
     """Draws networks and forecasts."""
     horizon: ManySeconds = (0.2, 0.5)
     """Open-loop horizons in s."""
-    workers: Count = 1
-    """Processes for the folds; networks then differ by rounding."""
 
     def run(self, call: Call) -> dict[str, Any]:
         out = run_directory(self.out, f"compare-{self.project.stem}")
-        read = read_project(self.project, self, alike=True)
-        how = {
-            "horizons": self.horizon,
-            "seed": self.seed,
-            "workers": self.workers,
-            "progress": call.progress,
-        }
-        return call.saved(out, lambda: command("compare")(*read, **how))
+        share_of(self)
+        work = function("commands.compare", "CompareWork")(
+            *read_project(self.project, self, alike=True),
+            horizons=self.horizon,
+            seed=self.seed,
+        )
+        return folds(self, call, out, work)
+
+
+def folds(given: InCells, call: Call, out: Path, work: Any) -> dict[str, Any]:
+    """The run of some folds, or a share of them."""
+    executor = executor_of(given)
+
+    def make(store: Any) -> dict[str, Any]:
+        how = executor, call.progress, store
+        return call.saved(out, lambda: work.run(*how))
+
+    return in_cells(given, call, out, work.cells, make)

@@ -37,6 +37,8 @@ _SEEDS = Range(0, MAX, f"a whole number from 0 to {MAX}", "E149")
 _COUNTS = Range(1, MAX, f"a whole number from 1 to {MAX}")
 _POSITIVE = Range(math.ulp(0.0), math.inf, "a positive number")
 
+_SHARES = Range(0.0, math.inf, "a number from 0")
+
 Flag = Annotated[bool, arg(help_behavior_hint="")]
 Seed = Annotated[int, option("INT"), _SEEDS]
 Count = Annotated[int, option("N"), _COUNTS]
@@ -46,6 +48,8 @@ SomeSeconds = Annotated[float | None, option("S"), _POSITIVE]
 ManySeconds = Annotated[tuple[float, ...], option("S..."), _POSITIVE]
 Percent = Annotated[float, option("PERCENT"), _POSITIVE]
 Factor = Annotated[float, option("FACTOR"), _POSITIVE]
+Share = Annotated[float, option("CORES"), _POSITIVE]
+Part = Annotated[float, option("GPUS"), _SHARES]
 Folder = Annotated[Path | None, option("DIR")]
 File = Annotated[Path | None, option("FILE")]
 Name = Annotated[str | None, option("NAME")]
@@ -103,3 +107,27 @@ class Reads(Writes, Budgeted):
 
     strict: Flag = False
     """Refuse logs with columns that nothing takes."""
+
+
+@dataclass(kw_only=True)
+class Spread(Common):
+    """Options of a command that computes in many places."""
+
+    workers: SomeCount = None
+    """Processes; default one, for a figure one per core."""
+    ray: Annotated[tuple[str, ...] | None, option("[ADDRESS]")] = None
+    """Use a Ray cluster (extra ray); without an address one is started here."""
+    cell_cores: Share = 1.0
+    """Cores of each cell on a Ray cluster."""
+    cell_gpus: Part = 0.0
+    """GPUs of each cell on a Ray cluster, or a share of one."""
+
+
+@dataclass(kw_only=True)
+class InCells(Spread):
+    """Options of a command whose cells are stored and joined."""
+
+    shard: Annotated[str | None, option("I/N")] = None
+    """Compute the I-th of N shares of the cells, and nothing else."""
+    merge: Annotated[tuple[Path, ...] | None, option("[DIR...]")] = None
+    """Compute nothing: join the shares that are stored here and at other runs."""

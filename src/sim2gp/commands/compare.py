@@ -7,87 +7,37 @@ models forecast the recording left out, open loop, from the same causal starts: 
 single prediction, and draws for the spread.
 """
 
-import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import equinox as eqx
-import jax
 import numpy as np
 
-from sim2gp.belief import AbstractModel
-from sim2gp.commands.compare_setup import Setup, prepare_comparison
+from sim2gp.commands.compare_folds import (
+    HORIZONS,
+    MODELS,
+    Learners,
+    ModelCell,
+    fit_without,
+    fold_key,
+    prepared,
+    trivial_errors,
+)
 from sim2gp.commands.compare_summary import FoldForecasts, summarise
-from sim2gp.commands.folds import recording_of_windows
+from sim2gp.commands.recordings import AbstractFolds, Recordings
 from sim2gp.commands.result import AbstractResult
 from sim2gp.data.logs import Log, note_lines
-from sim2gp.data.one_step_log import (
-    smoothed_states,
-    stride_of,
-    transitions,
-)
-from sim2gp.data.windows_likelihood import WindowsLikelihood
-from sim2gp.identification.fit import fit_windows
-from sim2gp.identification.forecasts import scoring
-from sim2gp.identification.forecasts.baselines import regression_errors
-from sim2gp.identification.forecasts.forecast import new_log_inflation
-from sim2gp.identification.forecasts.forecast_machine import fit_forecast_machine
-from sim2gp.identification.forecasts.prediction import channels, recording_names, subset
-from sim2gp.identification.missing_physics.at_zero import at_zero
-from sim2gp.inference.estimate import Estimate
-from sim2gp.inference.gaussian import Gaussian
-from sim2gp.models import NLM, FunctionSpace, Residual, ResidualFunctionSpace, Sim2GP
-from sim2gp.models.auto import log_scores
-from sim2gp.models.ensemble import ensemble
-from sim2gp.project import Project, load_project
+from sim2gp.identification.forecasts.prediction import channels, recording_names
+from sim2gp.project import Project
 from sim2gp.project.in_memory import Logs, project_and_logs
 from sim2gp.runs import Progress
+from sim2gp.runs.cell_work import AbstractCell, Values
+from sim2gp.runs.executors import Workers
+from sim2gp.runs.plain import from_exact
 from sim2gp.runs.progress import Task
 from sim2gp.runs.provenance import provenance
-from sim2gp.runs.workers import in_order
-from sim2gp.systems.assemble import carrying_inputs
 from sim2gp.systems.base import AbstractSystem
-
-HORIZONS = (0.2, 0.5)  # s
-DRAWS = 32
-
-
-class ModelFactory(NamedTuple):
-    """How a model is made of the simulator and a reach, and what it is in words.
-
-    With ``forces`` the simulator has those that predict recordings left out of its fit
-    (`fit_forecast_machine`), if there are any.
-    """
-
-    make: Callable[[Sim2GP, dict[str, float]], AbstractModel]
-    what: str
-    forces: bool = False
-
-
-Learners = Mapping[str, ModelFactory]
-WITH_RESIDUAL = "the simulator plus a learned residual"
-#: From simple to complex; each from the simulator with its parameters given.
-MODELS: Learners = {
-    "SIM2GP": ModelFactory(lambda sim, reach: sim, "the simulator alone"),
-    "MissingForces": ModelFactory(
-        lambda sim, reach: sim, "the simulator plus missing forces", forces=True
-    ),
-    "RES": ModelFactory(lambda sim, reach: Residual(sim, reach=reach), WITH_RESIDUAL),
-    "RES-FS": ModelFactory(
-        lambda sim, reach: ResidualFunctionSpace(sim, reach=reach), WITH_RESIDUAL
-    ),
-    "FS": ModelFactory(
-        lambda sim, reach: FunctionSpace(sim, reach=reach),
-        "a network that starts from the simulator",
-    ),
-    "NLM": ModelFactory(
-        lambda sim, reach: NLM(sim.system, reach=reach),
-        "a black box rather than the simulator",
-    ),
-}
 
 
 @dataclass(frozen=True, repr=False)
@@ -112,7 +62,7 @@ def compare(
     horizons: Sequence[float] = HORIZONS,
     models: Learners = MODELS,
     seed: int = 0,
-    workers: int = 1,
+    workers: Workers = 1,
     progress: Progress | None = None,
 ) -> Comparison:
     """Fit, train and judge all models fold by fold, at open-loop ``horizons`` in s.
@@ -125,187 +75,91 @@ def compare(
     Raises `InputError` E103 for a position that no log measures, E116 for too short
     logs, E160 for several configurations.
     """
-    started = time.perf_counter()
-    project, logs = project_and_logs(machine, logs, alike=True)
-    setup, folds = prepare_comparison(project, logs, horizons)
-    jobs = [
-        CompareJob(project.path, logs, tuple(horizons), seed, k, left)
-        for k, left in enumerate(folds)
-    ]
-    total = len(folds) * len(models) + 1
-    with (progress or Progress()).task("compare", total) as task:
-        if workers > 1 and models is MODELS and project.can_be_loaded:
-            parts = _folds_in_processes(jobs, workers, task)
-        else:
-            parts = [_run_fold(setup, job, models, task.advance) for job in jobs]
-        _, whole = _fit_without(setup, [], _fold_key(seed, len(folds)))
-        task.advance("evidence")
-    names = channels(project.system, setup.windows)
-    units = {c.name: c.unit for c in project.system.physical_states}
-    summary, arrays = summarise(
-        parts,
-        {name: learner.what for name, learner in models.items()},
-        names,
-        setup.logs,
-        np.asarray(setup.steps.steps) * setup.period,
-        setup.horizons,
-        np.random.default_rng(seed),
-        units,
+    work = CompareWork(
+        *project_and_logs(machine, logs, alike=True),
+        horizons=tuple(horizons),
+        models=models,
+        seed=seed,
     )
-    summary["models"]["SIM2GP"]["log_evidence"] = float(whole.log_evidence)
-    summary |= {
-        "command": "compare",
-        "title": f"{project.name}: which model its logs support",
-        "seed": seed,
-        "period": setup.period,
-        "folds": len(folds),
-        "n_logs": len(set(recording_names(setup.logs))),
-        "n_transitions": len(setup.samples.first),
-        "units": units,
-    }
-    summary["warnings"] += note_lines(setup.logs)
-    return Comparison(summary | provenance(started), arrays)
+    return work.run(workers, progress)
 
 
-class CompareJob(NamedTuple):
-    """One fold of a comparison, as another process needs it; ``left`` are its logs."""
+class CompareWork(AbstractFolds[Comparison]):
+    """A cell for each model without each group of logs; a comparison, of their values.
 
-    path: Path
-    logs: tuple[Log, ...]
-    horizons: tuple[float, ...]
-    seed: int
-    number: int
-    left: list[int]
-
-
-def _folds_in_processes(
-    jobs: Sequence[CompareJob], workers: int, task: Task
-) -> list[FoldForecasts]:
-    """The folds, computed as processes are free."""
-
-    def done(job: CompareJob) -> None:
-        task.advance(f"without {job.logs[job.left[0]].name}", len(MODELS))
-
-    return in_order(_fold_in_process, jobs, workers, done)
-
-
-def _run_fold(
-    setup: Setup, job: CompareJob, models: Learners, done: Callable[[str], None]
-) -> FoldForecasts:
-    return compare_fold(setup, job.left, models, _fold_key(job.seed, job.number), done)
-
-
-def _fold_key(seed: int, number: int) -> jax.Array:
-    return jax.random.fold_in(jax.random.key(seed), number)
-
-
-def _fold_in_process(job: CompareJob) -> FoldForecasts:
-    """The same in a process of its own."""
-    setup, _ = prepare_comparison(load_project(job.path), job.logs, job.horizons)
-    return _run_fold(setup, job, MODELS, lambda done: None)
-
-
-def compare_fold(
-    setup: Setup,
-    left: Sequence[int],
-    models: Learners,
-    key: jax.Array,
-    done: Callable[[str], None],
-) -> FoldForecasts:
-    """All models without the logs ``left``, judged on them.
-
-    What is left out is masked, not removed, so that folds share their compilations.
+    Raises what `prepare_comparison` raises.
     """
-    first, *keys = jax.random.split(key, 1 + len(models))
-    likelihood, belief = _fit_without(setup, left, first)
-    out = np.isin(setup.samples.step_log(), left)
-    test = np.isin(setup.steps.log, left)
-    tt = belief.posterior.mean
-    rows = transitions(
-        setup.samples, smoothed_states(setup.project.system, tt, setup.samples)
-    )
-    train = eqx.tree_at(lambda t: t.mask, rows, ~out)
-    held = eqx.tree_at(lambda t: t.mask, rows, out)
-    sims = _simulators(setup, likelihood, belief, models)
-    start_sd = _start_sd(setup.grid.lag[~test])
-    resolution = np.asarray(setup.windows.floor)
-    training = set(recording_names(setup.logs)) - {setup.logs[k].source for k in left}
-    inflation = new_log_inflation(len(training))
-    error, sd, steps = [], [], []
-    for (name, learner), key in zip(models.items(), keys, strict=True):
-        begin, learn, roll = jax.random.split(key, 3)
-        model = learner.make(sims[learner.forces], setup.reach)
-        fitted = model.fit(model.init(begin), train, key=learn)
-        found = ensemble(fitted, setup.steps, start_sd, draws=DRAWS, key=roll)
-        off = found.point - setup.steps.y
-        if found.finite():
-            counts = setup.steps.valid & ~test[:, None, None]
-            wide = scoring.predicted_spread(
-                off, found.draws, counts, resolution, inflation
+
+    title, after = "compare", 1
+
+    def __init__(
+        self,
+        project: Project,
+        logs: tuple[Log, ...],
+        *,
+        horizons: tuple[float, ...] = HORIZONS,
+        models: Learners = MODELS,
+        seed: int = 0,
+    ) -> None:
+        self.started, self.models, self.seed = time.perf_counter(), models, seed
+        self.recordings = Recordings(project, logs)
+        self.setup, self.folds = prepared(self.recordings, horizons)
+        self.alone = models is not MODELS
+        about = self.recordings, horizons, seed
+        own = models if self.alone else None
+        self.cells = [
+            ModelCell(*about, number, tuple(left), name, own)
+            for number, left in enumerate(self.folds)
+            for name in models
+        ]
+
+    def result(self, values: Mapping[AbstractCell, Values], task: Task) -> Comparison:
+        """Of the values of all cells; a fit of all logs gives the evidence."""
+        setup, seed = self.setup, self.seed
+        _, whole = fit_without(setup, [], fold_key(seed, len(self.folds)))
+        task.advance("evidence")
+        units = {c.name: c.unit for c in setup.project.system.physical_states}
+        summary, arrays = summarise(
+            self._forecasts([from_exact(values[cell]) for cell in self.cells]),
+            {name: learner.what for name, learner in self.models.items()},
+            channels(setup.project.system, setup.windows),
+            setup.logs,
+            np.asarray(setup.steps.steps) * setup.period,
+            setup.horizons,
+            np.random.default_rng(seed),
+            units,
+        )
+        summary["models"]["SIM2GP"]["log_evidence"] = float(whole.log_evidence)
+        summary |= {
+            "command": "compare",
+            "title": f"{setup.project.name}: which model its logs support",
+            "seed": seed,
+            "period": setup.period,
+            "folds": len(self.folds),
+            "n_logs": len(set(recording_names(setup.logs))),
+            "n_transitions": len(setup.samples.first),
+            "units": units,
+        }
+        summary["warnings"] += note_lines(setup.logs)
+        return Comparison(summary | provenance(self.started), arrays)
+
+    def _forecasts(self, found: Sequence[Values]) -> list[FoldForecasts]:
+        """Those of all models, fold by fold."""
+        setup, count = self.setup, len(self.models)
+        parts = []
+        for number, left in enumerate(self.folds):
+            test = np.isin(setup.steps.log, left)
+            each = found[number * count : (number + 1) * count]
+            parts.append(
+                FoldForecasts(
+                    np.stack([one["error"] for one in each]),
+                    np.stack([one["sd"] for one in each]),
+                    trivial_errors(setup, test),
+                    setup.steps.valid[test],
+                    setup.steps.log[test],
+                    setup.grid.since[test],
+                    np.asarray([one["step_score"] for one in each]),
+                    int(np.isin(setup.samples.step_log(), left).sum()),
+                )
             )
-        else:  # an infinite error: such a model loses, and has no numbers
-            off, wide = np.full_like(off, math.inf), np.ones_like(off)
-        error.append(off[test])
-        sd.append(wide[test])
-        steps.append(float(np.mean(np.asarray(log_scores(fitted, held))[out])))
-        done(f"{name} without {setup.logs[left[0]].name}")
-    return FoldForecasts(
-        np.stack(error),
-        np.stack(sd),
-        _trivial(setup, test),
-        setup.steps.valid[test],
-        setup.steps.log[test],
-        setup.grid.since[test],
-        np.asarray(steps),
-        held.count,
-    )
-
-
-def _trivial(setup: Setup, test: np.ndarray) -> np.ndarray:
-    """Errors of the start held and of the linear regression, as `Held.trivial`."""
-    train, tested = subset(setup.grid, ~test), subset(setup.grid, test)
-    rows = stride_of(setup.period) * np.asarray(setup.steps.steps)
-    start = np.asarray(tested.windows.start)[:, list(setup.steps.outputs)]
-    hold = start[:, None] - setup.steps.y[test]
-    return np.stack([hold, regression_errors(train, tested, rows)])
-
-
-def _simulators(
-    setup: Setup, likelihood: WindowsLikelihood, fit: Estimate, models: Learners
-) -> dict[bool, Sim2GP]:
-    """Without missing forces, and with them if a model asks for these."""
-    sims = {False: _simulator(setup, setup.project.system, fit.posterior)}
-    if any(learner.forces for learner in models.values()):
-        known = fit.with_measurements(setup.project.system.parameters)
-        recording = recording_of_windows(setup.logs, setup.of)
-        robust = setup.project.spec.likelihood.robust
-        start = at_zero(likelihood, known)
-        wider = fit_forecast_machine(start, recording, robust=robust)
-        sims[True] = _simulator(setup, wider.system, wider.posterior)
-    return sims
-
-
-def _simulator(setup: Setup, system: AbstractSystem, known: Gaussian) -> Sim2GP:
-    """In steps of the comparison, its parameters given."""
-    stepper = carrying_inputs(system, setup.period)
-    return Sim2GP(stepper, dt=setup.period, prior=known, frozen=True)
-
-
-def _fit_without(
-    setup: Setup, left: Sequence[int], key: jax.Array
-) -> tuple[WindowsLikelihood, Estimate]:
-    """The simulator's parameters from the windows of all logs but ``left``."""
-    mask = np.asarray(setup.windows.mask) & ~np.isin(setup.of, left)[:, None, None]
-    kept = eqx.tree_at(lambda w: w.mask, setup.windows, mask)
-    robust = setup.project.spec.likelihood.robust
-    system = setup.project.system
-    # One start: the folds are small changes of one problem, and share a compilation.
-    found = fit_windows(system, kept, key=key, robust=robust, starts=1)
-    return WindowsLikelihood(system, kept), found
-
-
-def _start_sd(lag: np.ndarray) -> np.ndarray:
-    """How far causal starts are off, as a root mean square over windows."""
-    known = np.isfinite(lag)
-    squares = np.sum(np.where(known, lag, 0.0) ** 2, axis=0)
-    return np.asarray(np.sqrt(squares / np.maximum(known.sum(axis=0), 1)))
+        return parts

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sim2gp.commands.evaluate import check_horizon, windows_for
+from sim2gp.commands.evaluation import check_horizon, windows_for
 from sim2gp.data.grid import CURVE, PERIOD, Grid
 from sim2gp.data.logs import Log
 from sim2gp.data.one_step_log import (

@@ -49,8 +49,8 @@ from sim2gp.project import Project, load_project
 from sim2gp.project.amend import amend
 from sim2gp.project.training_windows import cut_logs
 from sim2gp.runs import Progress, load_run
+from sim2gp.runs.executors import AbstractExecutor, Workers, executor_of
 from sim2gp.runs.provenance import provenance
-from sim2gp.runs.workers import spread
 from sim2gp.systems.assemble import free_parts
 from sim2gp.systems.effects.registry import Candidate
 from sim2gp.systems.effects.registry import candidates as registered
@@ -105,21 +105,23 @@ class MissingPhysics(AbstractResult):
 def explain(
     run: Identification | Demonstration,
     *,
-    workers: int = 1,
+    workers: Workers = 1,
     progress: Progress | None = None,
 ) -> MissingPhysics:
     """Search what the run's machine lacks.
 
     Every effect of the library is scored, the best few are fitted. With ``workers`` > 1
-    the fits run in that many processes if the project file has not changed since the
-    run, else in this one. Raises `InputError` E130 for a run of another command, and
-    what reading the run's logs raises.
+    the fits run in that many processes, or in those of an executor, if the project file
+    has not changed since the run, else in this one. Raises `InputError` E130 for a run
+    of another command, and what reading the run's logs raises.
     """
     started = time.perf_counter()
     logs = run.training_logs(alike=True) if isinstance(run, Identification) else ()
     data, fits, project = _data(run, logs), None, run.project
-    if workers > 1 and logs and project is not None and project.can_be_loaded:
-        fits = partial(_fits_in_processes, project.path, logs, workers)
+    executor = executor_of(workers)
+    apart = executor.count > 1 and logs
+    if apart and project is not None and project.can_be_loaded:
+        fits = partial(_fits_in_processes, project.path, logs, executor)
     with (progress or Progress()).task("explain", 3 + REFITS) as task:
         found = search_missing(data, fits=fits, on_step=task.advance)
     candidates, forces = candidate_rows(found), force_rows(found, data.system)
@@ -180,7 +182,7 @@ class RefitJob(NamedTuple):
 def _fits_in_processes(
     path: Path,
     logs: tuple[Log, ...],
-    workers: int,
+    executor: AbstractExecutor,
     data: AbstractData,
     bare: Estimate,
     ranked: Sequence[ScoredCandidate],
@@ -193,7 +195,7 @@ def _fits_in_processes(
         RefitJob(path, logs, data.seed, name, one.starts, sent)
         for name, one in asked.items()
     ]
-    for job, fit in spread(_refit_of, [[job] for job in jobs], workers):
+    for job, fit in executor.spread(_refit_of, [[job] for job in jobs]):
         if fit is None:
             yield job.name, None
             continue

@@ -5,7 +5,7 @@ from pathlib import Path
 from sim2gp.commands.compare import Comparison
 from sim2gp.commands.demo import Demonstration
 from sim2gp.commands.design import FILE, NextExperiment
-from sim2gp.commands.evaluate import Evaluation
+from sim2gp.commands.evaluation import Evaluation
 from sim2gp.commands.explain import MissingPhysics
 from sim2gp.commands.identification import Identification, restore_identification
 from sim2gp.commands.result import AbstractResult

@@ -1,13 +1,13 @@
 """A figure of the paper, or the mismatch map: its data, the picture, its claims."""
 
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from sim2gp.commands.load_run import StudyRun
 from sim2gp.runs import Progress
 from sim2gp.runs.cells import Old
+from sim2gp.runs.executors import Workers
 from sim2gp.runs.store import load_run
-from sim2gp.runs.workers import cores
 from sim2gp.studies.figure1 import TwoLinkArm
 from sim2gp.studies.figure2 import PosteriorSampling
 from sim2gp.studies.figure3 import Exploration
@@ -25,6 +25,11 @@ STUDIES: dict[str, type[Study]] = {
 }
 
 
+def study_of(figure: Figure, **size: Any) -> Study:
+    """The study of a figure; ``size`` as `reproduce` has it."""
+    return STUDIES[figure](figure, **size)
+
+
 def reproduce(
     figure: Figure,
     out: Path | str | None = None,
@@ -33,7 +38,7 @@ def reproduce(
     seeds: int | None = None,
     episodes: int | None = None,
     quick: bool = False,
-    workers: int | None = None,
+    workers: Workers | None = None,
     old: Old = "refuse",
     progress: Progress | None = None,
 ) -> StudyRun:
@@ -45,11 +50,9 @@ def reproduce(
     processes as there are cores. ``old`` says what to do with cells of another source
     (E186). Raises `InputError` E160 for ``episodes`` of figure 1, which has none.
     """
-    study = STUDIES[figure](
-        figure, seed=seed, seeds=seeds, episodes=episodes, quick=quick
-    )
+    study = study_of(figure, seed=seed, seeds=seeds, episodes=episodes, quick=quick)
     out = Path("runs") / figure if out is None else Path(out)
     progress = progress or Progress()
-    study.run(out, workers=workers or cores(), progress=progress, old=old)
+    study.run(out, workers=workers, progress=progress, old=old)
     found = load_run(out)
     return StudyRun(found.summary, found.arrays, {}, None, out)

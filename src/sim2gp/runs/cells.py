@@ -75,6 +75,17 @@ class Cells:
         _write(self.folder / f"{name}.json", seal(content))
         return plain
 
+    def adopt(
+        self, other: "Cells", cells: Iterable[tuple[str, Mapping[str, Any]]]
+    ) -> None:
+        """Copy those of the cells that are there and not here, with their source."""
+        for name, arguments in cells:
+            if self.load(name, arguments) or not other.load(name, arguments):
+                continue
+            for file in (f"{name}.json", f"sources/{other.source.digest}.json"):
+                if content := other._content(file):
+                    _write(self.folder / file, content)
+
     def check(self, cells: Iterable[tuple[str, Mapping[str, Any]]]) -> None:
         """Refuse names and arguments of cells before any of them is computed.
 

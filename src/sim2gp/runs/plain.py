@@ -1,5 +1,6 @@
 """Results as plain data: JSON that every reader accepts, and what made them."""
 
+import base64
 import importlib.metadata
 import json
 import math
@@ -34,6 +35,32 @@ def _plain_values(value: Any, key: str) -> Any:
             raise error("result_not_finite", Sim2GPError, where=where, got=value)
         return float(value)
     return _plain_values(np.asarray(value).tolist(), key)
+
+
+def exact(value: Any) -> Any:
+    """Arrays as their bytes, whichever numbers are in them: `from_exact` has them back.
+
+    Of mappings and lists, as deep as they go.
+    """
+    if isinstance(value, Mapping):
+        return {str(k): exact(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [exact(v) for v in value]
+    if isinstance(value, np.generic) or not hasattr(value, "shape"):
+        return value
+    value = np.asarray(value)
+    content = base64.b64encode(np.ascontiguousarray(value).tobytes()).decode("ascii")
+    return {"dtype": value.dtype.str, "shape": list(value.shape), "base64": content}
+
+
+def from_exact(value: Any) -> Any:
+    """What `exact` was given; lists for tuples."""
+    if isinstance(value, Mapping):
+        if value.keys() == {"dtype", "shape", "base64"}:
+            flat = np.frombuffer(base64.b64decode(value["base64"]), value["dtype"])
+            return flat.reshape(value["shape"]).copy()
+        return {k: from_exact(v) for k, v in value.items()}
+    return [from_exact(v) for v in value] if isinstance(value, list) else value
 
 
 def environment() -> dict[str, str]:

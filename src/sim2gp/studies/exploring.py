@@ -32,6 +32,7 @@ from sim2gp.planning import (
 from sim2gp.planning.episode import Purpose, episode, key_for, oracle_world
 from sim2gp.planning.loop import Episode, drawn, expected, psal
 from sim2gp.planning.tasks import Task
+from sim2gp.runs.cell_work import AbstractCell, Values
 from sim2gp.studies import swingup
 from sim2gp.studies.learners import (
     QUICK_TRAINING,
@@ -39,7 +40,7 @@ from sim2gp.studies.learners import (
     planner_of,
     task_and_model,
 )
-from sim2gp.studies.study import AbstractCell, Values, described
+from sim2gp.studies.study import described
 from sim2gp.systems.parts import AbstractPart
 from sim2gp.types import Dynamics, Key, in_float64
 

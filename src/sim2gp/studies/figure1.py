@@ -17,7 +17,8 @@ from jaxtyping import Array, Float
 
 from sim2gp.identification import diagnose
 from sim2gp.models import Sim2GPBelief
-from sim2gp.studies.study import AbstractCell, Arrays, Key, Study, Values
+from sim2gp.runs.cell_work import AbstractCell, Values
+from sim2gp.studies.study import Arrays, Key, Study
 from sim2gp.studies.two_link import (
     DT,
     LEVELS,

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sim2gp.planning.tasks import MACHINES, SOLVED
+from sim2gp.runs.cell_work import AbstractCell, Values
 from sim2gp.studies.claims import (
     SAMPLING_PAYS,
     at_least_as_good,
@@ -21,7 +22,7 @@ from sim2gp.studies.claims import (
     difference_in_words,
 )
 from sim2gp.studies.learners import CONDITIONS, METHODS, TRAINED, WITH_TERM
-from sim2gp.studies.study import AbstractCell, Arrays, Key, Study, Values
+from sim2gp.studies.study import Arrays, Key, Study
 from sim2gp.studies.swingup import (
     Cell,
     Table,

@@ -13,10 +13,11 @@ import numpy as np
 from jaxtyping import Float
 
 from sim2gp.planning.tasks import MACHINES
+from sim2gp.runs.cell_work import AbstractCell, Values
 from sim2gp.studies.claims import at_least_as_good, bootstrap_median, claim
 from sim2gp.studies.exploring import METHODS, QUANTITIES, Cell
 from sim2gp.studies.learners import CONDITIONS
-from sim2gp.studies.study import AbstractCell, Arrays, Key, Study, Values
+from sim2gp.studies.study import Arrays, Key, Study
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

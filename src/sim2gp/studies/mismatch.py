@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sim2gp.planning.tasks import MACHINES, SOLVED
+from sim2gp.runs.cell_work import AbstractCell, Values
 from sim2gp.studies.claims import (
     SAMPLING_PAYS,
     better_somewhere,
@@ -24,7 +25,7 @@ from sim2gp.studies.claims import (
     difference_in_words,
 )
 from sim2gp.studies.learners import METHODS, WITH_TERM
-from sim2gp.studies.study import AbstractCell, Arrays, Key, Study, Values
+from sim2gp.studies.study import Arrays, Key, Study
 from sim2gp.studies.swingup import (
     Cell,
     Table,

@@ -9,77 +9,32 @@ import os
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
-from functools import partial
 from pathlib import Path
-from sys import modules
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import jax
 import numpy as np
 
 from sim2gp.errors import error
 from sim2gp.runs import Progress, new_run
-from sim2gp.runs.cells import Cells, Old
+from sim2gp.runs.cell_work import (
+    AbstractCell,
+    Values,
+    compute_cells,
+    store_of,
+    with_needed,
+)
+from sim2gp.runs.cells import Old
+from sim2gp.runs.executors import Workers, executor_of
 from sim2gp.runs.provenance import provenance
-from sim2gp.runs.workers import spread
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Values = dict[str, Any]
 Arrays = dict[str, np.ndarray]
 #: Names of a row of cells, one cell for each seed: machine, condition, method.
 Key = tuple[str, ...]
-
-
-class AbstractCell(ABC):
-    """A frozen dataclass: all arguments of what is computed once."""
-
-    method: str
-    seed: int
-
-    @property
-    @abstractmethod
-    def name(self) -> str:
-        """The name of its file."""
-
-    @property
-    @abstractmethod
-    def arguments(self) -> Values:
-        """All that its values depend on, except how many episodes there are."""
-
-    @property
-    @abstractmethod
-    def program(self) -> tuple[Hashable, ...]:
-        """Cells that compile alike; the first entry groups more of them."""
-
-    @property
-    def needs(self) -> "AbstractCell | None":
-        """The cell whose values this one starts from."""
-        return None
-
-    def enough(self, values: Mapping[str, Any]) -> bool:
-        """Whether stored values have as many episodes as this cell asks for."""
-        del values
-        return True
-
-    @abstractmethod
-    def compute(self, needed: Values | None) -> Values:
-        """Its values; ``needed`` are those of the cell that it needs."""
-
-    @property
-    def batch(self) -> Hashable:
-        """Cells that an accelerator computes as one have the same; else the cell."""
-        return self
-
-    @classmethod
-    def compute_batch(
-        cls, cells: Sequence[Any], needed: Sequence[Values | None]
-    ) -> list[Values]:
-        """Values of cells of one `batch`."""
-        return [cell.compute(x) for cell, x in zip(cells, needed, strict=True)]
 
 
 class Study(ABC):
@@ -140,6 +95,11 @@ class Study(ABC):
         return out
 
     @property
+    def cells(self) -> list[AbstractCell]:
+        """All of them, each after the one that it needs."""
+        return with_needed(cell for row in self.rows().values() for cell in row)
+
+    @property
     def rng(self) -> np.random.Generator:
         """A new generator, for the bootstrap of the claims."""
         return np.random.default_rng(self.seed)
@@ -151,7 +111,12 @@ class Study(ABC):
         return words + " --quick" * self.quick + " --keep-old" * (old == "keep")
 
     def run(
-        self, out: Path, *, workers: int, progress: Progress, old: Old = "refuse"
+        self,
+        out: Path,
+        *,
+        workers: Workers | None,
+        progress: Progress,
+        old: Old = "refuse",
     ) -> dict[str, Any]:
         """Compute missing cells, check the claims, write the run; returns its summary.
 
@@ -190,7 +155,7 @@ def run_cells(
     rows: Mapping[Key, Sequence[AbstractCell]],
     out: Path,
     *,
-    workers: int,
+    workers: Workers | None,
     progress: Progress,
     old: Old = "refuse",
 ) -> tuple[dict[AbstractCell, Values], dict[str, Any]]:
@@ -199,118 +164,27 @@ def run_cells(
     Raises `InputError` E186 before the first cell is computed for stored cells that
     this source did not compute and ``old`` does not allow.
     """
-    wanted = list(dict.fromkeys(cell for row in rows.values() for cell in row))
-    needed = dict.fromkeys(cell.needs for cell in wanted if cell.needs is not None)
-    stages = (list(needed), [cell for cell in wanted if cell not in needed])
-    every = [*stages[0], *stages[1]]
-    stored = Cells(out, _code(every[0]), old)
-    named = [(cell.name, cell.arguments) for cell in every]
-    stored.check(named)
-    values: dict[AbstractCell, Values] = {}
+    every = with_needed(cell for row in rows.values() for cell in row)
+    store = store_of(every, out, old)
     # Each process would claim most of a GPU's memory, and all share one.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-    compute = _in_processes if jax.default_backend() == "cpu" else _in_batches
     with progress.task("cells", len(every)) as task:
-        for stage in stages:
-            for cell, value in compute(stage, out, old, workers):
-                values[cell] = value
-                task.advance(cell.name.replace("_", ", "))
-    return values, _about(values) | stored.summary(named)
-
-
-#: Cells with their values, as they get done.
-Done = Iterator[tuple[AbstractCell, Values]]
-
-
-def _in_processes(
-    cells: Sequence[AbstractCell], out: Path, old: Old, workers: int
-) -> Done:
-    """A cell at a time in each process, which owns one core."""
-    work = partial(run_cell, out=out, old=old)
-    yield from spread(work, _by_program(cells, workers), workers)
-
-
-def _in_batches(
-    cells: Sequence[AbstractCell], out: Path, old: Old, workers: int
-) -> Done:
-    """A batch at a time in each process: others are fitted while one is planned."""
-    batches: dict[Hashable, list[AbstractCell]] = {}
-    for cell in cells:
-        batches.setdefault(cell.batch, []).append(cell)
-    work = partial(run_batch, out=out, old=old)
-    for _, values in spread(work, [[batch] for batch in batches.values()], workers):
-        yield from values.items()
-
-
-def run_batch(
-    cells: Sequence[AbstractCell], out: Path, old: Old = "refuse"
-) -> dict[AbstractCell, Values]:
-    """`run_cell` of cells of one batch; those not stored are computed as one."""
-    stored = Cells(out, _code(cells[0]), old)
-    found = {cell: _stored(cell, stored) for cell in cells}
-    left = [cell for cell in cells if found[cell] is None]
-    if left:
-        needed = [
-            None if cell.needs is None else run_cell(cell.needs, out, old)
-            for cell in left
-        ]
-        computed = type(left[0]).compute_batch(left, needed)
-        for cell, values in zip(left, computed, strict=True):
-            found[cell] = _saved(cell, stored, values)
-    return {cell: values for cell, values in found.items() if values is not None}
-
-
-def run_cell(cell: AbstractCell, out: Path, old: Old = "refuse") -> Values:
-    """A cell's values, from the disk if there are enough of them (E186)."""
-    cells = Cells(out, _code(cell), old)
-    stored = _stored(cell, cells)
-    if stored is not None:
-        return stored
-    needed = None if cell.needs is None else run_cell(cell.needs, out, old)
-    return _saved(cell, cells, cell.compute(needed))
-
-
-def _stored(cell: AbstractCell, cells: Cells) -> Values | None:
-    """Values on the disk; None if there are not enough of them."""
-    stored = cells.load(cell.name, cell.arguments)
-    if stored is None or not (cell.enough(stored) or stored.get("failure")):
-        return None
-    return stored
-
-
-def _saved(cell: AbstractCell, cells: Cells, values: Values) -> Values:
-    """Stored with the device that computed them: another one rounds otherwise."""
-    device = {"device": jax.default_backend()}
-    return cells.save(cell.name, cell.arguments, values | device)
-
-
-def _code(cell: AbstractCell) -> str:
-    """The file that computes a cell: its source is stored with its values."""
-    return str(modules[type(cell).__module__].__file__)
-
-
-def _by_program(
-    cells: Iterable[AbstractCell], workers: int
-) -> list[list[AbstractCell]]:
-    """Groups that a process takes whole: it compiles once for all of a group.
-
-    All cells of a machine, or of a learner on a machine where processes outnumber
-    machines.
-    """
-    cells = list(cells)
-    whole = workers <= len({cell.program[0] for cell in cells})
-    groups: dict[Hashable, list[AbstractCell]] = {}
-    for cell in cells:
-        key = cell.program[0] if whole else cell.program
-        groups.setdefault(key, []).append(cell)
-    return list(groups.values())
+        values = compute_cells(
+            every,
+            store,
+            executor_of(workers),
+            lambda cell: task.advance(cell.note),
+        )
+    named = [(cell.name, cell.arguments) for cell in every]
+    return values, _about(values) | store.summary(named)
 
 
 def _about(values: Mapping[AbstractCell, Values]) -> dict[str, Any]:
     """Failures and seconds of all cells."""
     spent: dict[str, float] = {}
     for cell, value in values.items():
-        spent[cell.method] = spent.get(cell.method, 0.0) + value.get("seconds", 0.0)
+        method = str(cell.arguments.get("method", ""))
+        spent[method] = spent.get(method, 0.0) + value.get("seconds", 0.0)
     return {
         "fits_not_converged": [
             f"{cell.name}: {value['failure']}"

@@ -23,6 +23,7 @@ from sim2gp.planning.loop import SamplingRun
 from sim2gp.planning.oracle import AcceptedTruth, accept_truth, episodes_in
 from sim2gp.planning.tasks import MACHINES, Task, hanging_return, score
 from sim2gp.planning.together import accept_together, host, learn_together
+from sim2gp.runs.cell_work import AbstractCell, Values
 from sim2gp.studies.learners import (
     CONDITIONS,
     QUICK_TRAINING,
@@ -34,7 +35,7 @@ from sim2gp.studies.learners import (
     planner_of,
     task_and_model,
 )
-from sim2gp.studies.study import AbstractCell, Key, Values, described
+from sim2gp.studies.study import Key, described
 from sim2gp.systems.parts import AbstractPart
 
 #: Scores by row; a row has seeds of its own.

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 from sim2gp.data.transitions import Transitions
 from sim2gp.errors import NotConverged, NotFinite
 from sim2gp.models import Sim2GP, Sim2GPBelief
-from sim2gp.studies.study import AbstractCell, Values
+from sim2gp.runs.cell_work import AbstractCell, Values
 from sim2gp.systems import UniformRodArm
 from sim2gp.types import Action, Key, State, in_float64
 

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from sim2gp.errors import InputError, NotConverged, Sim2GPError
-from sim2gp.runs import workers
-from sim2gp.runs.workers import in_order, spread
+from sim2gp.runs.executors import Processes, processes
 
 
 def unfinished() -> NotConverged:
@@ -36,7 +35,7 @@ def square(job: int) -> tuple[int, int]:
 
 def test_every_job_is_done_once_and_groups_stay_together() -> None:
     groups = [[1, 2, 3], [], [4, 5], [6]]
-    found = dict(spread(square, groups, 2))
+    found = dict(Processes(2).spread(square, groups))
     assert {job: result[0] for job, result in found.items()} == {
         n: n**2 for n in range(1, 7)
     }
@@ -54,7 +53,9 @@ def late(job: tuple[float, int]) -> int:
 def test_results_have_the_order_of_their_jobs(count: int) -> None:
     """Of two processes the second is done first."""
     jobs, finished = [(2.0, 7), (0.0, 8), (0.0, 9)], []
-    assert in_order(late, jobs, count, lambda job: finished.append(job[1])) == [7, 8, 9]
+    assert Processes(count).in_order(
+        late, jobs, lambda job: finished.append(job[1])
+    ) == [7, 8, 9]
     assert sorted(finished) == [7, 8, 9]
     assert finished[0] == (7 if count == 1 else 8)
 
@@ -66,22 +67,22 @@ def cores_of_threads(job: int) -> list[list[int]]:
 
 
 @pytest.mark.skipif(
-    not os.path.isdir("/proc/self/task") or len(workers._allowed()) < 2,
+    not os.path.isdir("/proc/self/task") or len(processes._allowed()) < 2,
     reason="needs two cores and a system that tells of threads",
 )
 def test_no_thread_of_a_worker_leaves_its_core() -> None:
-    mine = workers._allowed()
-    found = dict(spread(cores_of_threads, [[1], [2]], 2))
+    mine = processes._allowed()
+    found = dict(Processes(2).spread(cores_of_threads, [[1], [2]]))
     for threads in found.values():
         assert len(threads) >= 1
         assert all(thread == threads[0] for thread in threads)
         assert len(threads[0]) == 1
     assert {threads[0][0] for threads in found.values()} <= set(mine[:2])
-    assert workers._allowed() == mine
+    assert processes._allowed() == mine
 
 
 def test_one_worker_is_this_process() -> None:
-    found = dict(spread(square, [[1, 2], [3]], 1))
+    found = dict(Processes(1).spread(square, [[1, 2], [3]]))
     assert found == {n: (n**2, os.getpid()) for n in (1, 2, 3)}
 
 
@@ -96,22 +97,22 @@ def programs(size: int) -> int:
     return doubled._cache_size()
 
 
-@pytest.mark.skipif(not workers.MAPS.exists(), reason="Linux limits a process's maps")
+@pytest.mark.skipif(not processes.MAPS.exists(), reason="Linux limits a process's maps")
 def test_programs_are_forgotten_before_memory_maps_run_out(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A study of many programs died of it after 43 of its 100 cells."""
     sizes = [[1, 2, 3]]
-    assert [n for _, n in spread(programs, sizes, 1)] == [1, 2, 3]
+    assert [n for _, n in Processes(1).spread(programs, sizes)] == [1, 2, 3]
     doubled.clear_cache()
-    monkeypatch.setattr(workers, "MOST", 0)
-    assert [n for _, n in spread(programs, sizes, 1)] == [1, 1, 1]
+    monkeypatch.setattr(processes, "MOST", 0)
+    assert [n for _, n in Processes(1).spread(programs, sizes)] == [1, 1, 1]
 
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_an_error_arrives_whole(count: int) -> None:
     with pytest.raises(InputError, match=r"E103 unlucky: got 13\. Fix: another") as e:
-        list(spread(square, [[13], [1]], count))
+        list(Processes(count).spread(square, [[13], [1]]))
     assert e.value.code == "E103"
     assert str(e.value.got) == "13"
 
@@ -119,18 +120,18 @@ def test_an_error_arrives_whole(count: int) -> None:
 def test_the_error_of_a_worker_is_the_same_error() -> None:
     """What is known where it ended stays in the process."""
     with pytest.raises(NotConverged) as e:
-        list(spread(square, [[15], [1]], 2))
+        list(Processes(2).spread(square, [[15], [1]]))
     assert str(e.value) == str(unfinished())
     assert e.value.key == "not_converged"
     assert e.value.known is None
 
 
 def test_a_process_that_dies_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workers, "PATIENCE", 0.1)
+    monkeypatch.setattr(processes, "PATIENCE", 0.1)
     with pytest.raises(
         Sim2GPError, match="E208 a worker process died: got exit code 3"
     ):
-        list(spread(square, [[14], [1]], 2))
+        list(Processes(2).spread(square, [[14], [1]]))
 
 
 def lingering(path: str) -> None:
@@ -141,15 +142,15 @@ def lingering(path: str) -> None:
 
 STUDY = """
 import sys
-from tests.runs.test_workers import lingering
-from sim2gp.runs.workers import spread
+from tests.runs.test_processes import lingering
+from sim2gp.runs.executors import Processes
 
 if __name__ == "__main__":
-    list(spread(lingering, [[name] for name in sys.argv[1:]], 2))
+    list(Processes(2).spread(lingering, [[name] for name in sys.argv[1:]]))
 """
 
 
-def test_workers_end_with_a_process_that_is_killed(tmp_path: Path) -> None:
+def test_processes_end_with_a_process_that_is_killed(tmp_path: Path) -> None:
     (tmp_path / "study.py").write_text(STUDY)
     files = [tmp_path / "one", tmp_path / "two"]
     path = os.pathsep.join(

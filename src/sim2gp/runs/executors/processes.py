@@ -1,4 +1,4 @@
-"""A long study on all cores: groups of jobs, each group in one process, in order.
+"""Processes of this machine: groups of jobs, each group in one process, in order.
 
 What a group has in common is compiled once, by the process that takes it. Processes
 are spawned, not forked (JAX has threads), and pinned to a core each where the system
@@ -11,17 +11,24 @@ import queue
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import chain, cycle
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 
-from sim2gp import cleanup, errors
+from sim2gp import cleanup
 from sim2gp.errors import Sim2GPError, error
+from sim2gp.runs.executors.base import (
+    AbstractExecutor,
+    Job,
+    Outcome,
+    Result,
+    outcome_of,
+    result_of,
+)
 
-Job = TypeVar("Job")
-Result = TypeVar("Result")
 PATIENCE = 1.0  # s between looks at whether the processes still live
 #: Memory maps of a process, of the 65,530 that Linux gives it: each compiled program
 #: takes several, and without any left the process dies.
@@ -33,23 +40,40 @@ def cores() -> int:
     return len(_allowed())
 
 
-def spread(
-    work: Callable[[Job], Result], groups: Sequence[Sequence[Job]], workers: int
-) -> Iterator[tuple[Job, Result]]:
-    """``work(job)`` of every job as it gets done; ``work`` must be importable.
+@dataclass(frozen=True)
+class Processes(AbstractExecutor):
+    """So many processes; one is this process itself."""
 
-    One worker is this process itself. Jobs and results are pickled; arrays of 64 bits
-    must be NumPy's, since JAX would read them with 32. Raises what ``work`` raises of
-    `Sim2GPError`, and E208 when a process dies of anything else.
-    """
-    groups = [group for group in groups if group]
-    workers = min(workers, len(groups))
-    if workers <= 1:
-        for group in groups:
-            for job in group:
-                yield job, work(job)
-                _forget_programs()
-        return
+    number: int = 1
+
+    @property
+    def count(self) -> int:
+        """How many there are."""
+        return self.number
+
+    @property
+    def accelerated(self) -> bool:
+        """Whether this machine has an accelerator, which all of them share."""
+        return jax.default_backend() != "cpu"
+
+    def spread(
+        self, work: Callable[[Job], Result], groups: Sequence[Sequence[Job]]
+    ) -> Iterator[tuple[Job, Result]]:
+        """As processes are free."""
+        groups = [group for group in groups if group]
+        number = min(self.number, len(groups))
+        if number <= 1:
+            for group in groups:
+                for job in group:
+                    yield job, work(job)
+                    forget_programs()
+        else:
+            yield from _spread(work, groups, number)
+
+
+def _spread(
+    work: Callable[[Job], Result], groups: Sequence[Sequence[Job]], number: int
+) -> Iterator[tuple[Job, Result]]:
     context = multiprocessing.get_context("spawn")
     jobs, results = context.Queue(), context.Queue()
     numbered = dict(enumerate(chain.from_iterable(groups)))
@@ -57,40 +81,22 @@ def spread(
     for group in groups:
         jobs.put((first, list(group)))
         first += len(group)
-    for _ in range(workers):
+    for _ in range(number):
         jobs.put(None)
     processes = [
         context.Process(target=_serve, args=(work, jobs, results), daemon=True)
-        for _ in range(workers)
+        for _ in range(number)
     ]
     with cleanup.registered(lambda: _kill(processes)):
         try:
             for process, core in zip(processes, cycle(_allowed()), strict=False):
                 _start(process, core)
             for _ in numbered:
-                number, result = _next(results, processes)
-                yield numbered[number], result
+                place, outcome = _next(results, processes)
+                yield numbered[place], result_of(outcome)
         finally:
             for process in _kill(processes):
                 process.join()
-
-
-def in_order(
-    work: Callable[[Job], Result],
-    jobs: Sequence[Job],
-    workers: int,
-    done: Callable[[Job], object],
-) -> list[Result]:
-    """``work(job)`` of every job, in their order; ``done(job)`` as each is finished.
-
-    As `spread` does it, a job at a time; no two jobs may be the same object.
-    """
-    place = {id(job): k for k, job in enumerate(jobs)}
-    found: dict[int, Result] = {}
-    for job, result in spread(work, [[job] for job in jobs], workers):
-        found[place[id(job)]] = result
-        done(job)
-    return [found[k] for k in range(len(jobs))]
 
 
 def _kill(processes: Sequence[Any]) -> list[Any]:
@@ -125,21 +131,16 @@ def _start(process: Any, core: int | None) -> None:
         os.sched_setaffinity(0, mine)
 
 
-def _next(results: Any, processes: Sequence[Any]) -> Any:
+def _next(results: Any, processes: Sequence[Any]) -> tuple[int, Outcome]:
     """The next result, for as long as somebody lives to make it."""
     while True:
         try:
-            number, result, failure = results.get(timeout=PATIENCE)
+            return results.get(timeout=PATIENCE)
         except queue.Empty:
             died = [p.exitcode for p in processes if p.exitcode]
             if died:
                 got = f"exit code {died[0]}"
                 raise error("worker_died", Sim2GPError, got=got) from None
-            continue
-        if failure is not None:
-            kind, arguments = failure
-            raise getattr(errors, kind)(**arguments)
-        return number, result
 
 
 def _serve(work: Callable[[Any], Any], jobs: Any, results: Any) -> None:
@@ -148,17 +149,15 @@ def _serve(work: Callable[[Any], Any], jobs: Any, results: Any) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_follow, daemon=True).start()
     for first, group in iter(jobs.get, None):
-        for number, job in enumerate(group, first):
-            try:
-                results.put((number, work(job), None))
-                _forget_programs()
-            except Sim2GPError as caught:
-                failure = type(caught).__name__, caught.arguments
-                results.put((number, None, failure))
+        for place, job in enumerate(group, first):
+            outcome = outcome_of(work, job)
+            results.put((place, outcome))
+            if outcome[1] is not None:
                 return
+            forget_programs()
 
 
-def _forget_programs() -> None:
+def forget_programs() -> None:
     """Give their memory maps back, once there are many."""
     if MAPS.exists() and MAPS.read_bytes().count(b"\n") > MOST:
         jax.clear_caches()
