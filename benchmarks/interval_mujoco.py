@@ -90,7 +90,7 @@ def knowing_arm(condition: "Condition") -> AbstractSystem:
         MissingForce(q, 0.05, Harmonics((1.0,), frequency=TURNS), what="cogging")
         if condition.cogging
         else MissingForce(
-            q, 0.05, Sign(condition.width), of_velocity=True, what="dry_friction"
+            q, 0.05, Sign((condition.width,)), of_velocity=True, what="dry_friction"
         )
         for q in ("q1", "q2")
     ]

@@ -62,7 +62,7 @@ def test_a_fit_has_a_free_force_on_the_host() -> None:
     """Its prior is as wide as it says: the host keeps the scale."""
     data = arms()
     forces = [
-        MissingForce(q, 0.05, Sign(FRICTION.width), of_velocity=True, what="dry")
+        MissingForce(q, 0.05, Sign((FRICTION.width,)), of_velocity=True, what="dry")
         for q in ("q1", "q2")
     ]
     system = free_parts(mujoco_arm(), forces)

@@ -207,6 +207,6 @@ def test_a_force_is_in_newton_metres_of_what_moves_the_joint() -> None:
     assert parts["q1.position_force"].unit(plant) == "N m"
     # Steep, but a step of the largest expected size does not reverse the joint.
     dry = parts["q2.dry_friction"]
-    steepest = dry.magnitude * spread[1, 1] * STEP / dry.basis.width
+    steepest = dry.magnitude * spread[1, 1] * STEP / dry.basis.widths[0]
     assert steepest == pytest.approx(0.5, rel=0.03)
     assert Coulomb("q1", 1.0).unit(plant) == "rad/s^2"

@@ -26,7 +26,8 @@ BOX = {
 BASES = {
     "smooth": smooth(-2.0, 2.0),
     "periodic": periodic(3),
-    "sign": Sign(0.2),
+    "sign": Sign((0.2,)),
+    "signs": Sign((0.1, 0.4, 1.6)),
 }
 
 

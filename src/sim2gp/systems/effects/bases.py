@@ -198,22 +198,35 @@ def ripple(count: int) -> Harmonics:
 
 
 class Sign(eqx.Module):
-    """Dry friction: against a velocity, smoothed over ``width``."""
+    """Dry friction: against a velocity, smoothed over each of the ``widths``."""
 
-    width: float = eqx.field(static=True)
-    sds: ClassVar[tuple[float, ...]] = (1.0,)
+    widths: tuple[float, ...] = eqx.field(static=True)
 
-    def value(self, x: Float[AnyArray, "1 *b"], z: Points) -> Points:
-        """The force of the level ``x``."""
-        return -x[0] * library(z).tanh(z / self.width)
+    @property
+    def sds(self) -> tuple[float, ...]:
+        """A width's level is as large as another's."""
+        return (1.0,) * len(self.widths)
 
-    def features(self, z: Float[AnyArray, "*b"]) -> Float[AnyArray, "*b 1"]:
-        """The force of a level of one."""
-        return -library(z).tanh(z / self.width)[..., None]
+    def value(self, x: Float[AnyArray, "k *b"], z: Points) -> Points:
+        """The force of the levels ``x``."""
+        found = [-x[k] * self._along(z, k) for k in range(len(self.widths))]
+        return sum(found[1:], found[0])
 
-    def slope(self, x: Float[AnyArray, "1 *b"], z: Points) -> Points:
+    def features(self, z: Float[AnyArray, "*b"]) -> Float[AnyArray, "*b k"]:
+        """The forces of levels of one."""
+        each = [-self._along(z, k) for k in range(len(self.widths))]
+        return library(z).stack(each, axis=-1)
+
+    def slope(self, x: Float[AnyArray, "k *b"], z: Points) -> Points:
         """Its derivative."""
-        return x[0] * (library(z).tanh(z / self.width) ** 2 - 1.0) / self.width
+        found = [
+            x[k] * (self._along(z, k) ** 2 - 1.0) / width
+            for k, width in enumerate(self.widths)
+        ]
+        return sum(found[1:], found[0])
+
+    def _along(self, z: Points, k: int) -> Points:
+        return library(z).tanh(z / self.widths[k])
 
 
 class Gap(eqx.Module):

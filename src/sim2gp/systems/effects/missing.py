@@ -22,6 +22,7 @@ HARMONICS = 2  # of a joint that may turn round
 RIPPLES = 12  # in a turn, of cogging
 #: Of dry friction's width: the change of velocity by the drive in a substep.
 WIDTH = 0.2
+WIDER, WIDEST = 4.0, 0.1  # times the one before; of the range of velocities
 DRY, CHANGE, GAP = 0.1, 0.1, 0.2  # prior sd, shares of the drive and of an input
 GAP_WIDTH = 0.12  # median of a dead zone's width, share of an input
 INPUT_REACH, INPUT_LENGTH = 1.2, 0.3  # half-widths of an input
@@ -42,9 +43,9 @@ def missing_forces(
     a smooth change and a dead zone.
 
     ``box`` is where the machine moves, by channel. With ``fine``, of each hinge the
-    cogging of a motor as well. ``closely``, each function by position and by velocity
-    has details too, and a joint that turns round is also pulled to where it started.
-    ``wide`` friction needs no shorter substeps than the machine has.
+    cogging of a motor as well, and friction that slips later. ``closely``, each
+    function by position and by velocity has details too, and a joint that turns round
+    is also pulled to where it started. ``wide`` friction needs no shorter substeps than the machine has.
     """
     plant = plant_of(system)
     # Others have short substeps, or kicks and steps that no effect can shorten.
@@ -60,7 +61,10 @@ def missing_forces(
         joint = joint_of(plant, name)
         at = periodic(HARMONICS) if joint.turns else smooth(*box[name])
         by_speed = smooth(*box[f"{name}.velocity"])
-        sign, dry = Sign(WIDTH * drive.acceleration * step), DRY * drive.force
+        dry, width = DRY * drive.force, WIDTH * drive.acceleration * step
+        low, high = box[f"{name}.velocity"]
+        widest = WIDEST * (high - low) if fine and not closely else width
+        sign = _sign(width, widest)
         if fine and joint.angle:
             found.append(MissingForce(name, dry, ripple(RIPPLES), what="ripple"))
         if closely:
@@ -87,6 +91,17 @@ def missing_forces(
             MissingInput(name, GAP * half, Gap(GAP_WIDTH * half), what="dead_zone"),
         ]
     return found
+
+
+def _sign(width: float, widest: float) -> Sign:
+    """Dry friction as steep as can be followed, and wider up to ``widest``.
+
+    Nobody knows how soon a joint's friction slips: wider ones may be next to it.
+    """
+    widths = [width]
+    while WIDER * widths[-1] < widest:
+        widths.append(WIDER * widths[-1])
+    return Sign(tuple(widths))
 
 
 def _details(
