@@ -45,7 +45,8 @@ def missing_forces(
     ``box`` is where the machine moves, by channel. With ``fine``, of each hinge the
     cogging of a motor as well, and friction that slips later. ``closely``, each
     function by position and by velocity has details too, and a joint that turns round
-    is also pulled to where it started. ``wide`` friction needs no shorter substeps than the machine has.
+    is also pulled to where it started. ``wide`` friction needs no shorter substeps than
+    the machine has.
     """
     plant = plant_of(system)
     # Others have short substeps, or kicks and steps that no effect can shorten.
@@ -63,8 +64,7 @@ def missing_forces(
         by_speed = smooth(*box[f"{name}.velocity"])
         dry, width = DRY * drive.force, WIDTH * drive.acceleration * step
         low, high = box[f"{name}.velocity"]
-        widest = WIDEST * (high - low) if fine and not closely else width
-        sign = _sign(width, widest)
+        sign = _sign(width, WIDEST * (high - low) * (fine and not closely))
         if fine and joint.angle:
             found.append(MissingForce(name, dry, ripple(RIPPLES), what="ripple"))
         if closely:
