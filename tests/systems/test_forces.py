@@ -215,3 +215,29 @@ def test_a_gap_takes_the_input_away_below_its_width():
         for u, there in ((0.4, 1.0), (-0.6, 1.0), (1.2, 0.0)):
             found = float(gap.value(x, jnp.asarray(u)))
             assert found == pytest.approx(-share * u * there, abs=6e-3)
+
+
+def test_friction_of_logs_slips_at_several_widths():
+    """From the steepest to a tenth of the velocities' range, each four times as wide.
+
+    Their span follows friction of any width in between, to a tenth of its level.
+    """
+    found = missing_forces(Furuta(), BOX, fine=True)
+    bases = {f.where: f.basis for f in found if f.what == "dry_friction"}
+    for joint, basis in bases.items():
+        low, high = BOX[f"{joint}.velocity"]
+        widths = np.asarray(basis.widths)
+        assert len(widths) > 1
+        np.testing.assert_allclose(widths[1:] / widths[:-1], 4.0)
+        assert widths[-1] < 0.1 * (high - low) <= 4.0 * widths[-1]
+        v = np.linspace(low, high, 4001)
+        Phi = np.asarray(basis.features(v))
+        for width in np.geomspace(widths[0], widths[-1], 9):
+            wanted = -np.tanh(v / width)
+            rest = wanted - Phi @ np.linalg.lstsq(Phi, wanted, rcond=None)[0]
+            assert np.max(np.abs(rest)) < 0.1
+    box = BOX | {"alpha": (-3.0, 3.0)}
+    closely = missing_forces(Furuta(), box, fine=True, closely=True)
+    for f in closely:
+        if f.what == "dry_friction":
+            assert f.basis.widths == bases[f.where].widths[:1]
