@@ -18,6 +18,7 @@ from typing import Any, NoReturn
 from sim2gp.cli.arguments import parse_command
 from sim2gp.cli.commands import COMMANDS
 from sim2gp.cli.interrupts import DONE, interruptible, leave
+from sim2gp.cli.kept_programs import keep_programs
 from sim2gp.cli.late import Call
 from sim2gp.errors import InputError, Sim2GPError, Sim2GPWarning, error
 from sim2gp.runs import DiskError, Progress, RunOwned
@@ -85,6 +86,8 @@ def _run_command(args: list[str]) -> int:
     command = parse_command(args or ["--help"], COMMANDS)
     if command is None:
         return OK if args else INPUT
+    if not command.no_cache:
+        keep_programs(os.environ)
     progress = Progress(quiet=command.quiet)
     with warnings.catch_warnings():
         warnings.simplefilter("always", Sim2GPWarning)

@@ -67,6 +67,8 @@ class Common:
     """Print all numbers of the summary, not only what matters."""
     debug: Flag = False
     """Show the traceback of an error."""
+    no_cache: Flag = False
+    """Compile all programs anew, and keep none for the next command."""
 
 
 @dataclass(kw_only=True)
