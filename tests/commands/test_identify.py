@@ -14,6 +14,7 @@ from sim2gp.commands.identification import restore_identification
 from sim2gp.commands.longer import Longer
 from sim2gp.data.logs import Log
 from sim2gp.errors import InputError
+from sim2gp.identification.missing_physics.at_zero import forces_of
 from sim2gp.project import load_project
 from sim2gp.runs import Progress, load_run
 from sim2gp.runs.store import new_run
@@ -226,12 +227,14 @@ def test_evaluate_predicts_a_log_from_anywhere(
 def stored_with_forces(run: Path, folder: Path, friction: float) -> Path:
     """The run again, with dry friction on both joints in its forecasts."""
     was = load_run(run)
-    table, x = restore_identification(run).machine.parameters, was.arrays
-    p, k = len(table), len(table) + 2
-    mean, scale = np.full(k, friction), np.zeros((k, k))
-    mean[:p], scale[:p, :p] = x["belief/mean"], x["belief/scale"]
+    machine, x = restore_identification(run).machine, was.arrays
     names = ("theta", "alpha", "theta.velocity", "alpha.velocity", "voltage")
     box = {name: [-1.0, 1.0] for name in names}
+    forces = forces_of(machine, dict.fromkeys(names, (-1.0, 1.0)))
+    p = len(machine.parameters)
+    k = p + sum(len(f.values) for f in forces if f.what == "dry_friction")
+    mean, scale = np.full(k, friction), np.zeros((k, k))
+    mean[:p], scale[:p, :p] = x["belief/mean"], x["belief/scale"]
     entries = {"forecast_forces": {"dry_friction": 1.0}, "forecast_box": box}
     with new_run(folder, "identify") as writer:
         writer.write_summary(was.summary | entries)

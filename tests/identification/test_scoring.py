@@ -7,7 +7,7 @@ import pytest
 import scipy.integrate
 import scipy.stats
 
-from sim2gp.commands import compare
+from sim2gp.commands.compare_folds import MODELS, ModelFactory
 from sim2gp.identification.forecasts import scoring
 from sim2gp.identification.forecasts.scoring import PairedComparison
 
@@ -131,7 +131,7 @@ def test_ties_keep_the_simpler_and_runaways_lose() -> None:
         assert scoring.select_model(np.stack(sums), RNG(0)) == kept
 
 
-WHAT = {name: compare.MODELS[name].what for name in ("SIM2GP", "RES", "NLM")}
+WHAT = {name: MODELS[name].what for name in ("SIM2GP", "RES", "NLM")}
 SAME = PairedComparison(0.0, 0.0, 0.0, 0, 6)
 
 
@@ -158,8 +158,8 @@ def test_the_verdict_in_words(
 
 def test_every_learner_that_is_compared_has_words() -> None:
     """A learner of one's own is one entry of the table; the verdict says it."""
-    own = compare.ModelFactory(lambda sim, reach: sim, "a table of numbers")
-    known = {**compare.MODELS, "OWN": own}
+    own = ModelFactory(lambda sim, reach: sim, "a table of numbers")
+    known = {**MODELS, "OWN": own}
     what = {name: learner.what for name, learner in known.items()}
     pairs = [SAME, *[PairedComparison(-0.1, -0.2, -0.05, 5, 6)] * (len(what) - 1)]
     for kept, (name, words) in list(enumerate(what.items()))[1:]:
