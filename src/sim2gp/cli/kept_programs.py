@@ -42,13 +42,10 @@ def keep_programs(environment: MutableMapping[str, str]) -> None:
 
 def _processor() -> str:
     """A short name of the processor's model and instructions."""
-    wanted, found = (
-        ("model name", "flags", "Features", "CPU part"),
-        [platform.machine()],
-    )
+    found = [platform.machine()]
     try:
-        for line in Path("/proc/cpuinfo").read_text(errors="replace").split("\n\n")[:1]:
-            found += [x for x in line.splitlines() if x.startswith(wanted)]
+        first, *_ = Path("/proc/cpuinfo").read_text(errors="replace").split("\n\n")
+        found += [line for line in first.splitlines() if line.startswith(TELLS)]
     except OSError:
         found.append(platform.node())
     return hashlib.sha256("\n".join(found).encode()).hexdigest()[:12]

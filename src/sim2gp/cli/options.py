@@ -37,7 +37,7 @@ _SEEDS = Range(0, MAX, f"a whole number from 0 to {MAX}", "E149")
 _COUNTS = Range(1, MAX, f"a whole number from 1 to {MAX}")
 _POSITIVE = Range(math.ulp(0.0), math.inf, "a positive number")
 
-_SHARES = Range(0.0, math.inf, "a number from 0")
+_FROM_ZERO = Range(0.0, math.inf, "a number from 0")
 
 Flag = Annotated[bool, arg(help_behavior_hint="")]
 Seed = Annotated[int, option("INT"), _SEEDS]
@@ -48,8 +48,8 @@ SomeSeconds = Annotated[float | None, option("S"), _POSITIVE]
 ManySeconds = Annotated[tuple[float, ...], option("S..."), _POSITIVE]
 Percent = Annotated[float, option("PERCENT"), _POSITIVE]
 Factor = Annotated[float, option("FACTOR"), _POSITIVE]
-Share = Annotated[float, option("CORES"), _POSITIVE]
-Part = Annotated[float, option("GPUS"), _SHARES]
+Cores = Annotated[float, option("CORES"), _POSITIVE]
+GPUs = Annotated[float, option("GPUS"), _FROM_ZERO]
 Folder = Annotated[Path | None, option("DIR")]
 File = Annotated[Path | None, option("FILE")]
 Name = Annotated[str | None, option("NAME")]
@@ -68,7 +68,7 @@ class Common:
     debug: Flag = False
     """Show the traceback of an error."""
     no_cache: Flag = False
-    """Compile all programs anew, and keep none for the next command."""
+    """Use no programs of earlier commands, and keep none for the next."""
 
 
 @dataclass(kw_only=True)
@@ -119,9 +119,9 @@ class Spread(Common):
     """Processes; default one, for a figure one per core."""
     ray: Annotated[tuple[str, ...] | None, option("[ADDRESS]")] = None
     """Use a Ray cluster (extra ray); without an address one is started here."""
-    cell_cores: Share = 1.0
+    cell_cores: Cores = 1.0
     """Cores of each cell on a Ray cluster."""
-    cell_gpus: Part = 0.0
+    cell_gpus: GPUs = 0.0
     """GPUs of each cell on a Ray cluster, or a share of one."""
 
 

@@ -97,7 +97,7 @@ class ModelCell(AbstractCell):
     @property
     def note(self) -> str:
         """What is left out, for people."""
-        return f"{self.model} without {self.recordings.logs[self.left[0]].name}"
+        return f"{self.model} {self.recordings.without(self.left)}"
 
     @property
     def arguments(self) -> Values:
@@ -125,7 +125,7 @@ class ModelCell(AbstractCell):
         )
         fold = self.recordings.kept(
             "fold",
-            self.arguments | {"model": ""},
+            (self.horizons, self.seed, self.left),
             lambda: fitted_fold(setup, self.left, first),
         )
         key = keys[list(models).index(self.model)]

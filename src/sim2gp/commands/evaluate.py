@@ -22,9 +22,7 @@ from sim2gp.commands.leave_one_out import LeaveOneOut
 from sim2gp.data.grid import CURVE, evaluation_windows
 from sim2gp.data.logs import Log, note_lines, shared_rows
 from sim2gp.errors import InputError, error
-from sim2gp.identification.forecasts.baselines import (
-    regression_errors,
-)
+from sim2gp.identification.forecasts.baselines import regression_errors
 from sim2gp.identification.forecasts.calibration import calibrate_forecasts
 from sim2gp.identification.forecasts.prediction import (
     channels,

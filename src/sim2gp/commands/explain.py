@@ -19,6 +19,7 @@ import numpy as np
 
 from sim2gp.commands.demo import Demonstration
 from sim2gp.commands.identification import Identification, project_of
+from sim2gp.commands.recordings import Recordings
 from sim2gp.commands.result import PROJECT, AbstractResult
 from sim2gp.data.logs import Budget, Log
 from sim2gp.errors import InputError, error
@@ -121,7 +122,7 @@ def explain(
     executor = executor_of(workers)
     apart = executor.count > 1 and logs
     if apart and project is not None and project.can_be_loaded:
-        fits = partial(_fits_in_processes, project.path, logs, executor)
+        fits = partial(_fits_in_processes, Recordings(project, logs), executor)
     with (progress or Progress()).task("explain", 3 + REFITS) as task:
         found = search_missing(data, fits=fits, on_step=task.advance)
     candidates, forces = candidate_rows(found), force_rows(found, data.system)
@@ -171,8 +172,7 @@ def _data(run: Identification | Demonstration, logs: Sequence[Log]) -> AbstractD
 class RefitJob(NamedTuple):
     """One candidate's fit, as another process needs it; arrays are NumPy's."""
 
-    path: Path
-    logs: tuple[Log, ...]
+    recordings: Recordings
     seed: int
     name: str
     starts: np.ndarray
@@ -180,8 +180,7 @@ class RefitJob(NamedTuple):
 
 
 def _fits_in_processes(
-    path: Path,
-    logs: tuple[Log, ...],
+    recordings: Recordings,
     executor: AbstractExecutor,
     data: AbstractData,
     bare: Estimate,
@@ -192,7 +191,7 @@ def _fits_in_processes(
     asked = {one.candidate.name: one for one in ranked}
     sent = jax.tree.map(np.asarray, bare)  # whose numbers keep their 64 bits
     jobs = [
-        RefitJob(path, logs, data.seed, name, one.starts, sent)
+        RefitJob(recordings, data.seed, name, one.starts, sent)
         for name, one in asked.items()
     ]
     for job, fit in executor.spread(_refit_of, [[job] for job in jobs]):
@@ -207,7 +206,7 @@ def _fits_in_processes(
 @in_float64
 def _refit_of(job: RefitJob) -> tuple[Estimate, float, float, float, float] | None:
     """A candidate's fit in its own process: a `FittedCandidate` without ``scored``."""
-    data = window_data(load_project(job.path), job.logs, job.seed)
+    data = window_data(job.recordings.project, job.recordings.logs, job.seed)
     known = {c.name: c for c in registered(data.system, windows=True)}
     candidate = known[job.name]
     system = free_parts(data.system, [candidate.effect])

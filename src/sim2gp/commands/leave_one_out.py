@@ -134,7 +134,7 @@ class FoldCell(AbstractCell):
     @property
     def note(self) -> str:
         """What is left out."""
-        return f"without {self.recordings.logs[self.left[0]].name}"
+        return self.recordings.without(self.left)
 
     @property
     def arguments(self) -> Values:

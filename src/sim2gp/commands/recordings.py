@@ -57,6 +57,10 @@ class Recordings:
                 for name, values in sorted(table.items()):
                     yield name, np.asarray(values).tobytes()
 
+    def without(self, left: Sequence[int]) -> str:
+        """What is left out, for people: by the first of the logs ``left``."""
+        return f"without {self.logs[left[0]].name}"
+
     def kept(self, name: str, about: object, make: Callable[[], Made]) -> Made:
         """What ``make`` returns, kept under its name until ``about`` is another."""
         if self._kept.get(name, (None, None))[0] != about:

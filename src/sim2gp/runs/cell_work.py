@@ -1,7 +1,7 @@
 """Cells, the unit of work: independent, named by their arguments, computed once.
 
 A cell is one learner on one hidden machine, one fold of recordings, one planted search.
-Whoever computes it, its values are the same, and who asked for them stores them.
+Its values are the same in every process, and the one that asked stores them.
 """
 
 from abc import ABC, abstractmethod
@@ -93,6 +93,7 @@ class Job(NamedTuple):
     cells: tuple[AbstractCell, ...]
     needed: tuple[Values | None, ...]
     together: bool  # as one program of an accelerator
+    source: str  # of the code that asks; empty where no other process computes
 
 
 class Found(NamedTuple):
@@ -100,7 +101,6 @@ class Found(NamedTuple):
 
     values: list[Values]
     device: str
-    source: str
 
 
 def compute_cells(
@@ -162,7 +162,8 @@ def _computed(
 
     def job(*cells: AbstractCell) -> Job:
         needed = tuple(known[c.needs] if c.needs else None for c in cells)
-        return Job(cells, needed, executor.accelerated)
+        source = _source(cells[0]) if executor.count > 1 else ""
+        return Job(cells, needed, executor.accelerated, source)
 
     if executor.accelerated:  # others are fitted while one batch is planned
         batches: dict[Hashable, list[AbstractCell]] = {}
@@ -175,21 +176,21 @@ def _computed(
             for group in _by_program(cells, executor.count)
         ]
     for asked, found in executor.spread(_compute, groups):
-        if found.source != _source(asked.cells[0]):
-            got = f"code {found.source}"
-            raise error("worker_of_other_code", Sim2GPError, got=got)
         for cell, values in zip(asked.cells, found.values, strict=True):
             # Another device rounds otherwise.
             yield cell, values | {"device": found.device}
 
 
 def _compute(job: Job) -> Found:
+    if job.source and job.source != (source := _source(job.cells[0])):
+        got = f"code {source}"
+        raise error("worker_of_other_code", Sim2GPError, got=got)
     if job.together:
         values = type(job.cells[0]).compute_batch(job.cells, job.needed)
     else:
         (cell,), (needed,) = job.cells, job.needed
         values = [cell.compute(needed)]
-    return Found(values, jax.default_backend(), _source(job.cells[0]))
+    return Found(values, jax.default_backend())
 
 
 def code_of(cell: AbstractCell) -> str:

@@ -82,7 +82,8 @@ class Cells:
         for name, arguments in cells:
             if self.load(name, arguments) or not other.load(name, arguments):
                 continue
-            for file in (f"{name}.json", f"sources/{other.source.digest}.json"):
+            source = other._read(name, arguments).source or other.source.digest
+            for file in (f"{name}.json", f"sources/{source}.json"):
                 if content := other._content(file):
                     _write(self.folder / file, content)
 
