@@ -1,5 +1,7 @@
 """Forces that are found: their sizes against closed forms, and planted ones."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +11,8 @@ import scipy.stats
 import planted_forces as study
 from sim2gp.data.one_step import OneStepLikelihood
 from sim2gp.data.transitions import Transitions
+from sim2gp.errors import NotFinite, error
+from sim2gp.identification.missing_physics import forces
 from sim2gp.identification.missing_physics.curves import Curve
 from sim2gp.identification.missing_physics.data import FREE, OneStepData
 from sim2gp.identification.missing_physics.forces import (
@@ -21,11 +25,13 @@ from sim2gp.identification.missing_physics.forces import (
     _with_free_sizes,
     find_forces,
 )
-from sim2gp.inference.estimate import estimate
+from sim2gp.inference.convergence import CONVERGED, NOT_FINITE, STALLED
+from sim2gp.inference.estimate import Estimate, estimate
+from sim2gp.inference.groups import best_ended
 from sim2gp.inference.parameters import Parameter, Parameters
 from sim2gp.inference.prior import ParameterPrior
 from sim2gp.inference.relevance import OFF, TRIED
-from sim2gp.systems import ODE, Channel, UniformRodArm
+from sim2gp.systems import ODE, CartPole, Channel, UniformRodArm
 from sim2gp.systems.effects.missing import missing_forces
 
 COUNT, SD = 12, 0.02
@@ -111,6 +117,44 @@ def test_a_force_that_is_off_has_the_band_that_data_leave() -> None:
     assert alike == 1.0
 
 
+@pytest.mark.usefixtures("float64")
+def test_of_several_fits_the_one_that_ended_best_is_taken() -> None:
+    """Then by evidence; what has stalled hides no start that was not taken."""
+    likelihood = pushed()
+    prior = ParameterPrior(MACHINES.prior(), MACHINES, jnp.ones(1))
+    fit = estimate(likelihood, prior, starts=jnp.zeros((1, COUNT + 1)))
+    skipped, nan = -1, np.nan
+
+    def ended(k: int, status: int, evidence: float) -> Estimate:
+        how = replace(fit.convergence, status=jnp.asarray(status), steps=jnp.asarray(k))
+        return replace(fit, convergence=how, log_evidence=jnp.asarray(evidence))
+
+    def taken(status: list[int], evidence: list[float]) -> int:
+        pairs = zip(status, evidence, strict=True)
+        each = [ended(k, *pair) for k, pair in enumerate(pairs)]
+        several = jax.tree.map(lambda *x: jnp.stack([*map(jnp.asarray, x)]), *each)
+        return int(best_ended(several).convergence.steps)
+
+    assert taken([CONVERGED, CONVERGED, skipped], [1.0, 2.0, 3.0]) == 1
+    assert taken([CONVERGED, STALLED, skipped], [1.0, 2.0, 3.0]) == 0
+    assert taken([NOT_FINITE, STALLED, STALLED], [nan, -3.0, -2.0]) == 2
+    assert taken([CONVERGED, STALLED, skipped], [nan, -3.0, 3.0]) == 1
+
+
+def test_without_a_fit_there_are_no_forces(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The search for effects of the library has its answer all the same."""
+
+    def fails(*args: object) -> FoundForces:
+        raise error("fit_not_finite", NotFinite, where="the data")
+
+    monkeypatch.setattr(forces, "_fitted", fails)
+    states, inputs = np.random.default_rng(0).normal(size=(2, 9, 4)) / 9.0
+    data = OneStepData(CartPole(), [(states, inputs[1:, :1])])
+    found = find_forces(data, data.fit())
+    assert (found.curves, found.each) == ((), {})
+    assert "E203" in found.failure
+
+
 def test_a_force_is_as_probable_as_the_functions_it_is_the_sum_of() -> None:
     def curve(where: str, mean: float) -> Curve:
         at, root = np.linspace(-1.0, 1.0, 21), 0.01 * np.eye(21)
@@ -129,15 +173,15 @@ def test_other_shapes_of_a_force_are_part_of_its_curve() -> None:
     """A share of its size: of those of the same joint and variable, and of no other."""
     plant = UniformRodArm()
     names = [c.name for c in (*plant.states, *plant.actions)]
-    forces = missing_forces(plant, dict.fromkeys(names, (-1.0, 2.0)), closely=True)
-    scales = np.asarray([0.2 if f.name == "q1.dry_friction" else OFF for f in forces])
-    found = zip(forces, _of_free_size(scales, forces), strict=True)
+    each = missing_forces(plant, dict.fromkeys(names, (-1.0, 2.0)), closely=True)
+    scales = np.asarray([0.2 if f.name == "q1.dry_friction" else OFF for f in each])
+    found = zip(each, _of_free_size(scales, each), strict=True)
     size = {f.name: scale * f.magnitude for f, scale in found}
-    friction = 0.2 * next(f for f in forces if f.name == "q1.dry_friction").magnitude
+    friction = 0.2 * next(f for f in each if f.name == "q1.dry_friction").magnitude
     assert size.pop("q1.dry_friction") == pytest.approx(friction / FREE)
     for name in ("q1.velocity_force", "q1.detail.velocity_force"):
         assert size.pop(name) == pytest.approx(SHARE * friction)
-    assert max(size.values()) == OFF * max(f.magnitude for f in forces)
+    assert max(size.values()) == OFF * max(f.magnitude for f in each)
 
 
 @pytest.mark.nightly

@@ -126,7 +126,7 @@ def explain(
     with (progress or Progress()).task("explain", 3 + REFITS) as task:
         found = search_missing(data, fits=fits, on_step=task.advance)
     candidates, forces = candidate_rows(found), force_rows(found, data.system)
-    none = found.answer == "none of these"
+    none, failure = found.answer == "none of these", found.forces.failure
     gains = np.asarray([s.gain for s in found.search.scored])
     scored = np.asarray([s.candidate.name for s in found.search.scored])
     summary: dict[str, Any] = {
@@ -146,6 +146,7 @@ def explain(
         "warnings": [
             *bound_warnings(run.summary.get("parameters") or {}).values(),
             *(f"no fit with {name}" for name in found.search.failed),
+            *([f"no forces are drawn: {failure}"] if failure else []),
         ],
         "tables": [*force_table(forces), candidate_table(found, candidates)],
     }

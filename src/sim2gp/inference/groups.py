@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from sim2gp.inference.arrowhead import Noise
-from sim2gp.inference.convergence import CONVERGED
+from sim2gp.inference.convergence import CONVERGED, NOT_FINITE
 from sim2gp.inference.estimate import Estimate, estimate
 from sim2gp.inference.likelihood import AbstractLikelihood
 from sim2gp.inference.prior import ParameterPrior
@@ -88,8 +88,18 @@ def estimate_groups(
 
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *each)
     _, found = jax.lax.scan(turn, (no, off), stacked)
-    there = found.convergence.status == CONVERGED
-    there = there & jnp.isfinite(found.log_evidence)
+    return best_ended(found)
+
+
+def best_ended(found: Estimate) -> Estimate:
+    """Of stacked fits the one of highest evidence; of those that ended best.
+
+    A fit that stalled says more than a start that was not taken.
+    """
+    status = found.convergence.status
+    there = jnp.isfinite(found.log_evidence) & (status >= CONVERGED)
+    status = jnp.where(there, status, NOT_FINITE)
+    there = there & (status == jnp.min(status))
     ranked = jnp.where(there, found.log_evidence, -jnp.inf)
     best: Estimate = jax.tree.map(lambda x: x[jnp.argmax(ranked)], found)
     return best

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from sim2gp.data.windows_likelihood import WindowsLikelihood
+from sim2gp.errors import NotConverged, NotFinite
 from sim2gp.identification.intervals.averaging import NONE, NOTHING
 from sim2gp.identification.intervals.discrepancy import corrected_windows
 from sim2gp.identification.intervals.pulls import Pulls, pulls_of_windows
@@ -68,10 +69,11 @@ EXCLUDED = 2.0  # nats less than without it: the data exclude a force of this si
 @dataclass(frozen=True)
 class FoundForces:
     """The probability of each force, of all joints of a kind or of one, and of nothing
-    (`NONE`); all curves."""
+    (`NONE`); all curves; why there are none where the fit did not converge."""
 
     each: Mapping[str, float] = field(default_factory=dict)
     curves: tuple[Curve, ...] = ()
+    failure: str = ""
 
     @property
     def found(self) -> tuple[Curve, ...]:
@@ -88,7 +90,7 @@ class FoundForces:
 def find_forces(data: AbstractData, bare: Estimate) -> FoundForces:
     """Which forces the machine of ``data`` lacks, given the fit without any.
 
-    None of a plant that takes no forces. Raises `NotFinite` E203.
+    None of a plant that takes no forces, or where a fit with all of them fails.
     """
     if not takes_forces(plant_of(data.system)):
         return FoundForces()
@@ -96,7 +98,10 @@ def find_forces(data: AbstractData, bare: Estimate) -> FoundForces:
     forces = missing_forces(data.system, box, fine=True, closely=True)
     likelihood = data.likelihood(data.system)
     if not likelihood.on_host:
-        return _fitted(data, forces, box)
+        try:
+            return _fitted(data, forces, box)
+        except (NotConverged, NotFinite) as failed:
+            return FoundForces(failure=str(failed))
     assert isinstance(data, WindowData)
     assert isinstance(likelihood, WindowsLikelihood)
     found = corrected_windows(at_zero(likelihood, bare, forces), data.recording)
