@@ -2,9 +2,10 @@
 
 Learners for `missing_forces.py`. Left out, one at a time: the projected starts, the
 choice of scales, the smooth functions. Other models of what the simulator leaves: an
-exact Gaussian process on each output of a step, and an ensemble of networks. And
-physics that is no force of one variable: backlash, friction that grows with the load,
-damping that grows with position.
+exact Gaussian process on each output of a step, and an ensemble of networks. The
+paper's learners about a simulator that was fitted from more starts. And physics that is
+no force of one variable: backlash, friction that grows with the load, damping that
+grows with position.
 """
 
 from collections.abc import Mapping
@@ -13,23 +14,25 @@ from functools import partial
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from residual_models import Ensemble, ProcessResidual
+from sim2gp.belief import AbstractBelief
 from sim2gp.data.one_step import OneStepLikelihood
 from sim2gp.data.transitions import Transitions
 from sim2gp.inference.arrowhead import Noise
 from sim2gp.inference.convergence import converged
 from sim2gp.inference.estimate import Estimate, estimate
 from sim2gp.inference.gaussian import Gaussian
-from sim2gp.inference.groups import BROAD, ROWS, Start
+from sim2gp.inference.groups import BROAD, ROWS, Start, best_ended
 from sim2gp.inference.least_squares import prior_rows
 from sim2gp.inference.parameters import Parameter
 from sim2gp.inference.prior import AbstractPrior, ParameterPrior
 from sim2gp.inference.variable_projection import projected
-from sim2gp.models import MissingForces, Residual, Sim2GP
-from sim2gp.models.sim2gp import Sim2GPBelief
+from sim2gp.models import FunctionSpace, MissingForces, Residual, Sim2GP
+from sim2gp.models.sim2gp import Sim2GPBelief, belief_of
 from sim2gp.studies.learners import METHODS
 from sim2gp.studies.swingup import Cell
 from sim2gp.systems.actuators import Lag
@@ -40,8 +43,9 @@ from sim2gp.systems.effects.friction_laws import COULOMB_SUBSTEP, coulomb
 from sim2gp.systems.effects.units import gravity_of
 from sim2gp.systems.mechanism import AbstractMechanism, Pair
 from sim2gp.systems.parts import AbstractPart
-from sim2gp.types import AnyArray, Scalar
+from sim2gp.types import AnyArray, Key, Scalar, in_float64
 
+DRAWS, BEST = 256, 3  # of the prior, and of these as starts
 #: Past inputs that a gap depends on, s; a swing crosses it more often.
 REMEMBERED = 0.2
 
@@ -132,6 +136,56 @@ class ShapesAlone(MissingForces):
 
     def counts(self, function: AbstractUnknownFunction) -> bool:
         return isinstance(function.basis, Gap | Sign)
+
+
+class MoreStarts(Sim2GP):
+    """A simulator fitted from the best of its prior's draws as well.
+
+    Each of three begins with the noise that it leaves itself. The fit of highest
+    evidence counts.
+    """
+
+    @in_float64
+    def fit(
+        self, belief: AbstractBelief, data: Transitions, *, key: Key
+    ) -> Sim2GPBelief:
+        assert isinstance(belief, Sim2GPBelief)
+        rows = jax.tree.map(jnp.asarray, data)
+        warm = self.prior.whitened(belief.posterior.mean)
+        found = _from_many(self, rows, warm, key)
+        found.convergence.check(self.system.parameters.names, f"{data.count} rows")
+        return belief_of(self, found, rows)
+
+
+@eqx.filter_jit
+def _from_many(
+    model: Sim2GP, data: Transitions, warm: Float[Array, " p"], key: Key
+) -> Estimate:
+    likelihood = OneStepLikelihood(model.system, data, model.dt)
+    prior = ParameterPrior(model.prior, model.system.parameters)
+    some, (p,) = likelihood.thinned(ROWS), warm.shape
+
+    def left(z: Array) -> tuple[Scalar, Array]:
+        """The cost with the noise profiled out, and this noise."""
+        mean = model.prior.mean + model.prior.scale @ z
+        r, _ = some.rows(mean, jnp.zeros((p, 1)))
+        sd = jnp.sqrt(jnp.mean(r**2, axis=0)) + likelihood.floor
+        cost = ROWS * jnp.sum(jnp.log(sd)) + 0.5 * z @ z
+        return jnp.where(jnp.isfinite(cost), cost, jnp.inf), sd
+
+    Z = jax.random.normal(key, (DRAWS, p))
+    cost, sd = jax.vmap(left)(Z)
+    best = jnp.argsort(cost)[:BEST]
+    usual = jnp.stack([warm, jnp.zeros(p)])
+    first = jnp.broadcast_to(likelihood.first_noise().sd, (len(usual), sd.shape[1]))
+
+    def descend(start: tuple[Array, Array]) -> Estimate:
+        z, noise = start
+        noise = Noise(noise, jnp.ones(1))
+        return estimate(likelihood, prior, starts=z[None], noise=noise)
+
+    starts = (usual, Z[best]), (first, sd[best])
+    return best_ended(jax.lax.map(descend, tuple(map(jnp.concatenate, starts))))
 
 
 class LoadFriction(AbstractForce):
@@ -232,6 +286,16 @@ CONTROLS = {
     "without relevance": partial(_on, WithoutRelevance),
     "shapes alone": partial(_on, ShapesAlone),
     "GP residual": partial(_on, ProcessResidual),
+    "SIM2GP, more starts": lambda system, *_: MoreStarts(system),
+    "FS, more starts": lambda system, _, options: FunctionSpace(
+        MoreStarts(system), **options
+    ),
+    "FS literal, more starts": lambda system, _, options: FunctionSpace(
+        MoreStarts(system), objective="literal", **options
+    ),
+    "RES, more starts": lambda system, _, options: Residual(
+        MoreStarts(system), **options
+    ),
     "ensemble": lambda system, _, options: Ensemble(
         Residual(Sim2GP(system), **options)
     ),
