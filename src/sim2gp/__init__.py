@@ -19,6 +19,7 @@ _MODULES = {
 }
 _CONTENTS = {
     "identify": "commands.identify",
+    "identify_fleet": "commands.fleet",
     "evaluate": "commands.evaluate",
     "explain": "commands.explain",
     "compare": "commands.compare",

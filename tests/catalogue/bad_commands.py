@@ -283,6 +283,13 @@ COMMANDS: tuple[Case, ...] = (
         line("not_an_identification", "evaluate other --logs a.csv", "got evaluate"),
         line("nothing_to_explain", "explain other", "got evaluate"),
         line("one_recording", "evaluate project.toml"),
+        line("no_such_part", "identify project.toml --each robot", "{robot}"),
+        line(
+            "one_machine",
+            "identify project.toml --each robot",
+            "a",
+            project=PROJECT.replace("*.csv", "{robot}.csv"),
+        ),
         line("horizon_out_of_range", "compare project.toml --horizon 100", "100 s"),
         line("horizon_out_of_range", "evaluate project.toml --horizon 100", "100 s"),
         line("E148", "compare project.toml --horizon soon", "soon"),

@@ -73,9 +73,19 @@ def run_directory(out: Path | None, name: str) -> Path:
 
 def read_project(path: Path, given: Reads, *, alike: bool = False) -> tuple[Any, Any]:
     """A project and its logs; their errors come before the fits are loaded."""
-    project = import_module("sim2gp.project").load_project(path)
-    project = replace(project, budget=budget(given.budget))
+    project = _project(path, given)
     return project, project.load_logs(strict=given.strict, alike=alike)
+
+
+def read_machines(path: Path, given: Reads, each: str) -> tuple[Any, Any]:
+    """A project, and the logs of each of its machines."""
+    project = _project(path, given)
+    return project, project.load_each(each, strict=given.strict)
+
+
+def _project(path: Path, given: Reads) -> Any:
+    project = import_module("sim2gp.project").load_project(path)
+    return replace(project, budget=budget(given.budget))
 
 
 def identification(path: Path) -> Any:

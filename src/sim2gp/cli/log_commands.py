@@ -16,6 +16,7 @@ from sim2gp.cli.late import (
     function,
     identification,
     in_cells,
+    read_machines,
     read_project,
     run_directory,
     share_of,
@@ -28,6 +29,7 @@ from sim2gp.cli.options import (
     Folder,
     InCells,
     ManySeconds,
+    Name,
     Reads,
     Seconds,
     Seed,
@@ -91,8 +93,8 @@ class Init(Common):
 
 
 @dataclass(kw_only=True)
-class Identify(Reads):
-    """Posterior of a machine's parameters from its logs."""
+class Identify(Reads, Spread):
+    """Posterior of a machine's parameters from its logs, or of many machines'."""
 
     project: Annotated[Positional[Path], arg(metavar="PROJECT")]
     """The project file (TOML)."""
@@ -106,9 +108,14 @@ class Identify(Reads):
     """Fit windows five times as long, too: are intervals narrower?"""
     quick: Flag = False
     """No second fit, which forecasts data that it has not seen."""
+    each: Name = None
+    """Machines of a kind, by this named part of the logs' patterns: {NAME}."""
 
     def run(self, call: Call) -> dict[str, Any]:
         out = run_directory(self.out, self.project.stem)
+        if self.each is not None:
+            return self._fleet(call, out, self.each)
+        self._only("with --each NAME", "workers", "ray")
         read = read_project(self.project, self)
         first = FirstFolder(out)
         summary = call.saved(
@@ -126,6 +133,20 @@ class Identify(Reads):
         )
         first.replaced()
         return summary
+
+    def _fleet(self, call: Call, out: Path, each: str) -> dict[str, Any]:
+        self._only("without --each", "check", "nuts", "longer", "quick")
+        read = read_machines(self.project, self, each)
+        identify = function("commands.fleet", "identify_fleet")
+        how = {"seed": self.seed, "workers": executor_of(self)}
+        return call.saved(out, lambda: identify(*read, progress=call.progress, **how))
+
+    def _only(self, when: str, *options: str) -> None:
+        """E160 where one of these is given in the other case."""
+        for name in options:
+            if getattr(self, name):
+                fix = "leave it out"
+                raise usage_error("of no use here", f"--{name}", f"{when} alone", fix)
 
 
 @dataclass(kw_only=True)

@@ -7,6 +7,7 @@ from sim2gp.commands.demo import Demonstration
 from sim2gp.commands.design import FILE, NextExperiment
 from sim2gp.commands.evaluation import Evaluation
 from sim2gp.commands.explain import MissingPhysics
+from sim2gp.commands.fleet import IdentifiedFleet
 from sim2gp.commands.identification import Identification, restore_identification
 from sim2gp.commands.result import AbstractResult
 from sim2gp.commands.selftest import SelfTest
@@ -23,6 +24,7 @@ KINDS: dict[str, type[AbstractResult]] = {
     "demo": Demonstration,
     "design": NextExperiment,
     "evaluate": Evaluation,
+    "identify each": IdentifiedFleet,
     "identify": Identification,  # a first answer, without a posterior
     "explain": MissingPhysics,
     "selftest": SelfTest,

@@ -86,7 +86,7 @@ def fit_fleet(
     priors = [prior] * len(alone) if given is None else given
     pairs = [_of_data(*pair, mu, sd) for pair in zip(alone, priors, strict=True)]
     L, h = (np.stack(part) for part in zip(*pairs, strict=True))
-    data = _Data(L, h, np.linalg.inv(S / np.outer(sd, sd)))
+    data = _Data(L, h, np.linalg.solve(S / np.outer(sd, sd), np.eye(len(sd))))
     draws = _spreads(data, np.random.default_rng(seed))
     conditional = [_given(data, t) for t in draws]
     m = np.stack([one.mean for one in conditional])
@@ -143,12 +143,13 @@ def _given(data: _Data, t: Float[np.ndarray, " p"]) -> _Given:
     L, h, P0 = data
     p = t.size
     K = np.eye(p) + t[:, None] * L * t
-    B = t[:, None] * np.linalg.inv(K) * t  # (diag(1/t^2) + L)^-1, for t = 0 as well
+    # (diag(1/t^2) + L)^-1, for t = 0 as well.
+    B = t[:, None] * np.linalg.solve(K, np.broadcast_to(np.diag(t), K.shape))
     A = np.eye(p) - B @ L
     c = np.einsum("rij,rj->ri", B, h)
     P = P0 + np.sum(L @ A, axis=0)
     b = np.sum(h - np.einsum("rij,rj->ri", L, c), axis=0)
-    C = np.linalg.inv(P)
+    C = np.linalg.solve(P, np.eye(p))
     C = 0.5 * (C + C.T)
     log_det = np.linalg.slogdet(K)[1].sum() + np.linalg.slogdet(P)[1]
     evidence = 0.5 * (b @ C @ b + np.sum(h * c) - log_det)

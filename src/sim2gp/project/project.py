@@ -9,10 +9,10 @@ import importlib
 import json
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from sim2gp.data.logs import (
     Budget,
@@ -25,6 +25,7 @@ from sim2gp.data.logs import (
 )
 from sim2gp.data.logs.file import display_path
 from sim2gp.errors import InputError, error, nearest
+from sim2gp.project.named_parts import as_glob, named_parts, names_in
 from sim2gp.project.schema import (
     ColumnSpec,
     LogSpec,
@@ -50,6 +51,13 @@ IN_MEMORY = "in memory"
 MODEL_FILES = (".xml", ".mjcf", ".urdf")
 #: What other tools write before a model's file.
 _PREFIX = re.compile(r"(?i)^(mujoco|mjcf|mjx|urdf|xml)\s*:\s*")
+
+
+class LogFile(NamedTuple):
+    """A file of logs, and what the named parts of its pattern stand for."""
+
+    path: Path
+    parts: Mapping[str, str]
 
 
 @dataclass(frozen=True)
@@ -95,28 +103,54 @@ class Project:
         """
         if alike:
             self.check_alike()
-        seen: dict[str, int] = {}
-        logs: list[Log] = []
-        for group, spec in enumerate(self.spec.logs):
-            for file in self.files(group):
-                place = os.path.realpath(file)  # of links in a circle, too
-                if place in seen:
-                    where = self.source.where("logs", group, "files")
-                    other = seen[place] + 1
-                    raise error(
-                        "file_listed_twice",
-                        where=where,
-                        got=display_path(file),
-                        other=other,
-                    )
-                seen[place] = group
-                logs += self._read(file, group, spec)
-        if not logs:
-            where, got = self.source.where("logs"), "no [[logs]] table"
-            raise error("no_logs_in_project", where=where, got=got)
+        logs = [log for _, part in self._read_files() for log in part]
         if strict:
             check_all_used(logs)
         return tuple(_uniquely_named(logs))
+
+    def load_each(
+        self, name: str, *, strict: bool = False
+    ) -> dict[str, tuple[Log, ...]]:
+        """The logs by what ``{name}`` stands for in the patterns of their files.
+
+        Raises as `load_logs` does, and E160 where a pattern does not say it.
+        """
+        self.check_alike()
+        for group, spec in enumerate(self.spec.logs):
+            for i, pattern in enumerate(spec.files):
+                if name not in names_in(pattern):
+                    where = self.source.where("logs", group, "files", i)
+                    asked = f"{{{name}}}"
+                    raise error("no_such_part", where=where, got=pattern, part=asked)
+        read = list(self._read_files())
+        named = _uniquely_named([log for _, part in read for log in part])
+        if strict:
+            check_all_used(named)
+        found: dict[str, list[Log]] = {}
+        for file, part in read:
+            mine, named = named[: len(part)], named[len(part) :]
+            found.setdefault(file.parts[name], []).extend(mine)
+        return {value: tuple(found[value]) for value in sorted(found)}
+
+    def _read_files(self) -> Iterator[tuple[LogFile, tuple[Log, ...]]]:
+        """Each file and its logs; E130 where there is none, or one twice."""
+        seen: dict[str, int] = {}
+        for group, spec in enumerate(self.spec.logs):
+            for file in self._found(group):
+                place = os.path.realpath(file.path)  # of links in a circle, too
+                if place in seen:
+                    where = self.source.where("logs", group, "files")
+                    raise error(
+                        "file_listed_twice",
+                        where=where,
+                        got=display_path(file.path),
+                        other=seen[place] + 1,
+                    )
+                seen[place] = group
+                yield file, self._read(file.path, group, spec)
+        if not seen:
+            where, got = self.source.where("logs"), "no [[logs]] table"
+            raise error("no_logs_in_project", where=where, got=got)
 
     def read_logs(
         self, files: Iterable[Path | str | RawLog], configuration: str | None = None
@@ -172,21 +206,27 @@ class Project:
 
     def files(self, group: int) -> list[Path]:
         """The files of a group, in the order of their names (E130 if there is none)."""
-        found: dict[Path, None] = {}
+        return [file.path for file in self._found(group)]
+
+    def _found(self, group: int) -> list[LogFile]:
+        found: dict[Path, LogFile] = {}
+        folder = str(self.path.parent)
         for i, pattern in enumerate(self.spec.logs[group].files):
             where = self.source.where("logs", group, "files", i)
             if "\x00" in pattern:
                 raise error("nul_in_pattern", where=where, got=repr(pattern))
-            anchored = os.path.join(self.path.parent, pattern)
-            if not glob.has_magic(pattern):
-                found[Path(anchored)] = None
+            anchored = os.path.join(folder, as_glob(pattern))
+            if not glob.has_magic(as_glob(pattern)):
+                found.setdefault(Path(anchored), LogFile(Path(anchored), {}))
                 continue
             matches = sorted(glob.glob(anchored, recursive=True))
             if not matches:
-                got, folder = repr(pattern), display_path(self.path.parent)
-                raise error("no_file_matches", where=where, got=got, folder=folder)
-            found.update(dict.fromkeys(Path(match) for match in matches))
-        return list(found)
+                got, place = repr(pattern), display_path(self.path.parent)
+                raise error("no_file_matches", where=where, got=got, folder=place)
+            for match in matches:
+                parts = named_parts(pattern, match, folder)
+                found.setdefault(Path(match), LogFile(Path(match), parts))
+        return list(found.values())
 
     def _read(self, path: Path | RawLog, group: int, spec: LogSpec) -> tuple[Log, ...]:
         return read_log(

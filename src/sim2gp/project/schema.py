@@ -125,7 +125,8 @@ class LogSpec(Section):
     """A group of files with the same columns, of the machine in one configuration."""
 
     files: Annotated[list[str], Field(min_length=1)]
-    """Paths or patterns (`*`, `**`); folders too."""
+    """Paths or patterns (`*`, `**`); folders too. A part in braces (`{robot}`) names
+    the machine for `identify --each`."""
     name: Annotated[str, Field(pattern=r"^[^\s@]+$")] | None = None
     """Name of the machine's configuration; without it, the number of the group if it
     has `fixed` or `free`."""

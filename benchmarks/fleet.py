@@ -1,0 +1,166 @@
+"""Do intervals of a fleet hold? Twenty arms of one kind, which differ in two of four.
+
+    python benchmarks/fleet.py [--fleets N] [--workers N] [--out DIR]
+        [--refresh | --keep-old]
+
+Hidden two-link arms (`interval_arms.py`), three seconds of each. In virtual units a
+kind is drawn from N(0, 1), where the prior's sd is 1.5; dampings of its arms differ by
+sd of .3 and .6, masses not at all (an interval of a spread is above zero: its upper end
+is told). Coverage of nominal 95 % (with its Clopper-Pearson
+interval) of the kind, of each arm, of an arm without logs, and of the spreads; widths
+of an arm's interval over that of its own fit alone. A cell is a fleet.
+"""
+
+import argparse
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.stats import beta
+
+from interval_arms import (
+    CONDITIONS,
+    FREQUENCIES,
+    NAMES,
+    NOISE,
+    PERIOD,
+    TORQUE,
+    Recordings,
+    flown,
+)
+from sim2gp.commands.fleet import fit_machines
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.project.in_memory import project_and_logs
+from sim2gp.runs import Progress
+from sim2gp.runs.cell_work import AbstractCell, Values, compute_cells
+from sim2gp.runs.cells import Cells, add_options
+from sim2gp.runs.executors import Processes, cores
+from sim2gp.systems import UniformRodArm
+from sim2gp.types import in_float64
+
+ARMS, SECONDS = 20, 3.0
+SPREAD = np.asarray([0.0, 0.3, 0.0, 0.6])  # of `NAMES`
+NORMAL95 = 1.959964
+
+
+@dataclass(frozen=True)
+class FleetCell(AbstractCell):
+    """A kind, its arms and one more."""
+
+    seed: int
+
+    @property
+    def name(self) -> str:
+        return f"fleet_{self.seed}"
+
+    @property
+    def arguments(self) -> Values:
+        return {"seed": self.seed, "arms": ARMS, "seconds": SECONDS}
+
+    @in_float64
+    def compute(self, needed: Values | None) -> Values:
+        """Whether each interval holds; widths over those alone."""
+        del needed
+        rng = np.random.default_rng([33, self.seed])
+        kind = rng.standard_normal(len(NAMES))
+        arms = kind + SPREAD * rng.standard_normal((ARMS + 1, len(NAMES)))
+        data, system = recorded(arms[:ARMS], rng), UniformRodArm()
+        project, logs = project_and_logs(system, [data.log(r) for r in range(ARMS)])
+        machines = {f"arm{r:02d}": (log,) for r, log in enumerate(logs)}
+        quiet = Progress(quiet=True)
+        fleet, alone, moved = fit_machines(project, machines, progress=quiet)
+        low, high = np.quantile(fleet.spread, (0.025, 0.975), axis=0)
+        pairs = zip(fleet.machines, arms, strict=False)
+        widths = [
+            np.asarray(a.sd()) / np.asarray(b.sd())
+            for a, b in zip(fleet.machines, alone, strict=True)
+        ]
+        return {
+            "kind": holds(fleet.kind, kind),
+            "arms": [holds(*pair) for pair in pairs],
+            "another": holds(fleet.another, arms[ARMS]),
+            "spread": ((low <= SPREAD) & (high >= SPREAD)).tolist(),
+            "spread_high": high.tolist(),
+            "widths": np.median(widths, axis=0).tolist(),
+            "agreement": fleet.agreement,
+            "moved": moved,
+        }
+
+
+def holds(known: Gaussian, truth: np.ndarray) -> list[bool]:
+    """Whether the 95 % interval of each parameter has its true value."""
+    away = np.abs(np.asarray(known.mean - jnp.asarray(truth)))
+    return [bool(x) for x in away <= NORMAL95 * np.asarray(known.sd())]
+
+
+def recorded(virtual: np.ndarray, rng: np.random.Generator) -> Recordings:
+    """Three seconds of each arm, under torques of its own."""
+    table = UniformRodArm().parameters
+    low, high = (
+        np.array([getattr(table[n], end) for n in NAMES]) for end in ("low", "high")
+    )
+    values = low + (high - low) / (1.0 + np.exp(-virtual))
+    time = PERIOD * np.arange(round(SECONDS / PERIOD))
+    phase = rng.uniform(0.0, 2.0 * np.pi, (len(FREQUENCIES), len(virtual), 2))
+    turns = 2.0 * np.pi * np.multiply.outer(FREQUENCIES, time)
+    torque = np.sin(turns[:, :, None, None] + phase[:, None]).sum(axis=0)
+    torque *= TORQUE / np.sqrt(np.mean(torque**2, axis=0))
+    angles = flown(values, torque, CONDITIONS["white"])[..., :2]
+    noise = NOISE * rng.standard_normal(angles.shape)
+    return Recordings(virtual, torque, angles + noise)
+
+
+def share(held: Any) -> dict[str, dict[str, float]]:
+    """Of each parameter, with the interval of Clopper and Pearson."""
+    held = np.asarray(held).reshape(-1, len(NAMES))
+    n, out = len(held), {}
+    for j, name in enumerate(NAMES):
+        k = int(held[:, j].sum())
+        low = float(beta.ppf(0.025, k, n - k + 1)) if k else 0.0
+        high = float(beta.ppf(0.975, k + 1, n - k)) if k < n else 1.0
+        out[name] = {"share": k / n, "low": low, "high": high, "of": n}
+    return out
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--fleets", type=int, default=20)
+    parser.add_argument("--workers", type=int, default=cores())
+    parser.add_argument("--out", type=Path, default=Path("runs/fleet"))
+    add_options(parser)
+    asked = parser.parse_args()
+    cells = [FleetCell(seed) for seed in range(asked.fleets)]
+    store = Cells(asked.out, __file__, asked.old)
+    with Progress().task("fleets", len(cells)) as task:
+        values = compute_cells(
+            cells, store, Processes(asked.workers), lambda cell: task.advance(cell.name)
+        )
+    each = [values[cell] for cell in cells]
+    summary: dict[str, Any] = {
+        name: share([x[name] for x in each])
+        for name in ("kind", "arms", "another", "spread")
+    }
+    widths = np.median([x["widths"] for x in each], axis=0)
+    summary["widths"] = dict(zip(NAMES, widths.tolist(), strict=True))
+    for j, name in enumerate(NAMES):
+        if not SPREAD[j]:
+            del summary["spread"][name]
+    high = np.median([x["spread_high"] for x in each], axis=0)
+    summary["spread_high"] = dict(zip(NAMES, high.tolist(), strict=True))
+    summary["true_spread"] = dict(zip(NAMES, SPREAD.tolist(), strict=True))
+    for name in ("agreement", "moved"):
+        summary[name] = sorted(x[name] for x in each)
+    for name in ("kind", "arms", "another", "spread"):
+        words = [f"{n} {x['share']:.3f}" for n, x in summary[name].items()]
+        print(f"{name:8}", "  ".join(words))
+    print("widths  ", summary["widths"])
+    asked.out.mkdir(parents=True, exist_ok=True)
+    text = json.dumps(summary | {"fleets": asked.fleets, "arms": ARMS}, indent=1)
+    (asked.out / "summary.json").write_text(text + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,380 @@
+"""Identify many machines of one kind: each from its own logs and from the others.
+
+Machines are cells. Each is fitted alone, then all are joined (`identification.fleet`).
+Where a machine's logs leave something open, its own fit may have ended far from what
+the others say, and a fit is linear about its end. So each is fitted once more, with
+what is known of the kind as its prior, and all are joined again.
+"""
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Int
+
+from sim2gp.commands.folds import recording_of_windows
+from sim2gp.commands.recordings import Recordings
+from sim2gp.commands.result import AbstractResult
+from sim2gp.data.logs import Log, note_lines
+from sim2gp.data.windows import Windows
+from sim2gp.data.windows_likelihood import WindowsLikelihood
+from sim2gp.errors import error
+from sim2gp.identification.fit import fit_windows
+from sim2gp.identification.fleet import Fleet, fit_fleet
+from sim2gp.identification.intervals.discrepancy import corrected_windows
+from sim2gp.identification.missing_physics.at_zero import at_zero, forces_of
+from sim2gp.identification.missing_physics.reach import box_of
+from sim2gp.identification.words import digits
+from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.parameters import Parameter, Parameters
+from sim2gp.inference.prior import ParameterPrior
+from sim2gp.project import Project
+from sim2gp.project.training_windows import cut_logs
+from sim2gp.runs.cell_work import AbstractCell, Values, compute_cells
+from sim2gp.runs.executors import Workers, executor_of
+from sim2gp.runs.plain import exact, from_exact
+from sim2gp.runs.progress import Progress
+from sim2gp.runs.provenance import provenance
+from sim2gp.systems.effects.forces import AbstractUnknownFunction
+from sim2gp.types import AnyArray, in_float64
+
+NORMAL95 = 1.959964
+AGREE = 1.1  # R-hat of halves of the draws
+MOVED = 0.5  # sd
+
+
+@dataclass(frozen=True, repr=False)
+class IdentifiedFleet(AbstractResult):
+    """The posterior of each machine, and of the kind; over virtual values."""
+
+    @cached_property
+    def machines(self) -> dict[str, Gaussian]:
+        """Each machine by its name, from its own logs and from those of the others."""
+        x = self.arrays
+        pairs = zip(x["fleet/means"], x["fleet/scales"], strict=True)
+        each = (_gaussian(*pair) for pair in pairs)
+        return dict(zip(self.summary["machines"], each, strict=True))
+
+    @cached_property
+    def kind(self) -> Gaussian:
+        """What the machines have in common: the middle of the kind."""
+        return _gaussian(self.arrays["fleet/kind"], self.arrays["fleet/kind_scale"])
+
+    @cached_property
+    def another(self) -> Gaussian:
+        """A machine of the kind without logs of its own: a prior to begin with."""
+        return _gaussian(
+            self.arrays["fleet/another"], self.arrays["fleet/another_scale"]
+        )
+
+
+def identify_fleet(
+    project: Project,
+    machines: Mapping[str, Sequence[Log]],
+    *,
+    seed: int = 0,
+    workers: Workers | None = None,
+    progress: Progress | None = None,
+) -> IdentifiedFleet:
+    """Fit machines of one kind, whose logs are given by their names.
+
+    ``seed`` draws the starts of the fits and the spreads. Machines are fitted in so
+    many processes, or where an executor computes (``workers``). Raises `InputError`
+    E160 for a single machine, and what a fit of one raises.
+    """
+    started = time.perf_counter()
+    if len(machines) < 2:
+        got = ", ".join(machines) or "none"
+        raise error("one_machine", where=project.source.where("logs"), got=got)
+    found = fit_machines(
+        project, machines, seed=seed, workers=workers, progress=progress
+    )
+    summary = _summary(project, machines, found) | {"seed": seed}
+    arrays = _arrays(found.fleet)
+    return IdentifiedFleet(summary | provenance(started), arrays, {}, project)
+
+
+class FittedFleet(NamedTuple):
+    """A fleet, each machine ``alone``, and the most that fits have moved again (sd)."""
+
+    fleet: Fleet
+    alone: list[Gaussian]
+    moved: float
+
+
+def fit_machines(
+    project: Project,
+    machines: Mapping[str, Sequence[Log]],
+    *,
+    seed: int = 0,
+    workers: Workers | None = None,
+    progress: Progress | None = None,
+) -> FittedFleet:
+    """Machines alone, joined, each again with the kind as its prior, and joined."""
+    cells = _cells(project, machines, seed)
+    executor = executor_of((workers or 1) if project.can_be_loaded else 1)
+    with (progress or Progress()).task("machines", 2 * len(cells)) as task:
+
+        def joined(cells: Sequence[MachineCell]) -> tuple[Fleet, list[Gaussian]]:
+            found = compute_cells(
+                cells, None, executor, lambda cell: task.advance(cell.note)
+            )
+            each = [from_exact(found[cell]) for cell in cells]
+            fits, given = (
+                [_gaussian(x[name], x[f"{name}_scale"]) for x in each]
+                for name in ("posterior", "prior")
+            )
+            fleet = fit_fleet(_prior(project, fits), fits, given, seed=seed)
+            return fleet, fits
+
+        first, alone = joined(cells)
+        known = np.asarray(first.another.mean), np.asarray(first.another.scale)
+        fleet, _ = joined([replace(cell, prior=known) for cell in cells])
+    return FittedFleet(fleet, alone, _moved(first, fleet))
+
+
+def _cells(
+    project: Project, machines: Mapping[str, Sequence[Log]], seed: int
+) -> "list[MachineCell]":
+    """Machines have as many windows each: one compiled program fits them all."""
+    logs = tuple(log for own in machines.values() for log in own)
+    recordings, ends = (
+        Recordings(project, logs),
+        np.cumsum([*map(len, machines.values())]),
+    )
+    of = np.searchsorted(ends, _cut(recordings).log, side="right")
+    most = int(np.bincount(of).max())
+    return [
+        MachineCell(recordings, name, tuple(range(end - len(own), end)), most, seed)
+        for (name, own), end in zip(machines.items(), ends.tolist(), strict=True)
+    ]
+
+
+class _Cut(NamedTuple):
+    """Windows of all machines, the log of each, and forces that machines may lack."""
+
+    windows: Windows
+    log: Int[np.ndarray, " W"]
+    forces: tuple[AbstractUnknownFunction, ...]
+
+
+def _cut(recordings: Recordings) -> _Cut:
+    project, logs = recordings.project, recordings.logs
+
+    def cut() -> _Cut:
+        windows, of = cut_logs(project, logs)
+        box = box_of(project.system, windows)
+        return _Cut(windows, of, forces_of(project.system, box))
+
+    return recordings.kept("cut", "machines", cut)
+
+
+@dataclass(frozen=True, eq=False)
+class MachineCell(AbstractCell):
+    """The fit of one machine; ``prior`` replaces the table's: its mean and scale.
+
+    ``logs`` are the machine's among the recordings, ``count`` the windows of its fit.
+    """
+
+    recordings: Recordings
+    machine: str
+    logs: tuple[int, ...]
+    count: int
+    seed: int
+    prior: tuple[np.ndarray, np.ndarray] | None = None
+
+    @property
+    def name(self) -> str:
+        """By its first log."""
+        return f"machine_{self.logs[0]}"
+
+    @property
+    def note(self) -> str:
+        """Which machine."""
+        return self.machine
+
+    @property
+    def arguments(self) -> Values:
+        """The project and its logs, by their digest."""
+        about = {"recordings": self.recordings.digest, "seed": self.seed}
+        prior = None if self.prior is None else [x.tolist() for x in self.prior]
+        return about | {"logs": list(self.logs), "count": self.count, "prior": prior}
+
+    @in_float64
+    def compute(self, needed: Values | None) -> Values:
+        """The corrected posterior, and the prior that it began with."""
+        del needed
+        project, system = self.recordings.project, self.recordings.project.system
+        windows, recording = self._windows()
+        fitted = fit_windows(
+            system,
+            windows,
+            key=jax.random.key(self.seed),
+            prior=None if self.prior is None else _gaussian(*self.prior),
+            robust=project.spec.likelihood.robust,
+        ).with_measurements(system.parameters)
+        likelihood, forces = (
+            WindowsLikelihood(system, windows),
+            _cut(self.recordings).forces,
+        )
+        start = at_zero(likelihood, fitted, forces)
+        known, about = corrected_windows(start, recording).posterior, fitted.prior
+        return exact(
+            {
+                "posterior": np.asarray(known.mean),
+                "posterior_scale": np.asarray(known.scale),
+                "prior": np.asarray(about.mean),
+                "prior_scale": np.asarray(about.scale),
+            }
+        )
+
+    def _windows(self) -> tuple[Windows, Int[np.ndarray, " count"]]:
+        """The machine's, and masked ones, of which no recording is made."""
+        windows, of, _ = _cut(self.recordings)
+        mine = np.flatnonzero(np.isin(of, self.logs))
+        at, own = np.resize(mine, self.count), np.arange(self.count) < len(mine)
+        some = windows.some(at)
+        mask = np.asarray(some.mask) & own[:, None, None]
+        recording = recording_of_windows(self.recordings.logs, of)[at]
+        return eqx.tree_at(lambda w: w.mask, some, mask), np.where(own, recording, -1)
+
+
+def _prior(project: Project, fits: Sequence[Gaussian]) -> Gaussian:
+    """The table's, with its measured sums: linear about the middle of the machines."""
+    table = project.system.parameters
+    about = ParameterPrior(table.prior(), table)
+    middle = np.mean([np.asarray(fit.mean) for fit in fits], axis=0)
+    return (
+        about.linearised(jnp.asarray(middle)) if table.measurements else about.gaussian
+    )
+
+
+@in_float64
+def _moved(first: Fleet, fleet: Fleet) -> float:
+    """The most that joining again has moved a machine's parameter, in its sd."""
+    pairs = zip(first.machines, fleet.machines, strict=True)
+    return max(
+        float(np.max(np.abs(np.asarray(b.mean - a.mean)) / np.asarray(b.sd())))
+        for a, b in pairs
+    )
+
+
+@in_float64
+def _summary(
+    project: Project, machines: Mapping[str, Sequence[Log]], found: FittedFleet
+) -> dict[str, Any]:
+    table, fleet, moved = project.system.parameters, found.fleet, found.moved
+    entries = {
+        p.name: _entry(p, j, fleet, list(machines)) for j, p in enumerate(table.free)
+    }
+    logs = [log for own in machines.values() for log in own]
+    warnings = note_lines(logs)
+    if fleet.agreement > AGREE:
+        warnings.append(
+            f"draws of the spreads have not settled (R-hat {fleet.agreement:.2f}): "
+            "their intervals are rough"
+        )
+    if moved > MOVED:
+        warnings.append(
+            f"a second round of fits has moved a parameter by {digits(moved, 2)} sd: "
+            "some machine's own logs leave it open, and intervals are rough"
+        )
+    return {
+        "command": "identify each",
+        "title": f"{project.name}: {len(machines)} machines of a kind",
+        "machines": list(machines),
+        "logs": {name: len(own) for name, own in machines.items()},
+        "kind": entries,
+        "agreement": fleet.agreement,
+        "moved": moved,
+        "warnings": warnings,
+        "tables": [_kind_table(entries), _machine_table(entries, list(machines))],
+    }
+
+
+def _entry(
+    p: Parameter, j: int, fleet: Fleet, machines: Sequence[str]
+) -> dict[str, Any]:
+    """One parameter in its unit: of the kind, its spread, another one, each one."""
+
+    def physical(x: Any) -> np.ndarray:
+        return np.asarray(Parameters((p,)).constrain(np.asarray(x)[..., None]))[..., 0]
+
+    def of(known: Gaussian) -> dict[str, float]:
+        mean, sd = float(known.mean[j]), float(known.sd()[j])
+        ends = mean + NORMAL95 * sd * np.asarray([-1.0, 0.0, 1.0])
+        return dict(zip(("low", "value", "high"), physical(ends).tolist(), strict=True))
+
+    middle, spread = float(fleet.kind.mean[j]), fleet.spread[:, j]
+    half = 0.5 * (physical(middle + spread) - physical(middle - spread))
+    low, value, high = np.quantile(half, (0.025, 0.5, 0.975)).tolist()
+    return {
+        "unit": p.unit,
+        "kind": of(fleet.kind),
+        "spread": {"low": low, "value": value, "high": high},
+        "another": of(fleet.another),
+        "machines": {
+            name: of(known)
+            for name, known in zip(machines, fleet.machines, strict=True)
+        },
+    }
+
+
+def _in_words(x: Mapping[str, float], unit: str = "") -> str:
+    """With so many digits that the ends differ in two."""
+    half = 0.5 * abs(x["high"] - x["low"])
+    large = max(abs(x["value"]), half, 1e-300)
+    count = 2 + max(math.ceil(math.log10(large / half)), 0) if half > 0.0 else 3
+    low, value, high = (digits(x[k], count) for k in ("low", "value", "high"))
+    return f"{value} ({low} to {high}) {unit}".strip()
+
+
+def _kind_table(entries: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    return {
+        "title": "The kind: its middle, how much machines differ, and another machine",
+        "columns": ["parameter", "kind", "machines differ by", "another machine"],
+        "rows": [
+            [name, *(_in_words(x[k], x["unit"]) for k in ("kind", "spread", "another"))]
+            for name, x in entries.items()
+        ],
+        "note": "With 95 % intervals. Machines differ by one standard deviation; a "
+        "machine without logs of its own is as the last column says.",
+    }
+
+
+def _machine_table(
+    entries: Mapping[str, Mapping[str, Any]], machines: Sequence[str]
+) -> dict[str, Any]:
+    heads = [f"{name}, {x['unit']}".removesuffix(", ") for name, x in entries.items()]
+    return {
+        "title": "Each machine, from its own logs and from those of the others",
+        "columns": ["machine", *heads],
+        "rows": [
+            [one, *(_in_words(x["machines"][one]) for x in entries.values())]
+            for one in machines
+        ],
+    }
+
+
+def _arrays(fleet: Fleet) -> dict[str, np.ndarray]:
+    return {
+        "fleet/kind": np.asarray(fleet.kind.mean),
+        "fleet/kind_scale": np.asarray(fleet.kind.scale),
+        "fleet/another": np.asarray(fleet.another.mean),
+        "fleet/another_scale": np.asarray(fleet.another.scale),
+        "fleet/means": np.stack([np.asarray(g.mean) for g in fleet.machines]),
+        "fleet/scales": np.stack([np.asarray(g.scale) for g in fleet.machines]),
+        "fleet/spread": fleet.spread,
+    }
+
+
+@in_float64
+def _gaussian(mean: AnyArray, scale: AnyArray) -> Gaussian:
+    return Gaussian(jnp.asarray(mean), jnp.asarray(scale))
