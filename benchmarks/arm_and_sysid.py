@@ -37,7 +37,6 @@ OPEN = (
     *(f"body/link{k}/mass" for k in range(2, 6)),
 )
 SPREAD, FACTOR = 0.3, 3.0
-Z = 1.959963984540054
 
 
 def truth(seed: int) -> dict[str, float]:

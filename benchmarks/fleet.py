@@ -19,17 +19,16 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.stats import beta
 
+from coverage95 import Z, binomial_interval
 from interval_arms import (
     CONDITIONS,
-    FREQUENCIES,
     NAMES,
     NOISE,
-    PERIOD,
-    TORQUE,
     Recordings,
     flown,
+    multisine,
+    physical,
 )
 from sim2gp.commands.fleet import fit_machines
 from sim2gp.inference.gaussian import Gaussian
@@ -43,7 +42,6 @@ from sim2gp.types import in_float64
 
 ARMS, SECONDS = 20, 3.0
 SPREAD = np.asarray([0.0, 0.3, 0.0, 0.6])  # of `NAMES`
-NORMAL95 = 1.959964
 
 
 @dataclass(frozen=True)
@@ -93,22 +91,13 @@ class FleetCell(AbstractCell):
 def holds(known: Gaussian, truth: np.ndarray) -> list[bool]:
     """Whether the 95 % interval of each parameter has its true value."""
     away = np.abs(np.asarray(known.mean - jnp.asarray(truth)))
-    return [bool(x) for x in away <= NORMAL95 * np.asarray(known.sd())]
+    return [bool(x) for x in away <= Z * np.asarray(known.sd())]
 
 
 def recorded(virtual: np.ndarray, rng: np.random.Generator) -> Recordings:
     """Three seconds of each arm, under torques of its own."""
-    table = UniformRodArm().parameters
-    low, high = (
-        np.array([getattr(table[n], end) for n in NAMES]) for end in ("low", "high")
-    )
-    values = low + (high - low) / (1.0 + np.exp(-virtual))
-    time = PERIOD * np.arange(round(SECONDS / PERIOD))
-    phase = rng.uniform(0.0, 2.0 * np.pi, (len(FREQUENCIES), len(virtual), 2))
-    turns = 2.0 * np.pi * np.multiply.outer(FREQUENCIES, time)
-    torque = np.sin(turns[:, :, None, None] + phase[:, None]).sum(axis=0)
-    torque *= TORQUE / np.sqrt(np.mean(torque**2, axis=0))
-    angles = flown(values, torque, CONDITIONS["white"])[..., :2]
+    torque = multisine(rng, SECONDS, len(virtual))
+    angles = flown(physical(virtual), torque, CONDITIONS["white"])[..., :2]
     noise = NOISE * rng.standard_normal(angles.shape)
     return Recordings(virtual, torque, angles + noise)
 
@@ -119,8 +108,7 @@ def share(held: Any) -> dict[str, dict[str, float]]:
     n, out = len(held), {}
     for j, name in enumerate(NAMES):
         k = int(held[:, j].sum())
-        low = float(beta.ppf(0.025, k, n - k + 1)) if k else 0.0
-        high = float(beta.ppf(0.975, k + 1, n - k)) if k < n else 1.0
+        low, high = binomial_interval(k, n)
         out[name] = {"share": k / n, "low": low, "high": high, "of": n}
     return out
 

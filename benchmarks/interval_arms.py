@@ -93,23 +93,33 @@ def recordings(condition: Condition, sets: int, chunk: int) -> Recordings:
     conditions share truths, torques and the noise's innovations.
     """
     rng = np.random.default_rng([20, chunk])
-    table = UniformRodArm().parameters
     truth = rng.standard_normal((sets, 4))
-    low = np.array([table[name].low for name in NAMES])
-    high = np.array([table[name].high for name in NAMES])
-    values = low + (high - low) / (1.0 + np.exp(-truth))
-    time = PERIOD * np.arange(round(SECONDS / PERIOD))
-    phase = rng.uniform(0.0, 2.0 * np.pi, (len(FREQUENCIES), sets, 2))
-    turns = 2.0 * np.pi * np.multiply.outer(FREQUENCIES, time)
-    torque = np.sin(turns[:, :, None, None] + phase[:, None]).sum(axis=0)
-    torque *= TORQUE / np.sqrt(np.mean(torque**2, axis=0))
+    values, torque = physical(truth), multisine(rng, SECONDS, sets)
     if condition.mujoco:
         states = moved(values, torque, condition, PERIOD)
     else:
         states = flown(values, torque, condition)
-    white = rng.standard_normal((len(time), sets, 2))
+    white = rng.standard_normal((len(torque), sets, 2))
     noise = coloured(white, condition.rho)
     return Recordings(truth, torque, states[..., :2] + NOISE * noise)
+
+
+def physical(truth: np.ndarray) -> np.ndarray:
+    """Masses and dampings (S, 4) of virtual values."""
+    table = UniformRodArm().parameters
+    low = np.array([table[name].low for name in NAMES])
+    high = np.array([table[name].high for name in NAMES])
+    return low + (high - low) / (1.0 + np.exp(-truth))
+
+
+def multisine(rng: np.random.Generator, seconds: float, *sets: int) -> np.ndarray:
+    """Torques (T, ..., 2) of `FREQUENCIES` with random phases, of rms `TORQUE`."""
+    time = PERIOD * np.arange(round(seconds / PERIOD))
+    phase = rng.uniform(0.0, 2.0 * np.pi, (len(FREQUENCIES), *sets, 2))
+    turns = 2.0 * np.pi * np.multiply.outer(FREQUENCIES, time)
+    turns = turns.reshape(*turns.shape, *(1 for _ in sets), 1)
+    torque = np.sin(turns + phase[:, None]).sum(axis=0)
+    return torque * (TORQUE / np.sqrt(np.mean(torque**2, axis=0)))
 
 
 def coloured(white: np.ndarray, rho: float) -> np.ndarray:

@@ -25,9 +25,10 @@ from typing import Any, NamedTuple, cast
 
 import jax
 import numpy as np
-from scipy.stats import beta, norm
+from scipy.stats import norm
 
 import interval_candidates as candidates
+from coverage95 import Z, binomial_interval
 from interval_arms import (
     CONDITIONS,
     NAMES,
@@ -77,7 +78,6 @@ SPEAK = {WINDOW: "speak", LONGER: "speak_longer"}
 MISSING = "missing"
 ASKED = {"white": (0.92, 0.98), "mujoco": (0.92, 0.98)}  # of the others:
 ASKED_ELSE, ASKED_SCORE = (0.90, 0.99), 1.5
-Z = 1.959963984540054
 
 
 class Job(NamedTuple):
@@ -222,7 +222,7 @@ def table(found: dict[str, np.ndarray]) -> dict[str, Any]:
         out[name] = {
             constant: {
                 "coverage": float(inside[:, j].mean()),
-                "between": _binomial(int(inside[:, j].sum()), len(inside)),
+                "between": binomial_interval(int(inside[:, j].sum()), len(inside)),
                 "score": float(ratio[j]),
                 "width": float(width[j]),
                 "error": float(rms[j] / best[j]),
@@ -236,12 +236,6 @@ def table(found: dict[str, np.ndarray]) -> dict[str, Any]:
 def _score(error: np.ndarray, sd: np.ndarray) -> np.ndarray:
     """Interval score of 95 % intervals: width, and 40 times what is outside."""
     return 2.0 * Z * sd + 40.0 * np.maximum(np.abs(error) - Z * sd, 0.0)
-
-
-def _binomial(k: int, n: int) -> list[float]:
-    low = float(beta.ppf(0.025, k, n - k + 1)) if k else 0.0
-    high = float(beta.ppf(0.975, k + 1, n - k)) if k < n else 1.0
-    return [low, high]
 
 
 def lines(summary: dict[str, Any]) -> list[str]:

@@ -35,7 +35,7 @@ import numpy as np
 from jaxtyping import Float
 
 from force_shapes import SHAPES, Planted, ShapedForce, ShapedInput
-from interval_arms import FREQUENCIES, NOISE, PERIOD, SECONDS, TORQUE
+from interval_arms import NOISE, PERIOD, SECONDS, multisine
 from planted_effects import data_of
 from sim2gp.data.logs import Log
 from sim2gp.data.split_log import cut
@@ -171,11 +171,7 @@ def _arm_log(planted: Planted | None, index: int) -> tuple[Log, np.ndarray, np.n
     system = UniformRodArm()
     prior = system.parameters.prior()
     tt = np.asarray(prior.mean + prior.scale @ rng.standard_normal(prior.mean.size))
-    clock = PERIOD * np.arange(round(SECONDS / PERIOD))
-    phase = rng.uniform(0.0, 2.0 * np.pi, (len(FREQUENCIES), 2))
-    turns = 2.0 * np.pi * np.multiply.outer(FREQUENCIES, clock)
-    torque = np.sin(turns[:, :, None] + phase[:, None]).sum(axis=0)
-    torque *= TORQUE / np.sqrt(np.mean(torque**2, axis=0))
+    torque = multisine(rng, SECONDS)
     true = with_parts(system, [planted]) if planted else system
     values = system.parameters.values(jnp.asarray(tt))
     fixed = {k: jnp.asarray(v, float) for k, v in true.parameters.fixed}
@@ -185,15 +181,15 @@ def _arm_log(planted: Planted | None, index: int) -> tuple[Log, np.ndarray, np.n
         return true.flow(record, x, u, PERIOD), x
 
     S = np.asarray(jax.jit(lambda u: jax.lax.scan(step, jnp.zeros(4), u)[1])(torque))
-    measured = S[:, :2] + NOISE * rng.standard_normal((len(clock), 2))
+    measured = S[:, :2] + NOISE * rng.standard_normal((len(torque), 2))
     joints, inputs = ("q1", "q2"), ("torque1", "torque2")
     log = Log(
         name=f"arm{index}",
         source=f"arm{index}.csv",
-        time=clock,
+        time=PERIOD * np.arange(len(torque)),
         channels=dict(zip(joints, measured.T, strict=True)),
         inputs=dict(zip(inputs, torque.T, strict=True)),
-        mask={n: np.ones(len(clock), bool) for n in joints},
+        mask={n: np.ones(len(torque), bool) for n in joints},
     )
     return log, S, torque
 

@@ -115,9 +115,7 @@ def test_other_priors_of_the_fits_change_nothing() -> None:
         gaussian(rng.normal(size=P), (root := random_root(rng)) @ root.T)
         for _ in range(R)
     ]
-    usual = fl.fit_fleet(
-        known.prior, [known.posterior(r, known.prior) for r in range(R)]
-    )
+    usual = fl.fit_fleet(known.prior, known.alone())
     other = fl.fit_fleet(
         known.prior, [known.posterior(r, g) for r, g in enumerate(given)], given
     )

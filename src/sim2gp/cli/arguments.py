@@ -109,6 +109,14 @@ def usage_error(
     return InputError(code, what, where=where, got=got, expected=expected, fix=fix)
 
 
+def refuse(given: object, options: Iterable[str], expected: str, or_: str) -> None:
+    """E160 where one of these options is given; ``or_`` is what else to do."""
+    for option in options:
+        if getattr(given, option):
+            fix = f"leave --{option} out, {or_}"
+            raise usage_error("too much", f"--{option}", expected, fix)
+
+
 def parse_numbers(option: str, words: Iterable[str]) -> dict[str, float]:
     """``NAME=NUMBER`` words by name (E160 for another form, or a name twice)."""
     return {

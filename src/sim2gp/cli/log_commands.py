@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from sim2gp.cli.arguments import parse_numbers, usage_error
+from sim2gp.cli.arguments import parse_numbers, refuse, usage_error
 from sim2gp.cli.late import (
     Call,
     FirstFolder,
@@ -115,7 +115,7 @@ class Identify(Reads, Spread):
         out = run_directory(self.out, self.project.stem)
         if self.each is not None:
             return self._fleet(call, out, self.each)
-        self._only("with --each NAME", "workers", "ray")
+        refuse(self, ("workers", "ray"), "one machine's logs", "or add --each NAME")
         read = read_project(self.project, self)
         first = FirstFolder(out)
         summary = call.saved(
@@ -135,18 +135,12 @@ class Identify(Reads, Spread):
         return summary
 
     def _fleet(self, call: Call, out: Path, each: str) -> dict[str, Any]:
-        self._only("without --each", "check", "nuts", "longer", "quick")
+        without = "check", "nuts", "longer", "quick"
+        refuse(self, without, "--each alone", "or leave --each out")
         read = read_machines(self.project, self, each)
         identify = function("commands.fleet", "identify_fleet")
         how = {"seed": self.seed, "workers": executor_of(self)}
         return call.saved(out, lambda: identify(*read, progress=call.progress, **how))
-
-    def _only(self, when: str, *options: str) -> None:
-        """E160 where one of these is given in the other case."""
-        for name in options:
-            if getattr(self, name):
-                fix = "leave it out"
-                raise usage_error("of no use here", f"--{name}", f"{when} alone", fix)
 
 
 @dataclass(kw_only=True)
@@ -164,11 +158,8 @@ class Evaluate(Reads, Chosen, InCells):
         path = self.run_or_project
         out = run_directory(self.out, f"evaluate-{path.stem}")
         if path.suffix == ".toml":
-            for option in ("logs", "configuration"):
-                if getattr(self, option):
-                    fix = f"leave --{option} out, or name a run"
-                    expected = "a project file alone: its own logs are left out"
-                    raise usage_error("too much", f"--{option}", expected, fix)
+            expected = "a project file alone: its own logs are left out"
+            refuse(self, ("logs", "configuration"), expected, "or name a run")
             share_of(self)
             work = function("commands.leave_one_out", "LeaveOneOut")(
                 *read_project(path, self), self.horizon

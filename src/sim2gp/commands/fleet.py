@@ -11,6 +11,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from statistics import NormalDist
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -45,7 +46,7 @@ from sim2gp.runs.provenance import provenance
 from sim2gp.systems.effects.forces import AbstractUnknownFunction
 from sim2gp.types import AnyArray, in_float64
 
-NORMAL95 = 1.959964
+NORMAL95 = NormalDist().inv_cdf(0.975)
 AGREE = 1.1  # R-hat of halves of the draws
 MOVED = 0.5  # sd
 
@@ -246,6 +247,7 @@ class MachineCell(AbstractCell):
         return eqx.tree_at(lambda w: w.mask, some, mask), np.where(own, recording, -1)
 
 
+@in_float64
 def _prior(project: Project, fits: Sequence[Gaussian]) -> Gaussian:
     """The table's, with its measured sums: linear about the middle of the machines."""
     table = project.system.parameters

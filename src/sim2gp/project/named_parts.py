@@ -31,16 +31,17 @@ def named_parts(pattern: str, path: str, folder: str) -> dict[str, str]:
 
 
 def _expression(pattern: str) -> str:
+    pattern = PurePath(pattern).as_posix()
     text, end, known = "", 0, set[str]()
-    for piece in _PIECES.finditer(PurePath(pattern).as_posix()):
-        text += re.escape(piece.string[end : piece.start()])
+    for piece in _PIECES.finditer(pattern):
+        text += re.escape(pattern[end : piece.start()])
         end, name = piece.end(), piece.group(1)
         if name is None:
             text += _MEANT.get(piece.group()) or _of_set(piece.group())
         else:
             text += f"(?P={name})" if name in known else f"(?P<{name}>[^/]+)"
             known.add(name)
-    return text + re.escape(PurePath(pattern).as_posix()[end:])
+    return text + re.escape(pattern[end:])
 
 
 def _of_set(text: str) -> str:

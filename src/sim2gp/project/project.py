@@ -11,6 +11,7 @@ import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -103,10 +104,7 @@ class Project:
         """
         if alike:
             self.check_alike()
-        logs = [log for _, part in self._read_files() for log in part]
-        if strict:
-            check_all_used(logs)
-        return tuple(_uniquely_named(logs))
+        return tuple(log for _, part in self._named_logs(strict) for log in part)
 
     def load_each(
         self, name: str, *, strict: bool = False
@@ -122,15 +120,19 @@ class Project:
                     where = self.source.where("logs", group, "files", i)
                     asked = f"{{{name}}}"
                     raise error("no_such_part", where=where, got=pattern, part=asked)
-        read = list(self._read_files())
-        named = _uniquely_named([log for _, part in read for log in part])
-        if strict:
-            check_all_used(named)
         found: dict[str, list[Log]] = {}
-        for file, part in read:
-            mine, named = named[: len(part)], named[len(part) :]
-            found.setdefault(file.parts[name], []).extend(mine)
+        for file, part in self._named_logs(strict):
+            found.setdefault(file.parts[name], []).extend(part)
         return {value: tuple(found[value]) for value in sorted(found)}
+
+    def _named_logs(self, strict: bool) -> list[tuple[LogFile, tuple[Log, ...]]]:
+        """Each file and its logs, with names that are unique among all."""
+        read = list(self._read_files())
+        logs = [log for _, part in read for log in part]
+        if strict:
+            check_all_used(logs)
+        named = iter(_uniquely_named(logs))
+        return [(file, tuple(islice(named, len(part)))) for file, part in read]
 
     def _read_files(self) -> Iterator[tuple[LogFile, tuple[Log, ...]]]:
         """Each file and its logs; E130 where there is none, or one twice."""
@@ -209,6 +211,7 @@ class Project:
         return [file.path for file in self._found(group)]
 
     def _found(self, group: int) -> list[LogFile]:
+        """They and the named parts of their paths."""
         found: dict[Path, LogFile] = {}
         folder = str(self.path.parent)
         for i, pattern in enumerate(self.spec.logs[group].files):

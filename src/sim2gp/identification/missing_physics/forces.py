@@ -90,7 +90,8 @@ class FoundForces:
 def find_forces(data: AbstractData, bare: Estimate) -> FoundForces:
     """Which forces the machine of ``data`` lacks, given the fit without any.
 
-    None of a plant that takes no forces, or where a fit with all of them fails.
+    None of a plant that takes no forces, or where a fit with all of them fails. Raises
+    `NotFinite` E203 where a simulator on the host is not finite.
     """
     if not takes_forces(plant_of(data.system)):
         return FoundForces()
