@@ -27,10 +27,9 @@ def timed(
     benchmark with what it said.
     """
     env = dict(os.environ, OPENBLAS_NUM_THREADS="1", MUJOCO_GL="disable")
-    env.pop("JAX_COMPILATION_CACHE_DIR", None)
-    if cache:
-        env |= {"JAX_COMPILATION_CACHE_DIR": cache}
-        env["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+    env["JAX_COMPILATION_CACHE_DIR"] = cache or ""
+    env["JAX_ENABLE_COMPILATION_CACHE"] = "true" if cache else "false"
+    env["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
     pinned = one_core and hasattr(os, "sched_setaffinity")
     command = [*(["taskset", "-c", "0"] if pinned else []), sys.executable, *args]
     with tempfile.TemporaryFile("w+") as said:

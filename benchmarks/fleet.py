@@ -139,8 +139,9 @@ def main() -> None:
     high = np.median([x["spread_high"] for x in each], axis=0)
     summary["spread_high"] = dict(zip(NAMES, high.tolist(), strict=True))
     summary["true_spread"] = dict(zip(NAMES, SPREAD.tolist(), strict=True))
-    for name in ("agreement", "moved"):
-        summary[name] = sorted(x[name] for x in each)
+    summary["agreement"] = sorted(x["agreement"] for x in each)
+    summary["moved"] = sorted(x["moved"][-1] for x in each)
+    summary["rounds"] = sorted(1 + len(x["moved"]) for x in each)
     for name in ("kind", "arms", "another", "spread"):
         words = [f"{n} {x['share']:.3f}" for n, x in summary[name].items()]
         print(f"{name:8}", "  ".join(words))

@@ -45,7 +45,7 @@ def compare(path: Path) -> list[str]:
     belief = fit_windows(system, windows, key=jax.random.key(0), robust=robust)
     known = belief.with_measurements(system.parameters)
     likelihood = WindowsLikelihood(system, windows)
-    wide = corrected_windows(at_zero(likelihood, known), of).posterior
+    wide = corrected_windows(at_zero(likelihood, known, of)).posterior
     grid = evaluation_windows(others, system, longest=CURVE[-1])
     lines = []
     for name, posterior in (("MAP", belief.posterior), ("corrected mean", wide)):

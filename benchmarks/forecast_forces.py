@@ -36,8 +36,9 @@ def kinds(name: str, sets: int) -> Counter[str]:
         system = condition.system()
         windows, _ = cut([data.log(s % CHUNK)], system, window=0.2)
         fitted = fit_windows(system, windows, key=jax.random.key(s), starts=1)
-        start = at_zero(WindowsLikelihood(system, windows), fitted)
-        machine = fit_forecast_machine(start, np.zeros(len(windows), int))
+        one = np.zeros(len(windows), int)
+        start = at_zero(WindowsLikelihood(system, windows), fitted, one)
+        machine = fit_forecast_machine(start, one)
         found[", ".join(sorted(machine.scales)) or "none"] += 1
     return found
 

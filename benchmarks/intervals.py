@@ -114,13 +114,13 @@ def work(job: Job) -> dict[str, Any]:
         found[SPEAK[WINDOW]].append(misfit_of_windows(likelihood, belief).alarm)
         pulls = pulls_of_windows(likelihood, belief, group)
         x = candidates.linear(likelihood, belief, pulls)
-        ours = corrected_windows(at_zero(likelihood, belief), group)
+        ours = corrected_windows(at_zero(likelihood, belief, group))
         found[MISSING].append(float(f"{ours.missing:.4g}"))
         each = {
             "plain": (x.z, np.asarray(belief.posterior.sd()) / prior_sd),
             "corrected": _units(ours, prior_sd),
             "scatter": _units(
-                corrected_windows(at_zero(likelihood, belief, ()), group), prior_sd
+                corrected_windows(at_zero(likelihood, belief, group, ())), prior_sd
             ),
             "clusters": candidates.clusters(x),
             "mixture": candidates.mixture(x),
@@ -154,7 +154,7 @@ def _also(
             alarm = misfit_of_windows(likelihood, belief).alarm
             found.setdefault(SPEAK[LONGER], []).append(alarm)
             centre, sd = _units(
-                corrected_windows(at_zero(likelihood, belief), group), prior_sd
+                corrected_windows(at_zero(likelihood, belief, group)), prior_sd
             )
         error = centre - data.truth[s] / prior_sd
         found[job.also].append([_rounded(error), _rounded(sd)])

@@ -163,7 +163,7 @@ def work(job: Job) -> dict[str, Any]:
         except (NotConverged, NotFinite) as error:
             return {"failed": str(error)}
         likelihood = WindowsLikelihood(project.system, windows)
-        mine = corrected_windows(at_zero(likelihood, belief), of).posterior
+        mine = corrected_windows(at_zero(likelihood, belief, of)).posterior
         seconds = time.perf_counter() - started
     found = table.values(mine.mean)
     return {

@@ -30,6 +30,7 @@ _CONTENTS = {
     "example": "commands.example",
     "init": "commands.init",
     "selftest": "commands.selftest",
+    "bench": "commands.bench",
     "reproduce": "commands.reproduce",
     "load_run": "commands.load_run",
     "Limits": "experiment_design.verdict",

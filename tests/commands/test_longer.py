@@ -52,7 +52,7 @@ def fitted(folder: Path, log: Log) -> tuple[Project, list[Log], CorrectedFit]:
     belief = fit_windows(project.system, windows, key=KEY)
     likelihood = WindowsLikelihood(project.system, windows)
     assert not misfit_of_windows(likelihood, belief).alarm
-    return project, [log], corrected_windows(at_zero(likelihood, belief), of)
+    return project, [log], corrected_windows(at_zero(likelihood, belief, of))
 
 
 def asked(folder: Path, log: Log, *, alarm: bool = False) -> Longer:

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import linear_system
-from sim2gp.data.one_step import BLOCK, OneStepLikelihood, in_blocks
+from sim2gp.data.one_step import OneStepLikelihood
 from sim2gp.data.transitions import Transitions
+from sim2gp.inference.linearized import BLOCK, in_blocks
 
 
 @pytest.mark.parametrize("count", [7, BLOCK, BLOCK + 1, 3 * BLOCK - 2])

@@ -150,7 +150,7 @@ def intervals(fitted: Fitted, windows: Any, of: np.ndarray) -> Any:
     """The corrected posterior."""
     table = fitted.likelihood.system.parameters
     known = fitted.estimate.with_measurements(table)
-    return corrected_windows(at_zero(fitted.likelihood, known), of).posterior
+    return corrected_windows(at_zero(fitted.likelihood, known, of)).posterior
 
 
 def slopes(fitted: Fitted, windows: Any) -> tuple[np.ndarray, np.ndarray]:

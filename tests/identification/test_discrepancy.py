@@ -276,10 +276,10 @@ def test_friction_that_the_simulator_lacks_is_in_the_intervals(
     truth, belief, likelihood = fitted(arms, "friction20", 0)
     one = np.zeros(len(likelihood.windows), int)
     assert away(truth, belief.posterior).max() > 12.0
-    alone = corrected_windows(at_zero(likelihood, belief, ()), one)
+    alone = corrected_windows(at_zero(likelihood, belief, one, ()))
     assert alone.kinds == ()
     assert away(truth, alone.posterior).max() > 7.0
-    found = corrected_windows(at_zero(likelihood, belief), one)
+    found = corrected_windows(at_zero(likelihood, belief, one))
     assert found.missing > 0.99
     assert found.each["dry_friction"] > 0.99
     assert found.posterior.scale.shape == (4, 4)
@@ -303,7 +303,7 @@ def test_friction_that_the_simulator_lacks_is_in_the_intervals(
         other = dataclasses.replace(
             belief, posterior=Gaussian(at, belief.posterior.scale)
         )
-    again = corrected_windows(at_zero(likelihood, other), one)
+    again = corrected_windows(at_zero(likelihood, other, one))
     assert away(Plain(found.posterior).mean, again.posterior).max() < 0.4
 
 
@@ -311,8 +311,8 @@ def test_friction_that_the_simulator_lacks_is_in_the_intervals(
 def test_a_sound_simulator_is_believed(arms: ModuleType) -> None:
     truth, belief, likelihood = fitted(arms, "white", 0)
     one = np.zeros(len(likelihood.windows), int)
-    found = corrected_windows(at_zero(likelihood, belief), one)
-    alone = corrected_windows(at_zero(likelihood, belief, ()), one)
+    found = corrected_windows(at_zero(likelihood, belief, one))
+    alone = corrected_windows(at_zero(likelihood, belief, one, ()))
     assert found.missing < 0.3
     assert missing_forces_table(found) == []
     assert interval_entry(alone, {}, 50)["missing"] is None

@@ -9,8 +9,9 @@ import pytest
 import payload_arm
 from interval_arms import CONDITIONS, Recordings, recordings
 from interval_mujoco import mujoco_arm
+from sim2gp.data import windows_likelihood
 from sim2gp.data.split_log import cut
-from sim2gp.data.windows_likelihood import WindowsLikelihood, linearise
+from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.intervals import pulls
 from sim2gp.identification.intervals.discrepancy import corrected_windows
@@ -42,7 +43,7 @@ def test_friction_that_the_model_lacks_is_found_and_the_truth_is_inside() -> Non
     """The plain interval of a damping is tens of sd away from its truth."""
     data, system = arms(), mujoco_arm()
     likelihood, found, group = fitted(system, data.log(1))
-    corrected = corrected_windows(at_zero(likelihood, found), group)
+    corrected = corrected_windows(at_zero(likelihood, found, group))
     assert max(corrected.each, key=corrected.each.__getitem__) == "dry_friction"
     apart = np.abs(corrected.posterior.mean - data.truth[1])
     assert np.all(apart < 3.0 * corrected.posterior.sd())
@@ -77,21 +78,19 @@ def test_a_fit_has_a_free_force_on_the_host() -> None:
 @in_float64
 def test_windows_at_a_time_say_the_same_as_all_at_once(monkeypatch: Any) -> None:
     likelihood, found, _ = fitted(mujoco_arm(), arms().log(0))
-    tt = found.posterior.mean
-    whole = pulls.rows_of(likelihood, found, tt)
-    monkeypatch.setattr(pulls, "TOGETHER", 1)
-    np.testing.assert_allclose(pulls.rows_of(likelihood, found, tt), whole, atol=1e-12)
-    # Rows between samples are not there: 20 samples of two joints, and four starts.
-    assert whole.shape[1] == 20 * 2 + 4
-    # What is left out says nothing: the pulls are those of all rows.
-    rows = linearise(likelihood, found, tt)
-    scale, n = np.asarray(found.noise.sd)[:, None], whole.shape[1] - 20 * 2
-    J = np.roll(np.asarray(rows.jacobian) / scale, n, axis=-1)
-    r = np.asarray(rows.residual)[..., None] / scale
-    every = np.concatenate([J, r], axis=-1).reshape(len(whole), -1, whole.shape[2])
-    mine = whole[:, :-n]
-    grams = (np.swapaxes(x, 1, 2) @ x for x in (mine, every))
-    np.testing.assert_allclose(*grams, atol=1e-9 * np.max(every) ** 2)
+    tt, group = found.posterior.mean, np.zeros(len(likelihood.windows), int)
+    whole = pulls.rows_of(likelihood, found, tt, group)
+    e, scale = (np.asarray(x) for x in (found.nuisances, found.prior.scale))
+    trial = likelihood.trial(np.asarray(tt), e, scale)
+    blocks = trial.blocks()
+    monkeypatch.setattr(windows_likelihood, "TOGETHER", 1)
+    parts = pulls.rows_of(likelihood, found, tt, group)
+    grams = (np.swapaxes(x.factors, 1, 2) @ x.factors for x in (parts, whole))
+    np.testing.assert_allclose(*grams, atol=1e-9 * np.max(whole.factors) ** 2)
+    np.testing.assert_allclose(parts.costs, whole.costs, rtol=1e-9)
+    again = likelihood.trial(np.asarray(tt), e, scale)
+    np.testing.assert_allclose(again.squares, trial.squares, rtol=1e-12)
+    np.testing.assert_allclose(again.blocks(), blocks, atol=1e-12 * np.max(blocks))
 
 
 @in_float64

@@ -62,7 +62,7 @@ def arm(condition: str) -> Arm:
     windows = eqx.tree_at(lambda w: w.mask, windows, mask)
     fitted = fit_windows(system, windows, key=jax.random.key(0), starts=1)
     recording = np.zeros(len(windows), int)
-    fit = at_zero(WindowsLikelihood(system, windows), fitted)
+    fit = at_zero(WindowsLikelihood(system, windows), fitted, recording)
     machine = fit_forecast_machine(fit, recording)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(interval_arms, "NOISE", 1e-5)
@@ -117,8 +117,9 @@ def test_scales_stay_as_chosen_and_a_fit_that_fails_is_not_used(
     windows, _ = cut([log], system, window=0.2)
     known, none = system.parameters.prior(), jnp.zeros(1)
     fitted = estimate_of(known, known, Noise(none, none), none[None])
-    fit = at_zero(WindowsLikelihood(system, windows), fitted)
-    found = fit_forecast_machine(fit, np.zeros(len(windows), int))
+    recording = np.zeros(len(windows), int)
+    fit = at_zero(WindowsLikelihood(system, windows), fitted, recording)
+    found = fit_forecast_machine(fit, recording)
     assert found.system is system
     assert found.scales == {}
     table = given["system"].parameters

@@ -22,7 +22,6 @@ from sim2gp.identification.intervals import scatter as intervals
 from sim2gp.identification.intervals.discrepancy import corrected_windows
 from sim2gp.identification.intervals.pulls import (
     Pulls,
-    cost_of_rows,
     pulls_of_windows,
     rows_of,
 )
@@ -302,7 +301,7 @@ def recorded(system: Machine, rows: int, rate: list[float], error: np.ndarray) -
 
 
 def cost_of(likelihood: WindowsLikelihood, found: Estimate, tt: jax.Array) -> float:
-    return cost_of_rows(rows_of(likelihood, found, tt), likelihood.windows)
+    return rows_of(likelihood, found, tt, np.zeros(len(likelihood.windows), int)).cost
 
 
 @pytest.fixture(scope="module")
@@ -331,7 +330,7 @@ def test_a_linear_machines_centre_is_where_the_gaussian_says(
             cost_of(likelihood, belief, jnp.asarray(x)) for x in (at + dz, at)
         )
     assert there - here == pytest.approx(told, rel=1e-6)
-    ours = corrected_windows(at_zero(likelihood, belief), of)
+    ours = corrected_windows(at_zero(likelihood, belief, of))
     plain = correct_posterior(belief.prior, belief.posterior, pulls)
     np.testing.assert_allclose(ours.posterior.mean, plain.posterior.mean, atol=1e-12)
 
@@ -349,7 +348,7 @@ def test_a_constant_at_its_bound_stays_where_the_data_are() -> None:
     likelihood = WindowsLikelihood(system, windows)
     pulls = pulls_of_windows(likelihood, belief, of := np.zeros(len(windows), int))
     naive = correct_posterior(belief.prior, belief.posterior, pulls)
-    ours = corrected_windows(at_zero(likelihood, belief), of)
+    ours = corrected_windows(at_zero(likelihood, belief, of))
     with jax.enable_x64(True):
         best, bad, good = (
             cost_of(likelihood, belief, found.posterior.mean)

@@ -12,8 +12,8 @@ AbstractBelief AbstractModel AbstractPlanner AbstractSystem Auto Box Channel
 FunctionSpace Gaussian ICEM InputError Limits Log MPC MPPI Machine MissingForces NLM
 Parameter
 Parameters PointEstimate PriorMean Progress Residual ResidualFunctionSpace SAC Sim2GP
-Sim2GPError Task Transitions Windows World __version__ apply bounded compare cut demo
-design diagnose episode evaluate example explain export fit_windows identify
+Sim2GPError Task Transitions Windows World __version__ apply bench bounded compare cut
+demo design diagnose episode evaluate example explain export fit_windows identify
 identify_fleet init load_project load_run log_bounded optimism positive
 posterior_sampling
 project_of_machine psal psrl read_logs reproduce rollout selftest show signed sinks

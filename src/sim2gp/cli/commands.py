@@ -216,6 +216,16 @@ class Selftest(Common):
 
 
 @dataclass(kw_only=True)
+class Bench(Common):
+    """How fast is it here? Ratios of times to what bounds them, in a few minutes."""
+
+    def run(self, call: Call) -> dict[str, Any]:
+        found = command("bench")(progress=call.progress)
+        summary: dict[str, Any] = found.with_entries(command_line=call.line).summary
+        return summary
+
+
+@dataclass(kw_only=True)
 class Reproduce(Writes, InCells):
     """A figure of the paper: its data, the picture, and the claims checked."""
 
@@ -269,5 +279,6 @@ COMMANDS: dict[str, type[Common]] = {
     "export": Export,
     "report": Report,
     "selftest": Selftest,
+    "bench": Bench,
     "reproduce": Reproduce,
 }

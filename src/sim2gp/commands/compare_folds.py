@@ -219,7 +219,7 @@ def _simulator_of(setup: Setup, fold: FittedFold, forces: bool) -> Sim2GP:
     known = fold.fit.with_measurements(setup.project.system.parameters)
     recording = recording_of_windows(setup.logs, setup.of)
     robust = setup.project.spec.likelihood.robust
-    start = at_zero(fold.likelihood, known)
+    start = at_zero(fold.likelihood, known, recording)
     wider = fit_forecast_machine(start, recording, robust=robust)
     return _simulator(setup, wider.system, wider.posterior)
 

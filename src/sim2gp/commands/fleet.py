@@ -2,8 +2,8 @@
 
 Machines are cells. Each is fitted alone, then all are joined (`identification.fleet`).
 Where a machine's logs leave something open, its own fit may have ended far from what
-the others say, and a fit is linear about its end. So each is fitted once more, with
-what is known of the kind as its prior, and all are joined again.
+the others say, and a fit is linear about its end. So each is fitted again with what is
+known of the kind as its prior, and all are joined again, until that moves no machine.
 """
 
 import math
@@ -48,7 +48,9 @@ from sim2gp.types import AnyArray, in_float64
 
 NORMAL95 = NormalDist().inv_cdf(0.975)
 AGREE = 1.1  # R-hat of halves of the draws
-MOVED = 0.5  # sd
+SETTLED = 0.1  # sd: rounds end when none moves a machine's parameter further
+ROUNDS = 7  # at most
+MOVED = 0.5  # sd: a fleet that still moves so far is not settled
 
 
 @dataclass(frozen=True, repr=False)
@@ -103,11 +105,14 @@ def identify_fleet(
 
 
 class FittedFleet(NamedTuple):
-    """A fleet, each machine ``alone``, and the most that fits have moved again (sd)."""
+    """A fleet, each machine ``alone``, and by how much each further round moved it.
+
+    ``moved`` has the largest change of a machine's parameter, in its sd.
+    """
 
     fleet: Fleet
     alone: list[Gaussian]
-    moved: float
+    moved: list[float]
 
 
 def fit_machines(
@@ -118,27 +123,37 @@ def fit_machines(
     workers: Workers | None = None,
     progress: Progress | None = None,
 ) -> FittedFleet:
-    """Machines alone, joined, each again with the kind as its prior, and joined."""
-    cells = _cells(project, machines, seed)
-    executor = executor_of((workers or 1) if project.can_be_loaded else 1)
-    with (progress or Progress()).task("machines", 2 * len(cells)) as task:
+    """Machines alone, joined, then each again with the kind as its prior and joined.
 
-        def joined(cells: Sequence[MachineCell]) -> tuple[Fleet, list[Gaussian]]:
+    The prior of a fit is divided out again: rounds move where fits are linearised.
+    """
+    cells, shown = _cells(project, machines, seed), progress or Progress()
+    executor = executor_of((workers or 1) if project.can_be_loaded else 1)
+
+    def joined(
+        cells: Sequence[MachineCell], label: str
+    ) -> tuple[Fleet, list[Gaussian]]:
+        with shown.task(label, len(cells)) as task:
             found = compute_cells(
                 cells, None, executor, lambda cell: task.advance(cell.note)
             )
-            each = [from_exact(found[cell]) for cell in cells]
-            fits, given = (
-                [_gaussian(x[name], x[f"{name}_scale"]) for x in each]
-                for name in ("posterior", "prior")
-            )
-            fleet = fit_fleet(_prior(project, fits), fits, given, seed=seed)
-            return fleet, fits
+        each = [from_exact(found[cell]) for cell in cells]
+        fits, given = (
+            [_gaussian(x[name], x[f"{name}_scale"]) for x in each]
+            for name in ("posterior", "prior")
+        )
+        return fit_fleet(_prior(project, fits), fits, given, seed=seed), fits
 
-        first, alone = joined(cells)
-        known = np.asarray(first.another.mean), np.asarray(first.another.scale)
-        fleet, _ = joined([replace(cell, prior=known) for cell in cells])
-    return FittedFleet(fleet, alone, _moved(first, fleet))
+    fleet, alone = joined(cells, "machines")
+    moved: list[float] = []
+    for number in range(2, ROUNDS + 1):
+        known = np.asarray(fleet.another.mean), np.asarray(fleet.another.scale)
+        again = [replace(cell, prior=known) for cell in cells]
+        before, (fleet, _) = fleet, joined(again, f"machines, round {number}")
+        moved.append(_moved(before, fleet))
+        if moved[-1] <= SETTLED:
+            break
+    return FittedFleet(fleet, alone, moved)
 
 
 def _cells(
@@ -225,8 +240,8 @@ class MachineCell(AbstractCell):
             WindowsLikelihood(system, windows),
             _cut(self.recordings).forces,
         )
-        start = at_zero(likelihood, fitted, forces)
-        known, about = corrected_windows(start, recording).posterior, fitted.prior
+        start = at_zero(likelihood, fitted, recording, forces)
+        known, about = corrected_windows(start).posterior, fitted.prior
         return exact(
             {
                 "posterior": np.asarray(known.mean),
@@ -259,9 +274,9 @@ def _prior(project: Project, fits: Sequence[Gaussian]) -> Gaussian:
 
 
 @in_float64
-def _moved(first: Fleet, fleet: Fleet) -> float:
+def _moved(before: Fleet, fleet: Fleet) -> float:
     """The most that joining again has moved a machine's parameter, in its sd."""
-    pairs = zip(first.machines, fleet.machines, strict=True)
+    pairs = zip(before.machines, fleet.machines, strict=True)
     return max(
         float(np.max(np.abs(np.asarray(b.mean - a.mean)) / np.asarray(b.sd())))
         for a, b in pairs
@@ -272,7 +287,7 @@ def _moved(first: Fleet, fleet: Fleet) -> float:
 def _summary(
     project: Project, machines: Mapping[str, Sequence[Log]], found: FittedFleet
 ) -> dict[str, Any]:
-    table, fleet, moved = project.system.parameters, found.fleet, found.moved
+    table, fleet, moved = project.system.parameters, found.fleet, found.moved[-1]
     entries = {
         p.name: _entry(p, j, fleet, list(machines)) for j, p in enumerate(table.free)
     }
@@ -285,8 +300,8 @@ def _summary(
         )
     if moved > MOVED:
         warnings.append(
-            f"a second round of fits has moved a parameter by {digits(moved, 2)} sd: "
-            "some machine's own logs leave it open, and intervals are rough"
+            f"the last of {len(found.moved) + 1} rounds of fits has still moved a "
+            f"parameter by {digits(moved, 2)} sd: intervals are rough"
         )
     return {
         "command": "identify each",
@@ -295,7 +310,7 @@ def _summary(
         "logs": {name: len(own) for name, own in machines.items()},
         "kind": entries,
         "agreement": fleet.agreement,
-        "moved": moved,
+        "moved": found.moved,
         "warnings": warnings,
         "tables": [_kind_table(entries), _machine_table(entries, list(machines))],
     }

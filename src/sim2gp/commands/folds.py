@@ -144,7 +144,7 @@ def fit_fold(
         warm_start=warm_start,
     )
     known = fitted.with_measurements(project.system.parameters)
-    start = at_zero(WindowsLikelihood(project.system, kept), known)
+    start = at_zero(WindowsLikelihood(project.system, kept), known, part.recording)
     machine = fit_forecast_machine(start, part.recording, robust=robust)
     result = forecast_grid(machine.system, machine.posterior, grid, horizon)
     train, tested = subset(grid, part.known), subset(grid, part.test)

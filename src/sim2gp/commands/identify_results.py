@@ -74,11 +74,11 @@ def identification_results(
     of = np.asarray([k for k, _ in places])
     known = fitted.with_measurements(table)
     likelihood = WindowsLikelihood(project.system, windows)
-    start = at_zero(likelihood, known)
+    start = at_zero(likelihood, known, of)
     recording, robust = recording_of_windows(logs, of), project.spec.likelihood.robust
     machine = fit_forecast_machine(start, recording, robust=robust)
     band, own = _own_forecasts(machine, grid, logs)
-    honest = corrected_windows(start, of)
+    honest = corrected_windows(start)
     summary = _identification_summary(
         project, logs, likelihood, known, honest, band, seed
     )

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from sim2gp.commands.bench import Bench
 from sim2gp.commands.compare import Comparison
 from sim2gp.commands.demo import Demonstration
 from sim2gp.commands.design import FILE, NextExperiment
@@ -20,6 +21,7 @@ class StudyRun(AbstractResult):
 
 
 KINDS: dict[str, type[AbstractResult]] = {
+    "bench": Bench,
     "compare": Comparison,
     "demo": Demonstration,
     "design": NextExperiment,

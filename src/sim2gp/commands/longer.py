@@ -118,7 +118,7 @@ def fit_longer_windows(
         likelihood = WindowsLikelihood(system, windows)
         alarm = misfit_of_windows(likelihood, fitted).alarm
         fitted = fitted.with_measurements(system.parameters)
-        found = corrected_windows(at_zero(likelihood, fitted), of)
+        found = corrected_windows(at_zero(likelihood, fitted, of))
     except (InputError, NotConverged, NotFinite, DeadParameters) as error:
         return no(f"they cannot be fitted ({error})")
     if not found.enough:

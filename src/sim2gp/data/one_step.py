@@ -3,13 +3,10 @@
 y_n = s'_n - s_n = f(x_n, tt) + eps_n,   eps ~ N(0, diag(sig^2))
 """
 
-from collections.abc import Callable
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from sim2gp.data.transitions import Transitions
 from sim2gp.inference import linearized
@@ -22,7 +19,6 @@ from sim2gp.inference.prior import ParameterPrior
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import in_float64
 
-BLOCK = 250  # rows: an episode
 FLOOR = 1e-3  # prior guess of the noise, relative to each channel's rms change
 
 
@@ -68,7 +64,7 @@ class OneStepLikelihood(AbstractLikelihood):
 
         data = self.data
         rows = data.state, data.action, data.next_state, data.mask, data.configuration
-        return in_blocks(jax.vmap(one), rows, data.mask)
+        return linearized.in_blocks(jax.vmap(one), rows, data.mask)
 
     def blocks(
         self,
@@ -120,31 +116,3 @@ def _rms_change(data: Transitions, d: int) -> Float[Array, " d"]:
     y = jnp.where(data.mask[:, None], data.delta()[:, :d], 0.0)
     change = jnp.sqrt(jnp.sum(y**2, axis=0) / jnp.maximum(N, 1.0))
     return jnp.where(change > 0.0, change, 1.0)
-
-
-def in_blocks(
-    f: Callable[..., Any], rows: tuple[Any, ...], mask: Bool[Array, " N"]
-) -> Any:
-    """``f(*rows)``, of `BLOCK` rows at a time; zeros for blocks that are all masked.
-
-    Data have room for all episodes of a run, and are empty in the beginning.
-    """
-    N = len(mask)
-    if N <= BLOCK:
-        return f(*rows)
-    count = -(-N // BLOCK)
-
-    def cut(x: Array) -> Array:
-        rest = jnp.zeros((count * BLOCK - N, *x.shape[1:]), x.dtype)
-        return jnp.concatenate([x, rest]).reshape(count, BLOCK, *x.shape[1:])
-
-    def nothing(some: tuple[Any, ...]) -> Any:
-        shapes = jax.eval_shape(f, *some)
-        return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-
-    def turn(given: tuple[Any, Array]) -> Any:
-        some, valid = given
-        return jax.lax.cond(jnp.any(valid), lambda x: f(*x), nothing, some)
-
-    found = jax.lax.map(turn, (jax.tree.map(cut, rows), cut(mask)))
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:N], found)

@@ -1,15 +1,21 @@
 """Logs cut into padded windows: what a likelihood of real logs is evaluated on."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from sim2gp.inference.linearized import in_blocks
 from sim2gp.systems.simulate import HeldInputs
 from sim2gp.types import AnyArray
+
+#: Rows of windows that a program works on at a time.
+TOGETHER = 100_000
+P = TypeVar("P", bound="Pieces")
 
 
 class Pieces(HeldInputs):
@@ -25,12 +31,17 @@ class Pieces(HeldInputs):
         return [HeldInputs(*rows) for rows in zip(*parts, strict=True)]
 
     def each(self, f: Callable[..., Any], *per_window: Any) -> Any:
-        """``f`` of one of them (and of one row of each argument), for all."""
-        axes = (self._axes(), *[0] * len(per_window))
-        return jax.vmap(f, in_axes=axes)(self, *per_window)
+        """``f`` of one of them (and of one row of each argument), for all.
 
-    def _axes(self) -> Any:
-        return 0
+        Of very many, some at a time (`TOGETHER`).
+        """
+        W, L = self.span.shape
+        rows, size = (self._each_with_all(), *per_window), max(1, TOGETHER // L)
+        return in_blocks(jax.vmap(f), rows, jnp.ones(W, bool), size)
+
+    def _each_with_all(self: P) -> P:
+        """With a row for each of them in every array."""
+        return self
 
 
 class Windows(Pieces):
@@ -66,8 +77,10 @@ class Windows(Pieces):
         )
         return chosen
 
-    def _axes(self) -> Any:
-        return eqx.tree_at(lambda w: w.floor, jax.tree.map(lambda _: 0, self), None)
+    def _each_with_all(self) -> "Windows":
+        floor = jnp.broadcast_to(self.floor, (len(self), self.floor.size))
+        whole: Windows = eqx.tree_at(lambda w: w.floor, self, floor)
+        return whole
 
 
 def channel_motion(windows: Windows) -> Float[np.ndarray, "W c"]:

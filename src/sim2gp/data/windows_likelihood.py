@@ -36,6 +36,9 @@ from sim2gp.systems.host import simulator_of
 from sim2gp.systems.simulate import inputs_of, simulate
 from sim2gp.types import AnyArray, in_float64
 
+#: Derivatives of windows that are in memory at once (256 MiB).
+TOGETHER = 2**25
+
 
 class WindowsLikelihood(AbstractLikelihood):
     """Windows of a machine's logs: per-window functions, vmapped at the edge."""
@@ -120,23 +123,35 @@ class WindowsLikelihood(AbstractLikelihood):
     ) -> Trial:
         if not self.on_host:
             return super().trial(tt, e, scale)
-        run, windows = self.run(tt, e, scale), self.windows
-        outputs = list(windows.outputs)
-        r = _residual(windows, run.states)
+        W, size = len(self.windows), together(self.system, self.windows)
+        parts = [np.arange(i, min(i + size, W)) for i in range(0, W, size)]
+        some = [self.some(i) for i in parts] if len(parts) > 1 else [self]
+        pairs = zip(some, parts, strict=True)
+        runs = [one.run(tt, e[i], scale) for one, i in pairs]
+        squares = [
+            np.sum(_residual(one.windows, run.states) ** 2, axis=1)
+            for one, run in zip(some, runs, strict=True)
+        ]
 
         def blocks() -> Float[np.ndarray, "W c b k"]:
-            J, mask = run.slopes()[:, :, outputs], windows.mask
+            pairs = zip(some, runs, strict=True)
+            return np.concatenate([one._factors(run, self.most) for one, run in pairs])
 
-            def one(w: int, c: int) -> Float[np.ndarray, "b k"]:
-                i = mask[w, :, c]
-                more = self.most - int(i.sum())
-                rows = np.pad(J[w, i, c], ((0, more), (0, 0)))
-                return factor(rows, np.pad(r[w, i, c], (0, more)))
+        return Trial(np.concatenate(squares), blocks)
 
-            channels = range(len(outputs))
-            return np.stack([[one(w, c) for c in channels] for w in range(len(r))])
+    def _factors(self, run: HostRun, most: int) -> Float[np.ndarray, "W c b k"]:
+        """`blocks` of a run, of no more than ``most`` samples of a channel."""
+        windows, outputs = self.windows, list(self.windows.outputs)
+        r, J = _residual(windows, run.states), run.slopes()[:, :, outputs]
 
-        return Trial(np.sum(r**2, axis=1), blocks)
+        def one(w: int, c: int) -> Float[np.ndarray, "b k"]:
+            i = windows.mask[w, :, c]
+            more = most - int(i.sum())
+            rows = np.pad(J[w, i, c], ((0, more), (0, 0)))
+            return factor(rows, np.pad(r[w, i, c], (0, more)))
+
+        channels = range(len(outputs))
+        return np.stack([[one(w, c) for c in channels] for w in range(len(r))])
 
     def run(
         self,
@@ -190,6 +205,13 @@ class Linearised(NamedTuple):
     input: Float[Array, "W L m"]
 
 
+def together(system: AbstractSystem, windows: Windows) -> int:
+    """How many of the windows to linearise at a time: all, if they are not many."""
+    (W, L), n = windows.span.shape, windows.start.shape[1]
+    each = L * n * (n + len(system.parameters))
+    return max(1, min(W, TOGETHER // max(each, 1)))
+
+
 @in_float64
 def linearise(
     likelihood: WindowsLikelihood, fitted: Estimate, tt: Float[Array, " p"]
@@ -204,9 +226,14 @@ def linearise(
 
 @in_float64
 def compile_linearise(system: AbstractSystem, windows: Windows) -> None:
-    """Start to compile `linearise` for windows like these and a fit to come."""
+    """Start to compile `linearise` for windows like these and a fit to come.
+
+    For as many as are linearised at a time.
+    """
     if simulator_of(system) is not None:
         return  # nothing to compile: its programs are small
+    size = together(system, windows)
+    windows = windows if size == len(windows) else windows.some(np.arange(size))
     prior, likelihood = system.parameters.prior(), WindowsLikelihood(system, windows)
     e = jnp.zeros(windows.start.shape)
     _linearise.compile_for(likelihood, e, prior.mean, prior.scale)

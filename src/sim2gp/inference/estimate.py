@@ -62,6 +62,12 @@ class Estimate(eqx.Module):
         """The MAP, whitened by the prior; call it under `in_float64`."""
         return self.prior.whitened(self.posterior.mean)
 
+    def some(self, which: Int[np.ndarray, " w"]) -> "Estimate":
+        """What it says of some of its windows, by number."""
+        noise = dataclasses.replace(self.noise, weights=self.noise.weights[which])
+        own = {"nuisances": self.nuisances[which], "scores": self.scores[which]}
+        return dataclasses.replace(self, noise=noise, **own)
+
     @in_float64
     def with_measurements(self, table: Parameters) -> "Estimate":
         """The same, with the measured sums of the table counted as prior."""

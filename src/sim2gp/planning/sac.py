@@ -230,7 +230,7 @@ def _trained(
         learner = eqx.tree_at(lambda l: l.replay, learner, learner.replay.add(rows))
 
         def update(learner: Learner, key: Key) -> tuple[Learner, None]:
-            return _updated(sac, learner, world, key), None
+            return updated(sac, learner, world, key), None
 
         keys = jax.random.split(learning, sac.updates)
         learner, _ = jax.lax.scan(update, learner, keys)
@@ -280,7 +280,7 @@ def _stepped(
     return Rollouts(S, t), rows
 
 
-def _updated(sac: SAC, learner: Learner, world: World, key: Key) -> Learner:
+def updated(sac: SAC, learner: Learner, world: World, key: Key) -> Learner:
     """One gradient step of critics, actor and temperature, in this order."""
     which, first, second = jax.random.split(key, 3)
     replay = learner.replay

@@ -17,7 +17,6 @@ from jaxtyping import Int
 
 from sim2gp.errors import DeadParameters, NotConverged, NotFinite
 from sim2gp.identification.fit import fit_windows
-from sim2gp.identification.intervals.pulls import without_starts
 from sim2gp.identification.missing_physics.at_zero import (
     AtZero,
     forces_at_zero,
@@ -177,12 +176,14 @@ def _helpful(fit: AtZero, recording: Int[np.ndarray, " W"]) -> dict[str, float]:
     if not fit.forces:
         return {}
     windows, whole, own = fit.likelihood.windows, fit.fitted, fit.own
-    if not np.isfinite(fit.rows).all():
+    rows = fit.rows
+    if not rows.finite:
         return {}
-    seen = np.asarray(windows.mask).any(axis=(1, 2))
-    rows, part = fit.rows[seen], recordings_or_parts(recording[seen])
-    rows = without_starts(rows, windows)
-    each = [rows[part == k].reshape(-1, rows.shape[-1]) for k in np.unique(part)]
+    data = np.asarray(windows.mask).any(axis=(1, 2))
+    seen = np.logical_or.reduceat(data, rows.first)
+    factors, part = rows.factors[seen], recordings_or_parts(recording[rows.first][seen])
+    k = factors.shape[-1]
+    each = [factors[part == one].reshape(-1, k) for one in np.unique(part)]
     at = np.asarray(whole.prior.whitened(whole.posterior.mean))[own]
     kinds = kinds_of(fit.likelihood.system.parameters.groups)
     return helpful_kinds(LeaveOneOut(each, own, at, kinds))

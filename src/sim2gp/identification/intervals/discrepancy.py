@@ -17,11 +17,11 @@ from jaxtyping import Float, Int
 from scipy.linalg import eigh
 
 from sim2gp.data.windows import Windows
-from sim2gp.data.windows_likelihood import WindowsLikelihood, compile_linearise
+from sim2gp.data.windows_likelihood import compile_linearise
 from sim2gp.identification.intervals.averaging import Groups
 from sim2gp.identification.intervals.pulls import (
     Pulls,
-    cost_of_rows,
+    WindowRows,
     pulls_of_rows,
     rows_of,
 )
@@ -36,7 +36,6 @@ from sim2gp.identification.missing_physics.at_zero import (
 )
 from sim2gp.identification.missing_physics.curves import curves_of
 from sim2gp.identification.missing_physics.reach import box_of
-from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.systems.assemble import free_parts
 from sim2gp.systems.base import AbstractSystem
@@ -57,24 +56,24 @@ def compile_corrected(system: AbstractSystem, cut: Windows) -> None:
 
     The machine's own linearisation, which others ask, too, comes first.
     """
-    compile_linearise(system, cut)
     forces = forces_of(system, box_of(system, cut))
-    if forces:
-        compile_linearise(free_parts(system, forces), cut)
+    machines = (system, free_parts(system, forces)) if forces else (system,)
+    for machine in machines:
+        compile_linearise(machine, cut)
 
 
 @in_float64
-def corrected_windows(start: AtZero, group: Int[np.ndarray, " W"]) -> CorrectedFit:
+def corrected_windows(start: AtZero) -> CorrectedFit:
     """The corrected posterior of a fit's parameters, checked with the simulator itself.
 
     ``start`` is the fit, with the forces that its machine may lack. Raises `NotFinite`
     E203.
     """
     whole, own, wider = start.fitted, start.own, start.likelihood
-    cut, system, p = wider.windows, wider.system, len(own)
+    system, p = wider.system, len(own)
     mean, scale = (np.asarray(x) for x in (whole.prior.mean, whole.prior.scale))
     rows = start.rows
-    pulls = pulls_of_rows(rows, cut, group)
+    pulls = pulls_of_rows(rows, start.group)
     T, groups = _identifiable(pulls, own, system.parameters.groups)
     k = T.shape[1]
     prior = Gaussian(jnp.zeros(k), jnp.eye(k))
@@ -88,12 +87,12 @@ def corrected_windows(start: AtZero, group: Int[np.ndarray, " W"]) -> CorrectedF
             return replace(found, posterior=start.alone.posterior)
         to = np.asarray(found.posterior.mean)
         inflation = found.inflation
-        to, rows = _trusted(wider, whole, rows, pulls.onto(T), onto, at, to, inflation)
+        to, rows = _trusted(start, rows, pulls.onto(T), onto, at, to, inflation)
         moved = np.abs(to - at) / np.asarray(found.posterior.sd())
         at = to
         if not groups or np.max(moved) <= SETTLED:
             break
-        pulls = pulls_of_rows(rows, cut, group)
+        pulls = pulls_of_rows(rows, start.group)
     both = Gaussian(
         jnp.asarray(onto(at)), jnp.asarray(onto.scale) @ found.posterior.scale
     )
@@ -157,15 +156,14 @@ def _apart(
 
 
 def _trusted(
-    likelihood: WindowsLikelihood,
-    fitted: Estimate,
-    rows: Float[np.ndarray, "W r npr"],
+    start: AtZero,
+    rows: WindowRows,
     pulls: Pulls,
     onto: _Onto,
     at: Float[np.ndarray, " k"],
     to: Float[np.ndarray, " k"],
     inflation: float,
-) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "W r npr"]]:
+) -> tuple[Float[np.ndarray, " k"], WindowRows]:
     """As far towards ``to`` as the linear misfit may be believed, and the rows there.
 
     Near a bound the machine is not linear in ``z``, and a centre far from the MAP is
@@ -173,15 +171,14 @@ def _trusted(
     more than the linear one, to `TRUSTED` nats of data that count as often as they
     should, or half of what is gained.
     """
-    cut = likelihood.windows
     dz = to - at
     score, F = pulls.scores.sum(axis=0), pulls.fisher.sum(axis=0)
-    before = cost_of_rows(rows, cut)
     for share in 0.5 ** np.arange(HALVINGS):
         there = at + share * (to - at)
-        found = rows_of(likelihood, fitted, jnp.asarray(onto(there)))
+        tt = jnp.asarray(onto(there))
+        found = rows_of(start.likelihood, start.fitted, tt, start.group)
         linear = share * dz @ (score + 0.5 * share * F @ dz)
         slack = TRUSTED * max(inflation, 1.0) + GAIN * max(-linear, 0.0)
-        if cost_of_rows(found, cut) - before - linear <= slack:
+        if found.cost - rows.cost - linear <= slack:
             return there, found
     return at, rows

@@ -1,24 +1,68 @@
 """What every window of a fit says of the parameters alone: its pulls.
 
-The windows' rows ``[J_e J_z r]``, whitened by prior and noise, the start state ``e``
-eliminated by a QR of each window's own. `sim2gp.identification.intervals.scatter` asks
-how far the pulls scatter.
+The windows' rows ``[J_e J_z r]`` are whitened by prior and noise, and the start state
+``e`` is eliminated by a QR of each window's own. How far the pulls scatter is asked by
+`sim2gp.identification.intervals.scatter`.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sim2gp.data.windows import Windows
-from sim2gp.data.windows_likelihood import WindowsLikelihood, linearise
+from sim2gp.data.windows_likelihood import (
+    WindowsLikelihood,
+    linearise,
+    together,
+)
 from sim2gp.identification.misfit.tests import must_be_finite
 from sim2gp.inference.estimate import Estimate
 from sim2gp.types import in_float64
 
-#: Derivatives that a simulator on the host has in memory at once (256 MiB).
-TOGETHER = 2**25
+#: Of more windows, successive ones are one: as many say how far they scatter.
+MOST = 4096
+
+
+class WindowRows(NamedTuple):
+    """Runs of windows linearised and whitened, start states eliminated.
+
+    ``factors`` are rows ``[J_z r]`` of each run, every window from its best start,
+    ``costs`` half their squared misfit there, one Gauss-Newton step from where the fit
+    has put them. A run is one window, or successive ones from ``first`` on.
+    """
+
+    factors: Float[np.ndarray, "V q p1"]
+    costs: Float[np.ndarray, " V"]
+    first: Int[np.ndarray, " V"]
+
+    @property
+    def finite(self) -> bool:
+        """Whether the simulation and its derivatives are."""
+        return bool(np.isfinite(self.factors).all())
+
+    @property
+    def cost(self) -> float:
+        """Of all windows; infinite where the simulation is not finite."""
+        return float(np.sum(self.costs)) if self.finite else math.inf
+
+    def in_runs(self, group: Int[np.ndarray, " V"], count: int) -> "WindowRows":
+        """Joined by so many successive ones of one group."""
+        if count == 1:
+            return self
+        edges = np.flatnonzero(np.diff(group)) + 1
+        starts = [0, *edges.tolist()]
+        ends = [*edges.tolist(), len(group)]
+        at = np.concatenate(
+            [np.arange(*pair, count) for pair in zip(starts, ends, strict=True)]
+        )
+        k = self.factors.shape[2]
+        factors = np.zeros((len(at), k, k))
+        for run, rows in enumerate(np.split(self.factors, at[1:])):
+            R = np.asarray(np.linalg.qr(rows.reshape(-1, k), mode="r"))
+            factors[run, : len(R)] = R
+        return WindowRows(factors, np.add.reduceat(self.costs, at), self.first[at])
 
 
 @dataclass(frozen=True)
@@ -56,59 +100,39 @@ def pulls_of_windows(
 
     Raises `NotFinite` E203.
     """
-    rows = rows_of(likelihood, fitted, fitted.posterior.mean)
-    return pulls_of_rows(rows, likelihood.windows, group)
+    tt = fitted.posterior.mean
+    return pulls_of_rows(rows_of(likelihood, fitted, tt, group), group)
 
 
-def pulls_of_rows(
-    rows: Float[np.ndarray, "W k npr"], cut: Windows, group: Int[np.ndarray, " W"]
-) -> Pulls:
-    """Of rows `rows_of`; raises `NotFinite` E203."""
-    R = without_starts(rows, cut)
+def pulls_of_rows(rows: WindowRows, group: Int[np.ndarray, " W"]) -> Pulls:
+    """Of runs of windows whose ``group`` is given; raises `NotFinite` E203."""
+    R = rows.factors
+    must_be_finite("derivatives or residuals", R, "the intervals")
     scores = np.einsum("wkp,wk->wp", R[..., :-1], R[..., -1])
-    return Pulls(R[..., :-1], scores, np.asarray(group))
-
-
-def without_starts(
-    rows: Float[np.ndarray, "W k npr"], cut: Windows
-) -> Float[np.ndarray, "W q pr"]:
-    """Rows ``[J_z r]`` of each window from its best start, of rows `rows_of`.
-
-    Raises `NotFinite` E203.
-    """
-    must_be_finite("derivatives or residuals", rows, "the intervals")
-    n = cut.start.shape[1]
-    return np.asarray(np.linalg.qr(rows, mode="r"))[:, n:, n:]
-
-
-def cost_of_rows(rows: Float[np.ndarray, "W k npr"], cut: Windows) -> float:
-    """Half the windows' squared misfit of rows `rows_of`, each from its best start.
-
-    Starts follow by one Gauss-Newton step from where the fit has put them. Infinite
-    where the simulation is not finite.
-    """
-    if not np.isfinite(rows).all():
-        return math.inf
-    n = cut.start.shape[1]
-    both = np.concatenate([rows[..., :n], rows[..., -1:]], axis=-1)
-    R = np.asarray(np.linalg.qr(both, mode="r"))
-    return 0.5 * float(np.sum(R[:, n:, n] ** 2))
+    return Pulls(R[..., :-1], scores, np.asarray(group)[rows.first])
 
 
 def rows_of(
-    likelihood: WindowsLikelihood, fitted: Estimate, tt: Array
-) -> Float[np.ndarray, "W k npr"]:
-    """Of each window ``[J_e J_z r]``, whitened, the start's prior in its last rows.
+    likelihood: WindowsLikelihood,
+    fitted: Estimate,
+    tt: Array,
+    group: Int[np.ndarray, " W"],
+) -> WindowRows:
+    """The windows at virtual values ``tt``, from the starts of the fit.
 
-    Rows that nothing measures are left out. A simulator on the host is asked for some
-    windows at a time: of hundreds of forces all derivatives at once are large.
+    Some windows at a time, all as many: of hundreds of forces all derivatives at once
+    are large. Of more windows than `MOST` runs of one ``group``.
     """
-    (W, L), n = likelihood.windows.span.shape, fitted.nuisances.shape[1]
-    one = L * n * (n + len(fitted.prior.mean))
-    size = max(1, TOGETHER // one) if likelihood.on_host else W
-    parts = (np.arange(k, min(k + size, W)) for k in range(0, W, size))
+    W, size = len(likelihood.windows), together(likelihood.system, likelihood.windows)
     most = int(np.asarray(likelihood.windows.mask).any(axis=2).sum(axis=1).max())
-    return np.concatenate([_some_rows(likelihood, fitted, tt, i, most) for i in parts])
+    found, count = [], -(-W // MOST)
+    for begin in range(0, W, size):
+        own = np.arange(begin, min(begin + size, W))
+        some = _some_rows(likelihood, fitted, tt, np.resize(own, size), most)
+        factors, costs = (x[: len(own)] for x in some)
+        rows = WindowRows(factors, costs, own)
+        found.append(rows.in_runs(np.asarray(group)[own], count))
+    return WindowRows(*(np.concatenate(x) for x in zip(*found, strict=True)))
 
 
 def _some_rows(
@@ -117,11 +141,10 @@ def _some_rows(
     tt: Array,
     which: Int[np.ndarray, " w"],
     most: int,
-) -> Float[np.ndarray, "w k npr"]:
-    """`rows_of` of some windows, of which none has more than ``most`` measured rows."""
+) -> tuple[Float[np.ndarray, "w q p1"], Float[np.ndarray, " w"]]:
+    """Factors and costs of some windows, none with more than ``most`` measured rows."""
     if len(which) < len(fitted.nuisances):
-        likelihood = likelihood.some(which)
-        fitted = _some(fitted, which)
+        likelihood, fitted = likelihood.some(which), fitted.some(which)
     e, p = np.asarray(fitted.nuisances), fitted.prior.mean.size
     n = e.shape[1]
     found = linearise(likelihood, fitted, tt)
@@ -133,13 +156,14 @@ def _some_rows(
     scale = weight / np.asarray(fitted.noise.sd)
     rows = np.concatenate([J[..., p:], J[..., :p], r[..., None]], axis=-1)
     rows *= scale[..., None]
+    # The start's prior: its residual is e.
     own = np.zeros((len(e), n, n + p + 1))
     own[..., :n], own[..., -1] = np.eye(n), e
-    return np.concatenate([rows.reshape(len(e), -1, n + p + 1), own], axis=1)
-
-
-def _some(fitted: Estimate, which: Int[np.ndarray, " w"]) -> Estimate:
-    """What an estimate says of some of its windows."""
-    noise = replace(fitted.noise, weights=fitted.noise.weights[which])
-    of_windows = {"nuisances": fitted.nuisances[which], "scores": fitted.scores[which]}
-    return replace(fitted, noise=noise, **of_windows)
+    rows = np.concatenate([rows.reshape(len(e), -1, n + p + 1), own], axis=1)
+    if not np.isfinite(rows).all():
+        nothing = np.full((len(e), min(rows.shape[1:]) - n, p + 1), np.nan)
+        return nothing, np.full(len(e), np.nan)
+    factors = np.asarray(np.linalg.qr(rows, mode="r"))[:, n:, n:]
+    of_start = np.concatenate([rows[..., :n], rows[..., -1:]], axis=-1)
+    rest = np.asarray(np.linalg.qr(of_start, mode="r"))[:, n:, n]
+    return factors, 0.5 * np.sum(rest**2, axis=1)

@@ -13,7 +13,11 @@ from jaxtyping import Array, Float, Int
 from sim2gp.data.one_step import OneStepLikelihood, compiled_rows
 from sim2gp.data.transitions import earlier_inputs, episode_numbers
 from sim2gp.data.windows import Windows
-from sim2gp.data.windows_likelihood import WindowsLikelihood, linearise
+from sim2gp.data.windows_likelihood import (
+    WindowsLikelihood,
+    linearise,
+    together,
+)
 from sim2gp.identification.misfit.tests import Misfit, misfit
 from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
@@ -52,11 +56,16 @@ def misfit_of_transitions(
 
 @in_float64
 def misfit_of_windows(likelihood: WindowsLikelihood, fitted: Estimate) -> Misfit:
-    """Of a fit and its windows.
+    """Of a fit and its windows; of very many, of some that are evenly spread.
 
     One-step windows have no start state of their own, and are tested as transitions.
     """
-    system, cut = likelihood.system, likelihood.windows
+    system, W = likelihood.system, len(likelihood.windows)
+    size = together(system, likelihood.windows)
+    if size < W:
+        which = np.linspace(0, W - 1, size).round().astype(int)
+        likelihood, fitted = likelihood.some(which), fitted.some(which)
+    cut = likelihood.windows
     found = linearise(likelihood, fitted, fitted.posterior.mean)
     r, J, s, a = (np.concatenate(np.asarray(x)) for x in found)
     weight = np.sqrt(np.repeat(np.asarray(fitted.noise.weights), cut.mask.shape[1]))

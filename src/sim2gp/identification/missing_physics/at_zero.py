@@ -6,10 +6,10 @@ from functools import cached_property
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from sim2gp.data.windows_likelihood import WindowsLikelihood
-from sim2gp.identification.intervals.pulls import rows_of
+from sim2gp.identification.intervals.pulls import WindowRows, rows_of
 from sim2gp.identification.missing_physics.reach import Range, box_of
 from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
@@ -31,27 +31,30 @@ class AtZero:
 
     ``likelihood``, ``fitted`` and ``forces`` are those of the machine with forces,
     ``own`` the places of the machine's parameters among its own, ``box`` where it
-    moved.
+    moved. ``group`` numbers the logs of the windows, which follow each other in one.
     """
 
     machine: AbstractSystem
     alone: Estimate
     likelihood: WindowsLikelihood
     fitted: Estimate
+    group: Int[np.ndarray, " W"]
     own: Int[np.ndarray, " p"]
     forces: tuple[AbstractUnknownFunction, ...]
     box: Mapping[str, Range]
 
     @cached_property
-    def rows(self) -> Float[np.ndarray, "W k npr"]:
+    def rows(self) -> WindowRows:
         """The windows, linearised (`rows_of`): once for all who ask."""
-        return rows_of(self.likelihood, self.fitted, self.fitted.posterior.mean)
+        tt = self.fitted.posterior.mean
+        return rows_of(self.likelihood, self.fitted, tt, self.group)
 
 
 @in_float64
 def at_zero(
     likelihood: WindowsLikelihood,
     fitted: Estimate,
+    group: Int[np.ndarray, " W"],
     forces: Sequence[AbstractUnknownFunction] | None = None,
 ) -> AtZero:
     """A fit with what its machine may lack: None is those of `forces_of`.
@@ -63,7 +66,8 @@ def at_zero(
     given = forces_of(machine, box) if forces is None else tuple(forces)
     system, whole, own = forces_at_zero(machine, fitted, given)
     wider = WindowsLikelihood(system, cut)
-    return AtZero(machine, fitted, wider, whole, own, given, box)
+    group = np.asarray(group)
+    return AtZero(machine, fitted, wider, whole, group, own, given, box)
 
 
 def forces_of(

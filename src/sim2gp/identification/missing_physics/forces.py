@@ -105,7 +105,7 @@ def find_forces(data: AbstractData, bare: Estimate) -> FoundForces:
             return FoundForces(failure=str(failed))
     assert isinstance(data, WindowData)
     assert isinstance(likelihood, WindowsLikelihood)
-    found = corrected_windows(at_zero(likelihood, bare, forces), data.recording)
+    found = corrected_windows(at_zero(likelihood, bare, data.recording, forces))
     return FoundForces(found.each, found.curves)
 
 
