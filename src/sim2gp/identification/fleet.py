@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.gaussian import Gaussian, of_mixture
 from sim2gp.types import in_float64
 
 #: Of log spreads, in prior sds: what is smaller is no difference.
@@ -99,7 +99,10 @@ def fit_fleet(
     machines = zip(np.stack(own, axis=1), np.stack(each, axis=1), strict=True)
 
     def of(mean: np.ndarray, covariance: np.ndarray) -> Gaussian:
-        return _mixture(mu + sd * mean, covariance * np.outer(sd, sd))
+        scales = sd[:, None] * np.linalg.cholesky(covariance)
+        even = np.full(len(mean), 1.0 / len(mean))
+        found = of_mixture(even, mu + sd * mean, scales)
+        return Gaussian(*map(jnp.asarray, found))
 
     return Fleet(
         of(m, Cm),
@@ -202,16 +205,6 @@ def _slice(
         if inside(x):
             return at(x)
         low, high = (x, high) if x < u[j] else (low, x)
-
-
-def _mixture(
-    means: Float[np.ndarray, "draws p"], covariances: Float[np.ndarray, "draws p p"]
-) -> Gaussian:
-    """The Gaussian of the same mean and covariance."""
-    mean = means.mean(axis=0)
-    away = means - mean
-    total = covariances.mean(axis=0) + away.T @ away / len(away)
-    return Gaussian(jnp.asarray(mean), jnp.asarray(np.linalg.cholesky(total)))
 
 
 def _agreement(draws: Float[np.ndarray, "draws p"]) -> float:

@@ -133,6 +133,20 @@ def from_covariance(
     return Gaussian(jnp.asarray(mean), jnp.asarray(scale))
 
 
+def of_mixture(
+    weights: Float[np.ndarray, " k"],
+    means: Float[np.ndarray, "k n"],
+    scales: Float[np.ndarray, "k n q"],
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n n"]]:
+    """Mean and a scale of a mixture of ``N(mean, scale scale^T)``; weights sum to 1."""
+    mean = weights @ means
+    away = (means - mean)[:, None]
+    rows = np.concatenate([np.swapaxes(scales, 1, 2), away], axis=1)
+    rows = np.sqrt(weights)[:, None, None] * rows
+    R = np.asarray(np.linalg.qr(rows.reshape(-1, rows.shape[2]), mode="r"))
+    return mean, R.T
+
+
 def _no_covariance(where: str, got: str, expected: str) -> InputError:
     return error("not_a_covariance", where=where, got=got, expected=expected)
 

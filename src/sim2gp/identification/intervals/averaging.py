@@ -18,6 +18,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from sim2gp.inference.gaussian import of_mixture
+
 #: Places of the unknowns of each group, by its name.
 Groups = Mapping[str, Int[np.ndarray, " _"]]
 Scales = Mapping[str, float]  # of the groups that are on
@@ -60,13 +62,8 @@ def averaged(
     weights = weights / weights.sum()
     if alone is not None:
         found[0] = found[0]._replace(mean=alone[0], scale=alone[1])
-    mean = weights @ np.stack([f.mean for f in found])
-    rows = [
-        math.sqrt(w) * np.concatenate([f.scale.T, [f.mean - mean]])
-        for w, f in zip(weights, found, strict=True)
-        if w > 0.0
-    ]
-    scale = np.asarray(np.linalg.qr(np.concatenate(rows), mode="r")).T
+    means, scales = np.stack([f.mean for f in found]), [f.scale for f in found]
+    mean, scale = of_mixture(weights, means, np.stack(scales))
     of = {name: [name in f.scales for f in found] for name in groups}
     each = {name: float(weights @ np.asarray(on, float)) for name, on in of.items()}
     return mean, scale, {NONE: float(weights[0])} | each
