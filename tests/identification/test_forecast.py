@@ -10,6 +10,7 @@ import pytest
 
 from oracles import log_protocol as protocol
 from oracles import plain_least_squares as plain
+from sim2gp.data import grid as grid_module
 from sim2gp.data.grid import CURVE, evaluation_windows, parabola_slopes, steps_of
 from sim2gp.data.logs import Log
 from sim2gp.identification.forecasts.forecast import (
@@ -226,6 +227,21 @@ def test_a_masked_past_starts_no_window() -> None:
     at = int(np.flatnonzero(np.round(cut.since, 9) == 0.2)[0])
     assert not cut.windows.mask[at, 40, 0]
     assert cut.windows.mask[at, 40, 1]
+
+
+def test_of_long_logs_windows_start_further_apart(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """One in three of those that start 0.1 s apart, from the first on."""
+    logs, system = [moved(3, seconds=1.0), moved(4, seconds=2.0)], arm(NUMBERS)
+    whole = evaluation_windows(logs, system, longest=0.2)
+    monkeypatch.setattr(grid_module, "MOST", 10)  # of 30: they start 0.3 s apart
+    some = evaluation_windows(logs, system, longest=0.2)
+    for log in (0, 1):
+        mine, all_of = some.since[some.log == log], whole.since[whole.log == log]
+        np.testing.assert_allclose(mine, all_of[::3])
+    kept = np.isin(whole.log + 1j * whole.since, some.log + 1j * some.since)
+    np.testing.assert_array_equal(some.windows.y, whole.windows.y[kept])
 
 
 @pytest.fixture(scope="module")

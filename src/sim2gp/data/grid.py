@@ -7,6 +7,7 @@ taken as recorded, an unmeasured velocity is the slope of the parabola through t
 enters a forecast but the inputs. Windows overlap; they end with their log.
 """
 
+import math
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -29,6 +30,7 @@ from sim2gp.systems.base import LONGEST_MEAN, AbstractSystem
 PERIOD = 2e-3  # s
 SAMPLES = 25  # of the filter
 ORDER = 2
+MOST = 20_000  # windows: of longer logs they start further apart
 CURVE = tuple(round(0.1 * k, 1) for k in range(1, 11))  # s, horizons of the error curve
 
 
@@ -58,17 +60,18 @@ def evaluation_windows(
     """Windows of up to ``longest`` seconds of all logs; rows are grid samples.
 
     A window whose start rests on a masked sample is left out; a masked row is not
-    compared. Raises `InputError` E148 for a length that is not positive.
+    compared. Of logs of more than 2,000 s together they start further apart.
+    Raises `InputError` E148 for a length that is not positive.
     """
     checks.positive("evaluation_windows", longest=longest)
     states = [channel.name for channel in system.physical_states]
     actions = [channel.name for channel in system.actions]
     measured = measured_states(logs, system)
-    L = steps_of(longest) + 1
+    L, apart = steps_of(longest) + 1, between_starts(logs)
     parts, spans = [], []
     for k, log in enumerate(logs):
         y, valid = on_grid(log, measured)
-        first = _starts(valid)
+        first = _starts(valid, apart)
         starts, centred = _start_states(y, states, measured)
         rows = first[:, None] + np.arange(L)[None]
         inside = rows < len(y)
@@ -156,10 +159,16 @@ def parabola_slopes(
     return value, slope
 
 
-def _starts(valid: Bool[np.ndarray, "N c"]) -> Int[np.ndarray, " W"]:
-    """Samples at multiples of 0.1 s with a whole past and some future."""
+def between_starts(logs: Sequence[Log]) -> int:
+    """Samples from one start to the next: 0.1 s, or a multiple where logs are long."""
+    seconds = sum(float(log.time[-1] - log.time[0]) for log in logs)
+    return steps_of(SPACING) * max(1, math.ceil(seconds / SPACING / MOST))
+
+
+def _starts(valid: Bool[np.ndarray, "N c"], apart: int) -> Int[np.ndarray, " W"]:
+    """Samples ``apart``, the first at 0.1 s, with a whole past and some future."""
     every = steps_of(SPACING)
-    first = np.arange(every, len(valid) - steps_of(CURVE[0]), every)
+    first = np.arange(every, len(valid) - steps_of(CURVE[0]), apart)
     past = first[:, None] + np.arange(1 - SAMPLES, 1)
     return first[valid[past].all(axis=(1, 2))]
 

@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from sim2gp.data.grid import steps_of
+from sim2gp.data.grid import PERIOD, between_starts, steps_of
 from sim2gp.data.logs import Log
 from sim2gp.data.split_log import SPACING
 from sim2gp.identification.forecasts.calibration_words import (
@@ -70,7 +70,8 @@ def calibrate_forecasts(
     measured = np.flatnonzero(valid.any(axis=0)).tolist()
     z = np.abs(found.error[:, at] / found.scale[:, at])
     some = valid.any(axis=1)
-    blocks = blocks_of(found.log[some], recording_names(logs), horizon)
+    apart = PERIOD * between_starts(logs)
+    blocks = blocks_of(found.log[some], recording_names(logs), horizon, apart)
     half = half_widths(z[some], valid[some], blocks.of)
     arrays = {"calibration/level": levels}
     channels: dict[str, dict[str, Any]] = {}
@@ -98,14 +99,17 @@ def calibrate_forecasts(
 
 
 def blocks_of(
-    log: Int[np.ndarray, " W"], files: Sequence[str], horizon: float
+    log: Int[np.ndarray, " W"],
+    files: Sequence[str],
+    horizon: float,
+    apart: float = SPACING,
 ) -> Blocks:
     """Blocks of windows in the order of time, from the log of each.
 
-    ``files`` is the recording of each log. Eight recordings or more are a block each,
-    unless one holds most of the windows. Else all are cut into stretches of at least
-    two horizons, which keeps the overlap of two blocks' windows small, and of at least
-    a sixteenth of all windows.
+    ``files`` is the recording of each log, windows start ``apart`` s. Eight recordings
+    or more are a block each, unless one holds most of the windows. Else all are cut
+    into stretches of at least two horizons, which keeps the overlap of two blocks'
+    windows small, and of at least a sixteenth of all windows.
     """
     order = list(dict.fromkeys(files))
     recording = np.asarray([order.index(file) for file in files])[log]
@@ -113,7 +117,7 @@ def blocks_of(
     if len(present) >= FEWEST and counts.max() <= LARGEST * len(log):
         place = np.searchsorted(present, recording)
         return Blocks(place, len(present), f"{len(present)} recordings")
-    least = math.ceil(2.0 * horizon / SPACING - 1e-9)
+    least = math.ceil(2.0 * horizon / apart - 1e-9)
     length = max(1, least, math.ceil(len(log) / MOST))
     of, count = np.zeros(len(log), int), 0
     for each, windows in zip(present, counts, strict=True):
@@ -121,7 +125,7 @@ def blocks_of(
         of[recording == each] = count + np.arange(windows) * pieces // windows
         count += int(pieces)
     unit = "recording" if len(present) == 1 else "recordings"
-    mean = SPACING * len(log) / count
+    mean = apart * len(log) / count
     stretch = f"stretch{'' if count == 1 else 'es'} of about {mean:.2g} s"
     return Blocks(of, count, f"{count} {stretch} in {len(present)} {unit}")
 
