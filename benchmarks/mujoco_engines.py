@@ -19,16 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim2gp import systems as sy
+from sim2gp.commands.bench_jobs import CART_POLE
 
 TURNS, DT = 5, 0.01
-CART_POLE = """
-<mujoco><option timestep="0.005"/><worldbody>
-  <body name="cart"><joint name="x" type="slide" axis="1 0 0" damping="1"/>
-    <geom type="box" size=".1 .1 .02" mass=".5"/>
-    <body name="pole"><joint name="q" axis="0 1 0" damping=".02"/>
-      <geom type="capsule" fromto="0 0 0 0 0 .3" size=".02" mass=".1"/></body></body>
-</worldbody><actuator><motor name="u" joint="x" gear="2"/></actuator></mujoco>
-"""
 PUCK = """
 <mujoco><option timestep="0.005"/><worldbody>
   <geom name="floor" type="plane" size="5 5 .1" friction=".3"/>
