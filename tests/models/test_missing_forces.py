@@ -1,5 +1,6 @@
 """A simulator that finds the force it lacks, and none where nothing is missing."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +9,9 @@ import pytest
 import sim2gp as sg
 from sim2gp.data.one_step import estimate_forces
 from sim2gp.data.transitions import Transitions
+from sim2gp.errors import Sim2GPWarning
+from sim2gp.inference.convergence import STALLED
+from sim2gp.models import missing_forces
 from sim2gp.studies.learners import misfit_of_belief
 from sim2gp.systems import Furuta, Machine, Spring
 
@@ -75,6 +79,26 @@ def test_a_spring_is_found_as_a_force_of_the_arms_position(with_spring):
             features = force.basis.slope(jnp.zeros_like(w), jnp.asarray(angle))
             assert float(features) == 0.0
             assert float(got) == pytest.approx(-STIFFNESS * angle, abs=1.5e-3)
+
+
+def test_a_fit_that_ends_nowhere_is_the_simulators_own(
+    with_spring, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What no force of one variable can be may keep a descent from its end."""
+    _, data = with_spring
+
+    def stalled(*args):
+        found = estimate_forces(*args)
+        status = lambda f: f.convergence.status  # noqa: E731
+        return eqx.tree_at(status, found, jnp.full_like(status(found), STALLED))
+
+    monkeypatch.setattr(missing_forces, "estimate_forces", stalled)
+    with pytest.warns(Sim2GPWarning, match="W204"):
+        belief = MODEL.fit(MODEL.init(KEY), data, key=KEY)
+    plain = sg.Sim2GP(Furuta())
+    alone = plain.fit(plain.init(KEY), data, key=KEY)
+    np.testing.assert_array_equal(belief.posterior.mean, alone.posterior.mean)
+    assert on(belief) == []
 
 
 @pytest.mark.nightly  # 15 s; the curve is compared by day

@@ -21,6 +21,7 @@ from jaxtyping import Int
 from sim2gp.belief import AbstractBelief, AbstractModel
 from sim2gp.data.one_step import OneStepLikelihood, estimate_forces
 from sim2gp.data.transitions import Transitions
+from sim2gp.errors import NotConverged, NotFinite, warn
 from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.groups import Start
@@ -107,9 +108,9 @@ class MissingForces(AbstractModel):
     ) -> Sim2GPBelief:
         """The best of several starts by evidence, with noise and scales learned.
 
-        Friction is looked for as wide as the machine's own substeps can follow; a fit
-        with the short ones that steep friction needs follows where it is found. Raises
-        `NotConverged`, `NotFinite` or `DeadParameters`.
+        Where it does not converge, as where no force of one variable is what is
+        missing, the simulator is fitted alone (warning W204). Raises `NotConverged`,
+        `NotFinite` or `DeadParameters` where that fails.
         """
         assert isinstance(belief, Sim2GPBelief)
         model = self.holding(data)
@@ -117,15 +118,27 @@ class MissingForces(AbstractModel):
             return model.fit(belief, data, key=key)
         rows = jax.tree.map(jnp.asarray, data)
         belief = belief if self._same_ranges(belief.system) else self.init(key)
+        try:
+            belief = self._with_forces(belief, rows)
+        except (NotConverged, NotFinite) as failed:
+            warn("W204", f"the simulator is fitted without missing forces: {failed}")
+        else:
+            likelihood = OneStepLikelihood(belief.system, rows, belief.dt)
+            on = belief.system.parameters.groups
+            late = on and arrive_late(likelihood, belief.prior, belief.posterior)
+            if not late:
+                return belief
+        return self.plain.fit(self.init(key), data, key=key)
+
+    def _with_forces(self, belief: Sim2GPBelief, rows: Transitions) -> Sim2GPBelief:
+        """Friction is looked for as wide as the machine's own substeps can follow.
+
+        A fit with the short ones that steep friction needs follows where it is found.
+        """
         if not _has_friction(belief.system):
             belief = self._fitted(self.wide, belief, rows)
         if _has_friction(belief.system):
             belief = self._fitted(self.sim, belief, rows)
-        if not belief.system.parameters.groups:
-            return belief
-        likelihood = OneStepLikelihood(belief.system, rows, belief.dt)
-        if arrive_late(likelihood, belief.prior, belief.posterior):
-            return self.plain.fit(self.init(key), data, key=key)
         return belief
 
     def _fitted(
