@@ -104,7 +104,7 @@ def test_neither_fit_nor_band_sees_what_is_held_out(
         return Band(np.ones(4), np.ones(1), one, np.array([0.0]), one[None], 1.0)
 
     stubs = ("fit_windows", fitted), ("forecast_grid", forecasts)
-    monkeypatch.setattr(folds, "at_zero", lambda likelihood, _: likelihood)
+    monkeypatch.setattr(folds, "at_zero", lambda likelihood, *_: likelihood)
     for name, stub in (*stubs, ("fit_forecast_machine", machine)):
         monkeypatch.setattr(folds, name, stub)
     monkeypatch.setattr(folds, "fit_band", band)
