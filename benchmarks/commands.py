@@ -22,7 +22,7 @@ def timed(
     """Seconds by the clock and of the processor, and the largest memory in MiB.
 
     ``args`` are Python's, the command runs in ``folder``. ``cache`` keeps what JAX
-    compiles; without one it compiles anew. ``first`` are the seconds until the file
+    compiles; without one it compiles again. ``first`` are the seconds until the file
     ``watched`` was there. A command that fails, or takes longer than `LIMIT`, ends the
     benchmark with what it said.
     """

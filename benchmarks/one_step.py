@@ -23,6 +23,7 @@ import numpy as np
 from scipy.stats import multivariate_normal
 
 from sim2gp.belief import AbstractBelief
+from sim2gp.commands.bench_jobs import driven
 from sim2gp.data.transitions import Transitions
 from sim2gp.planning.coloured_noise import coloured_noise
 from sim2gp.planning.episode import Purpose, key_for
@@ -56,19 +57,8 @@ def random_episode(task: Task, seed: int) -> Rows:
     """Transitions under pink noise of half the input's range, from rest."""
     key = jax.random.key(seed)
     noise = coloured_noise(key, 1, jnp.zeros((STEPS, 1), jnp.float32), 1.0)[0]
-    S, A, S2 = _episode(task, key, task.limit(0.5 * task.actions.high * noise))
-    return tuple(np.asarray(x, float) for x in (S, A, S2))  # type: ignore[return-value]
-
-
-@eqx.filter_jit
-def _episode(task: Task, key: Any, A: Any) -> Any:
-    def step(s: Any, row: Any) -> Any:
-        a, k = row
-        s2 = task.step(s, a, key=k)
-        return s2, (s, a, s2)
-
-    keys = jax.random.split(key, len(A))
-    return jax.lax.scan(step, task.reset(key), (A, keys))[1]
+    rows = driven(task, key, task.limit(0.5 * task.actions.high * noise))
+    return tuple(np.asarray(x, float) for x in rows)  # type: ignore[return-value]
 
 
 def anywhere(task: Task, seed: int, times: float) -> Rows:

@@ -295,10 +295,8 @@ def arm_rows() -> list[dict[str, Any]]:
         found = cell(5.0, 0, 0.01, cold=cold)
         ours, theirs = found["ours"], found["sysid"]
         job = f"identify, six-axis arm, 5 s of log, {words}"
-        row: dict[str, Any] = {"job": job, "against": "mujoco.sysid"}
-        row |= {"ours": ours["wall"], "theirs": theirs["wall"]}
-        row |= {"ratio": ours["wall"] / theirs["wall"], "target": 1.0}
-        row["meets_target"] = row["ratio"] <= row["target"]
+        seconds = ours["wall"], theirs["wall"]
+        row = bench.row_of(job, "mujoco.sysid", 1.0, *seconds)
         row |= {"error_ours": ours["median_error"]}
         rows.append(row | {"error_theirs": theirs["median_error"]})
     return rows
@@ -323,10 +321,8 @@ def command_rows(data: Path) -> list[dict[str, Any]]:
                 how, target = (
                     ("compiled before", most[1]) if turn else ("cold", most[0])
                 )
-                row = {"job": f"{name}, {how}", "against": f"{target:g} s"}
-                row |= {"ours": found["wall"], "theirs": target}
-                row |= {"ratio": found["wall"] / target, "target": 1.0}
-                row |= {"meets_target": found["wall"] <= target}
+                limit = f"{target:g} s", 1.0
+                row = bench.row_of(f"{name}, {how}", *limit, found["wall"], target)
                 rows.append(row | {"memory_mib": found["memory"]})
     return rows
 

@@ -64,7 +64,7 @@ def test_a_program_of_some_windows_at_a_time(
         args = found.posterior.mean, jnp.asarray(found.nuisances), found.prior.scale
         whole = likelihood.blocks(*args)
         rows = likelihood.windows.span.shape[1]
-        monkeypatch.setattr(windows_module, "TOGETHER", 5 * rows)
+        monkeypatch.setattr(windows_module, "AT_A_TIME", 5 * rows)
         parts = likelihood.blocks(*args)
     np.testing.assert_allclose(parts, whole, rtol=1e-12, atol=1e-12)
 

@@ -99,15 +99,26 @@ def summary_of(rows: list[dict[str, Any]], started: float) -> dict[str, Any]:
 
 def timed_row(job: Job) -> dict[str, Any]:
     """The job's medians in s, and the median ratio of its turns."""
-    row: dict[str, Any] = {"job": job.what, "against": job.against}
-    row |= {"ours": None, "theirs": None, "ratio": None}
-    row |= {"target": job.target, "meets_target": None}
     try:
-        ours, theirs, ratio = timed(job.make())
+        return row_of(job.what, job.against, job.target, *timed(job.make()))
     except ImportError as missing:
-        return row | {"missing": str(missing.name or missing)}
-    row |= {"ours": ours, "theirs": theirs, "ratio": ratio}
-    return row | {"meets_target": ratio <= job.target}
+        none = dict.fromkeys(("ours", "theirs", "ratio", "meets_target"))
+        about = {"job": job.what, "against": job.against, "target": job.target}
+        return about | none | {"missing": str(missing.name or missing)}
+
+
+def row_of(
+    what: str,
+    against: str,
+    target: float,
+    ours: float,
+    theirs: float,
+    ratio: float | None = None,
+) -> dict[str, Any]:
+    """A row of the table; without a ``ratio`` that of these seconds."""
+    ratio = ours / theirs if ratio is None else ratio
+    row = {"job": what, "against": against, "ours": ours, "theirs": theirs}
+    return row | {"ratio": ratio, "target": target, "meets_target": ratio <= target}
 
 
 def timed(pair: Pair) -> tuple[float, float, float]:

@@ -23,7 +23,7 @@ from sim2gp.planning.episode import oracle_world, world_of
 from sim2gp.planning.sac import updated
 from sim2gp.planning.tasks import Task, cartpole_swingup, furuta_swingup
 from sim2gp.systems import CartPole, Furuta, MuJoCo
-from sim2gp.types import in_float64
+from sim2gp.types import Key, in_float64
 
 SAMPLES, HORIZON = 1024, 50
 ROWS = 250  # an episode of five seconds
@@ -66,10 +66,8 @@ def plan_in_draw() -> Pair:
 
 def plan(world: World, task: Task) -> Callable[[], object]:
     """One round of MPPI."""
-    planner, key = (
-        MPC(update=MPPI(samples=SAMPLES, iterations=1), horizon=HORIZON),
-        jax.random.key(1),
-    )
+    planner = MPC(update=MPPI(samples=SAMPLES, iterations=1), horizon=HORIZON)
+    key = jax.random.key(1)
     state, s = planner.init(world, key=key), task.reset(key)
     act = eqx.filter_jit(lambda *x: planner.act(*x, key=key))
     return _done(act, state, world, s)
@@ -119,18 +117,24 @@ def random_rows(task: Task) -> Transitions:
     key, m = jax.random.key(2), task.actions.low.size
     A = jnp.repeat(jax.random.uniform(key, (ROWS // 5, m), minval=-1.0), 5, axis=0)
     A = jax.vmap(lambda a: task.limit(0.5 * task.actions.high * a))(A)
+    rows = [np.asarray(x, float) for x in driven(task, key, A)]
+    return Transitions.empty(ROWS, task.size, m).extend(*rows)
 
-    @jax.jit
-    def flown(A: Array) -> tuple[Array, Array]:
-        def step(s: Array, row: tuple[Array, Array]) -> tuple[Array, tuple]:
-            a, key = row
-            s2 = task.step(s, a, key=key)
-            return s2, (s, s2)
 
-        return jax.lax.scan(step, task.reset(key), (A, jax.random.split(key, ROWS)))[1]
+@eqx.filter_jit
+def driven(
+    task: Task, key: Key, A: Float[Array, "T m"]
+) -> tuple[Float[Array, "T n"], Float[Array, "T m"], Float[Array, "T n"]]:
+    """States, inputs and next states of a task's machine under given inputs."""
 
-    S, S2 = (np.asarray(x, float) for x in flown(A))
-    return Transitions.empty(ROWS, task.size, m).extend(S, np.asarray(A, float), S2)
+    def step(s: Array, row: tuple[Array, Array]) -> tuple[Array, Any]:
+        a, key = row
+        s2 = task.step(s, a, key=key)
+        return s2, (s, a, s2)
+
+    keys = jax.random.split(key, len(A))
+    rows: tuple[Array, Array, Array] = jax.lax.scan(step, task.reset(key), (A, keys))[1]
+    return rows
 
 
 def sac_and_updates() -> Pair:

@@ -14,7 +14,7 @@ from sim2gp.systems.simulate import HeldInputs
 from sim2gp.types import AnyArray
 
 #: Rows of windows that a program works on at a time.
-TOGETHER = 100_000
+AT_A_TIME = 100_000
 P = TypeVar("P", bound="Pieces")
 
 
@@ -33,10 +33,10 @@ class Pieces(HeldInputs):
     def each(self, f: Callable[..., Any], *per_window: Any) -> Any:
         """``f`` of one of them (and of one row of each argument), for all.
 
-        Of very many, some at a time (`TOGETHER`).
+        Of very many, some at a time (`AT_A_TIME`).
         """
         W, L = self.span.shape
-        rows, size = (self._each_with_all(), *per_window), max(1, TOGETHER // L)
+        rows, size = (self._each_with_all(), *per_window), max(1, AT_A_TIME // L)
         return in_blocks(jax.vmap(f), rows, jnp.ones(W, bool), size)
 
     def _each_with_all(self: P) -> P:

@@ -7,6 +7,7 @@ The windows' rows ``[J_e J_z r]`` are whitened by prior and noise, and the start
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -52,11 +53,8 @@ class WindowRows(NamedTuple):
         if count == 1:
             return self
         edges = np.flatnonzero(np.diff(group)) + 1
-        starts = [0, *edges.tolist()]
-        ends = [*edges.tolist(), len(group)]
-        at = np.concatenate(
-            [np.arange(*pair, count) for pair in zip(starts, ends, strict=True)]
-        )
+        parts = pairwise([0, *edges.tolist(), len(group)])
+        at = np.concatenate([np.arange(*part, count) for part in parts])
         k = self.factors.shape[2]
         factors = np.zeros((len(at), k, k))
         for run, rows in enumerate(np.split(self.factors, at[1:])):
