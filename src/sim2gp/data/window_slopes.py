@@ -144,9 +144,11 @@ def _altered(
     """The inputs that arrive, and their slopes in each input and in the parameters."""
 
     def one(c: Array, a: Array) -> tuple[Array, Array, Array]:
-        value, by_c = value_and_jacobian(lambda c: machine.altered(c, a), c)
-        each = (jnp.ones_like(a),)  # an input alters no other
-        _, by_a = jax.jvp(lambda a: machine.altered(c, a), (a,), each)
-        return value, by_a, by_c
+        # An input alters no other: all may be moved at once, by x[-1].
+        here = jnp.append(c, 0.0)
+        value, J = value_and_jacobian(
+            lambda x: machine.altered(x[:-1], a + x[-1]), here
+        )
+        return value, J[:, -1], J[:, :-1]
 
     return jax.vmap(jax.vmap(one, (None, 0)))(constants, inputs)

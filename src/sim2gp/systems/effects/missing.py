@@ -85,7 +85,7 @@ def missing_forces(
     for channel in plant.actions:
         low, high = box[channel.name]
         half, name = 0.5 * (high - low), channel.name
-        change = smooth(low, high, reach=INPUT_REACH, length=INPUT_LENGTH)
+        change = bases.smooth(low, high, reach=INPUT_REACH, length=INPUT_LENGTH)
         found += [
             MissingInput(name, CHANGE * half, change),
             MissingInput(name, GAP * half, Gap(GAP_WIDTH * half), what="dead_zone"),
