@@ -18,6 +18,7 @@ it is undone, and the next one trusts the linear model less.
 from collections.abc import Callable
 from typing import NamedTuple, TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -30,6 +31,7 @@ from sim2gp.inference.levenberg_marquardt import (
     JOINT_TOLERANCE,
     MOST_DAMPING,
     Point,
+    blocks_of,
     evaluate,
     is_stale,
     judged,
@@ -206,8 +208,7 @@ def _nowhere(
     e: Float[Array, "W n"],
 ) -> Point:
     """No number: where nothing finite is ever found, nothing must look like a fit."""
-    args = prior.gaussian.at(z), e, prior.gaussian.scale
-    blocks = jax.eval_shape(likelihood.blocks, *args)
+    blocks = eqx.filter_eval_shape(blocks_of, likelihood, prior, z, e)
     rows, zero = jax.eval_shape(prior.rows, z), jnp.zeros_like(z)
     blocks, rows = (jnp.full(x.shape, jnp.nan, x.dtype) for x in (blocks, rows))
     cost, scores = jnp.asarray(jnp.inf, z.dtype), jnp.zeros((len(e), z.size))

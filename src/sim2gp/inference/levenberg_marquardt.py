@@ -140,9 +140,20 @@ def evaluate(
     noise: Noise,
 ) -> Point:
     """Data and prior linearised at ``(z, e)``."""
+    return point(z, e, blocks_of(likelihood, prior, z, e), prior.rows(z), noise)
+
+
+@eqx.filter_jit
+def blocks_of(
+    likelihood: AbstractLikelihood,
+    prior: AbstractPrior,
+    z: Float[Array, " p"],
+    e: Float[Array, "W n"],
+) -> Blocks:
+    """The data's factors at whitened unknowns; a program of descents traces it once."""
     about = prior.gaussian
-    blocks = likelihood.blocks(about.at(z), e, about.scale)
-    return point(z, e, blocks, prior.rows(z), noise)
+    found: Blocks = likelihood.blocks(about.at(z), e, about.scale)
+    return found
 
 
 def point(

@@ -85,11 +85,13 @@ def corrected_windows(start: AtZero) -> CorrectedFit:
         found = correct_posterior(prior, now, pulls.onto(T), groups)
         if not found.enough:
             return replace(found, posterior=start.alone.posterior)
-        to = np.asarray(found.posterior.mean)
-        inflation = found.inflation
-        to, rows = _trusted(start, rows, pulls.onto(T), onto, at, to, inflation)
-        moved = np.abs(to - at) / np.asarray(found.posterior.sd())
-        at = to
+        to, sd = (np.asarray(x) for x in (found.posterior.mean, found.posterior.sd()))
+        # So near, there is nothing to try: a linearisation of all forces is saved.
+        near = groups and np.max(np.abs(to - at) / sd) <= SETTLED
+        if not near:
+            inflation = found.inflation
+            to, rows = _trusted(start, rows, pulls.onto(T), onto, at, to, inflation)
+        moved, at = np.abs(to - at) / sd, to
         if not groups or np.max(moved) <= SETTLED:
             break
         pulls = pulls_of_rows(rows, start.group)

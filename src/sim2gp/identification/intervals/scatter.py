@@ -125,9 +125,9 @@ def correct_posterior(
     for what in (pulls.factors, pulls.scores):
         must_be_finite("pulls of windows", what, "the intervals")
     L0, mu0 = np.asarray(prior.scale), np.asarray(prior.mean)
-    z, pulls, A, R = _at_the_map(prior, plain.mean, pulls)
+    z, pulls, data, R = _at_the_map(prior, plain.mean, pulls)
     p = len(mu0)
-    _, s, Vt = np.linalg.svd(A, full_matrices=False)
+    _, s, Vt = np.linalg.svd(data, full_matrices=False)
     seen = ~(s <= RANK_TOLERANCE * s.max(initial=0.0))
     s, Vt = s[seen], Vt[seen]
     v, P = _whitened(pulls, R)
@@ -141,12 +141,12 @@ def correct_posterior(
     own = np.setdiff1d(np.arange(p), _places(groups or {}))
     rows = _scatter(v, P, pulls.group, b) @ onto.T
     root, kappa2 = _shrink_apart(rows, columns[:, own], nu)
-    _, size, U = np.linalg.svd(root, full_matrices=False)
+    _, size, U = np.linalg.svd(np.linalg.qr(root, mode="r"), full_matrices=False)
     spread = np.maximum(size, 1.0) * math.sqrt(nu / (nu - 2.0))
     # F z_data = (F + I) z at the MAP, where the scores add up to -z.
-    data = s * (Vt @ z) - (Vt @ pulls.scores.sum(axis=0)) / s
+    known = s * (Vt @ z) - (Vt @ pulls.scores.sum(axis=0)) / s
     weight = U / spread[:, None]
-    root, rest = weight @ columns, weight @ data
+    root, rest = weight @ columns, weight @ known
     alone = _without_forces(z, pulls, own) if groups else None
     centre, scale, each = averaged(root, rest, groups or {}, alone)
     found = Gaussian(jnp.asarray(mu0 + L0 @ centre), jnp.asarray(L0 @ scale))
@@ -255,16 +255,16 @@ def _at_the_map(
 ) -> tuple[
     Float[np.ndarray, " p"],
     Pulls,
-    Float[np.ndarray, "r p"],
+    Float[np.ndarray, "q p"],
     Float[np.ndarray, "p p"],
 ]:
     """The MAP of what is linear, whitened, and the pulls there: the same where ``at``
-    is it; the rows of all windows, and R."""
+    is it; the factor of the data's information, and R, that of the posterior's."""
     z = np.asarray(prior.whitened(jnp.asarray(at)))
-    A = np.concatenate(list(pulls.factors))
-    R = np.asarray(np.linalg.qr(np.concatenate([A, np.eye(len(z))]), mode="r"))
+    data = np.asarray(np.linalg.qr(np.concatenate(list(pulls.factors)), mode="r"))
+    R = np.asarray(np.linalg.qr(np.concatenate([data, np.eye(len(z))]), mode="r"))
     step = -np.linalg.solve(R, np.linalg.solve(R.T, z + pulls.scores.sum(axis=0)))
-    return z + step, pulls.at(step), A, R
+    return z + step, pulls.at(step), data, R
 
 
 def _whitened(
