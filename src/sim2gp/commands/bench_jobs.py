@@ -64,9 +64,11 @@ def plan_in_draw() -> Pair:
     return Pair(plan(world, task), bare_rollout(task))
 
 
-def plan(world: World, task: Task) -> Callable[[], object]:
+def plan(
+    world: World, task: Task, samples: int = SAMPLES, horizon: int = HORIZON
+) -> Callable[[], object]:
     """One round of MPPI."""
-    planner = MPC(update=MPPI(samples=SAMPLES, iterations=1), horizon=HORIZON)
+    planner = MPC(update=MPPI(samples=samples, iterations=1), horizon=horizon)
     key = jax.random.key(1)
     state, s = planner.init(world, key=key), task.reset(key)
     act = eqx.filter_jit(lambda *x: planner.act(*x, key=key))

@@ -16,14 +16,9 @@ from jaxtyping import Bool, Float, Int
 
 from sim2gp import checks
 from sim2gp.data.clock import step_between
+from sim2gp.data.cuts import inputs_since, knots_of
 from sim2gp.data.logs import Log
-from sim2gp.data.split_log import (
-    SPACING,
-    inputs_since,
-    knots_of,
-    measured_states,
-    resolution,
-)
+from sim2gp.data.split_log import SPACING, measured_states, resolution
 from sim2gp.data.windows import Windows
 from sim2gp.systems.base import LONGEST_MEAN, AbstractSystem
 

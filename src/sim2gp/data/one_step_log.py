@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from sim2gp.data.cuts import inputs_since, knots_of
 from sim2gp.data.grid import (
     PERIOD,
     SAMPLES,
@@ -29,7 +30,7 @@ from sim2gp.data.grid import (
     states_from,
 )
 from sim2gp.data.logs import Log
-from sim2gp.data.split_log import inputs_since, knots_of, measured_states
+from sim2gp.data.split_log import measured_states
 from sim2gp.data.transitions import Transitions
 from sim2gp.data.windows import Windows
 from sim2gp.systems.base import AbstractSystem

@@ -10,14 +10,15 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Literal, get_args
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from sim2gp import checks
 from sim2gp.data.clock import on_even_clock
+from sim2gp.data.cuts import Cuts
 from sim2gp.data.logs import Log
 from sim2gp.data.windows import Windows
 from sim2gp.errors import error
-from sim2gp.systems.base import DELAY_BLUR, AbstractSystem, index_of, steps_in
+from sim2gp.systems.base import AbstractSystem, index_of
 
 HALF_WIDTH = 0.025  # s, half the span of the local parabola that guesses a start
 PAST = 0.049  # s, the span of the causal one: 25 samples of 2 ms
@@ -50,40 +51,64 @@ def cut(
     unknown, E144 for a sd or a floor that is not positive, E145 for another ``start``,
     E148 for a length that is negative.
     """
+    cuts = cuts_of(
+        logs, system, window=window, start_sd=start_sd, floor=floor, start=start
+    )
+    return cuts.whole(), cuts.places
+
+
+def cuts_of(
+    logs: Sequence[Log],
+    system: AbstractSystem,
+    *,
+    window: float,
+    start_sd: dict[str, float] | None = None,
+    floor: dict[str, float] | None = None,
+    start: Start = "smoothed",
+) -> Cuts:
+    """Where `cut` cuts, as which it raises; its windows are made when asked for."""
     checks.not_negative("cut", window=window)
     checks.one_of("cut", get_args(Start), start=start)
     checks.deviation("start_sd", **(start_sd or {}))
     checks.deviation("floor", **(floor or {}))
     logs = [on_even_clock(log, system) for log in logs]
     measured = measured_states(logs, system, every=window == 0.0)
-    pieces = []
-    for k, log in enumerate(logs):
-        if window == 0.0:
-            _, mask = log.measured(measured)
-            whole = np.asarray(mask.all(axis=1))
-            rows = np.flatnonzero(whole[:-1] & whole[1:])
-            pieces += [(k, int(i), int(i) + 2) for i in rows]
-        else:
-            past = SPACING if start == "causal" else 0.0
-            pieces += [(k, i, j) for i, j in _consecutive(log.time, window, past)]
-    pieces = [p for p in pieces if _has_data(logs[p[0]], measured, p)]
-    if not pieces:
+    past = SPACING if start == "causal" else 0.0
+    each = [_pieces(k, log, measured, window, past) for k, log in enumerate(logs)]
+    pieces = np.concatenate(each)
+    if not len(pieces):
         raise error(
             "no_window_to_learn_from",
             got=f"{sum(len(log) for log in logs)} rows",
             window=f"{window:g}",
         )
-    windows = assemble(logs, system, pieces, measured, start)
-    if window == 0.0:  # the first row is the start itself, not a measurement of it
-        x0 = np.zeros_like(windows.start)
-        x0[:, windows.outputs] = windows.y[:, 0]
-        mask = windows.mask.copy()
-        mask[:, 0] = False
+    quantum = np.asarray([resolution(logs, name) for name in measured])
+    if window == 0.0:
+        x0 = _recorded_starts(logs, pieces, measured, system)
         sd = np.zeros_like(x0)
-        windows = dataclasses.replace(windows, start=x0, start_sd=sd, mask=mask)
-    return _with_stated(windows, system, measured, start_sd, floor), [
-        (k, i) for k, i, _ in pieces
-    ]
+    else:
+        x0, sd = _guessed_starts(logs, pieces, measured, system, start, quantum)
+    # A first row that is the start itself is no measurement of it.
+    first, used = int(window == 0.0), np.ones(len(pieces), bool)
+    cuts = Cuts(system, logs, pieces, measured, x0, sd, quantum, used, first)
+    return _with_stated(cuts, start_sd, floor)
+
+
+def _pieces(
+    k: int, log: Log, measured: Sequence[str], window: float, past: float
+) -> Int[np.ndarray, "w 3"]:
+    """Where a log is cut: rows of windows in which something was measured."""
+    _, mask = log.measured(measured)
+    if window == 0.0:
+        whole = np.asarray(mask.all(axis=1))
+        rows = np.flatnonzero(whole[:-1] & whole[1:])
+        ends = np.stack([rows, rows + 2], axis=1)
+    else:
+        ends = np.asarray(_consecutive(log.time, window, past), int).reshape(-1, 2)
+    known = np.concatenate([[0], np.cumsum(mask.any(axis=1))])
+    i, j = ends.T
+    kept = ends[(known[j] > known[i]) & (j - i > 1)]
+    return np.concatenate([np.full((len(kept), 1), k), kept], axis=1)
 
 
 def measured_states(
@@ -103,98 +128,67 @@ def measured_states(
     return measured
 
 
-def assemble(
+def _recorded_starts(
     logs: Sequence[Log],
-    system: AbstractSystem,
-    pieces: Sequence[tuple[int, int, int]],
+    pieces: Int[np.ndarray, "W 3"],
     measured: Sequence[str],
-    start: Start = "smoothed",
-) -> Windows:
-    """Padded windows of rows ``i .. j - 1`` of log ``k``, for each piece (k, i, j).
-
-    The start's prior is a local parabola's value and slope, with a spread far wider
-    than its error, so that the same rows are not believed twice, and no slope that a
-    coarse clock blurs pulls at the parameters. A causal start is the recorded value and
-    the slope of the parabola through the past alone.
-    """
-    actions = [channel.name for channel in system.actions]
+    system: AbstractSystem,
+) -> Float[np.ndarray, "W n"]:
+    """The first rows of windows in which every state is measured."""
     names = [channel.name for channel in system.physical_states]
-    W, c = len(pieces), len(measured)
-    held = [knots_of(log, actions, system.longest_delay) for log in logs]
-    guesses = [_local_parabolas(log, measured, start) for log in logs]
-    twice = [_local_parabolas(log, measured, start, 2.0) for log in logs]
-    steps = [_integration_steps(log.time, system.window_substep) for log in logs]
-    L = max(int(steps[k][0][j - 1] - steps[k][0][i]) + 1 for k, i, j in pieces)
-    spans = [
-        (k, logs[k].time[i], logs[k].time[j - 1] - logs[k].time[i])
-        for k, i, j in pieces
-    ]
-    knots, area = inputs_since(held, spans, system.longest_delay)
-    y, mask = np.zeros((W, L, c)), np.zeros((W, L, c), bool)
-    span, (x0, wider) = np.zeros((W, L)), np.zeros((2, W, len(names)))
-    for w, (k, i, j) in enumerate(pieces):
-        values, valid = logs[k].measured(measured)
-        row, lengths = steps[k]
-        at = row[i:j] - row[i]
-        y[w, at], mask[w, at] = values[i:j], valid[i:j]
-        span[w, 1 : at[-1] + 1] = lengths[row[i] : row[j - 1]]
-        x0[w] = start_of(names, measured, *guesses[k](i))
-        wider[w] = start_of(names, measured, *twice[k](i))
-    floor = np.asarray([resolution(logs, name) for name in measured])
-    outputs = tuple(names.index(name) for name in measured)
+    x0 = np.zeros((len(pieces), len(names)))
+    where = [names.index(name) for name in measured]
+    for k in np.unique(pieces[:, 0]):
+        own = pieces[:, 0] == k
+        x0[np.ix_(own, where)] = logs[k].measured(measured)[0][pieces[own, 1]]
+    return x0
+
+
+def _guessed_starts(
+    logs: Sequence[Log],
+    pieces: Int[np.ndarray, "W 3"],
+    measured: Sequence[str],
+    system: AbstractSystem,
+    start: Start,
+    quantum: Float[np.ndarray, " c"],
+) -> tuple[Float[np.ndarray, "W n"], Float[np.ndarray, "W n"]]:
+    """Starts of windows, and the sd of their prior.
+
+    It is a local parabola's value and slope, with a spread far wider than its error, so
+    that the same rows are not believed twice, and no slope that a coarse clock blurs
+    pulls at the parameters. A causal start is the recorded value and the slope of the
+    parabola through the past alone.
+    """
+    names = [channel.name for channel in system.physical_states]
+    x0, wider = np.zeros((2, len(pieces), len(names)))
+    for k in np.unique(pieces[:, 0]):
+        guesses = _local_parabolas(logs[k], measured, start)
+        twice = _local_parabolas(logs[k], measured, start, 2.0)
+        for w in np.flatnonzero(pieces[:, 0] == k):
+            i = int(pieces[w, 1])
+            x0[w] = start_of(names, measured, *guesses(i))
+            wider[w] = start_of(names, measured, *twice(i))
     # Slopes over twice the time differ by about what either is wrong by.
     doubt = np.sqrt(np.mean((x0 - wider) ** 2, axis=0))
     spread = FAR * np.minimum(np.sqrt(np.mean(x0**2, axis=0)), doubt)
-    for index, quantum in zip(outputs, floor, strict=True):
-        spread[index] = 100.0 * quantum
+    for name, step in zip(measured, quantum, strict=True):
+        spread[names.index(name)] = 100.0 * step
     spread = np.where(spread > 0.0, spread, 1.0)
-    sd = np.broadcast_to(spread, x0.shape)
-    which = np.asarray([logs[k].group for k, _, _ in pieces], np.int32)
-    return Windows(span, knots, area, y, mask, x0, sd, floor, which, outputs)
-
-
-def inputs_since(
-    held: Sequence[tuple[np.ndarray, np.ndarray]],
-    spans: Sequence[tuple[int, float, float]],
-    delay: float,
-) -> tuple[Float[np.ndarray, "W H"], Float[np.ndarray, "W H m"]]:
-    """Padded knots and integrals of the inputs for each (log, since, length) in s.
-
-    They reach ``delay`` seconds (and a blur's width) back; knots count from ``since``.
-    """
-    ranges = []
-    for k, since, length in spans:
-        time = held[k][0]
-        back = delay + DELAY_BLUR
-        first = int(np.searchsorted(time, since - back, side="right")) - 1
-        last = int(np.searchsorted(time, since + length + DELAY_BLUR)) + 1
-        ranges.append((max(first, 0), min(last, len(time))))
-    W, H = len(spans), max(b - a for a, b in ranges)
-    knots, area = np.zeros((W, H)), np.zeros((W, H, held[0][1].shape[1]))
-    for w, ((k, since, _), (a, b)) in enumerate(zip(spans, ranges, strict=True)):
-        knots[w, : b - a] = held[k][0][a:b] - since
-        knots[w, b - a :] = knots[w, b - a - 1] + np.arange(1.0, H - (b - a) + 1)
-        area[w] = held[k][1][np.minimum(np.arange(a, a + H), b - 1)]
-        area[w] -= held[k][1][a]
-    return knots, area
+    return x0, np.broadcast_to(spread, x0.shape)
 
 
 def _with_stated(
-    windows: Windows,
-    system: AbstractSystem,
-    measured: Sequence[str],
-    start_sd: Mapping[str, float] | None,
-    floor: Mapping[str, float] | None,
-) -> Windows:
+    cuts: Cuts, start_sd: Mapping[str, float] | None, floor: Mapping[str, float] | None
+) -> Cuts:
     """What the user states replaces what was guessed from the data."""
-    states = system.physical_states
-    channels = [c for name in measured for c in states if c.name == name]
-    sd, quantum = windows.start_sd.copy(), windows.floor.copy()
+    states = cuts.system.physical_states
+    channels = [states[i] for i in cuts.outputs]
+    sd, quantum = cuts.start_sd.copy(), cuts.floor.copy()
     for name, value in (start_sd or {}).items():
         sd[:, index_of(name, states, where="start_sd")] = value
     for name, value in (floor or {}).items():
         quantum[index_of(name, channels, where="floor")] = value
-    return dataclasses.replace(windows, start_sd=sd, floor=quantum)
+    return dataclasses.replace(cuts, start_sd=sd, floor=quantum)
 
 
 def _consecutive(
@@ -211,36 +205,6 @@ def _consecutive(
     return out
 
 
-def _has_data(log: Log, measured: Sequence[str], piece: tuple[int, int, int]) -> bool:
-    _, mask = log.measured(measured)
-    return bool(mask[piece[1] : piece[2]].any()) and piece[2] - piece[1] > 1
-
-
-def _integration_steps(
-    time: Float[np.ndarray, " N"], longest: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Integration steps of at most ``longest`` seconds that meet every stamp.
-
-    Returns each stamp's place among the steps' ends, and the steps' lengths.
-    """
-    gaps = np.round(np.diff(time), 9)  # those that are equal differ by rounding
-    count = steps_in(gaps, longest)
-    place = np.concatenate([[0], np.cumsum(count)])
-    return place, np.repeat(gaps / count, count)
-
-
-def knots_of(
-    log: Log, actions: Sequence[str], delay: float
-) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, "K m"]]:
-    """Times and integral of the held inputs; before the log, its first input holds."""
-    u, t = log.commanded(actions), log.time
-    before = delay + 1.0
-    time = np.concatenate([[t[0] - before], t, [t[-1] + 1.0]])
-    held = np.concatenate([u[:1], u])
-    area = np.concatenate([0.0 * u[:1], np.cumsum(held * np.diff(time)[:, None], 0)])
-    return time, area
-
-
 def _local_parabolas(
     log: Log, measured: Sequence[str], start: Start, width: float = 1.0
 ) -> Callable[[int], tuple[np.ndarray, np.ndarray]]:
@@ -250,18 +214,23 @@ def _local_parabolas(
     before, after = width * before, width * after
 
     def at(i: int) -> tuple[np.ndarray, np.ndarray]:
-        t = log.time - log.time[i]
+        time, now = log.time, log.time[i]
         # As long a span at the log's ends: half of it knows slopes ten times worse.
-        early = max(0.0, t[0] + before) if start == "smoothed" else 0.0
-        late = max(0.0, after - t[-1])
-        near = slice(
-            int(np.searchsorted(t, -before - late)),
-            int(np.searchsorted(t, after + early, side="right")),
+        early = max(0.0, time[0] - now + before) if start == "smoothed" else 0.0
+        late = max(0.0, after - (time[-1] - now))
+        # Of a long log a part that has all rows in question.
+        least, most = now - 2.0 * (before + late), now + 2.0 * (after + early)
+        first, last = np.searchsorted(time, (least, most + 1e-6))
+        t = time[first:last] - now
+        ends = (
+            np.searchsorted(t, -before - late),
+            np.searchsorted(t, after + early, "right"),
         )
+        near, t = slice(first + ends[0], first + ends[1]), t[slice(*ends)]
         value, slope = np.zeros(len(measured)), np.zeros(len(measured))
         for c in range(len(measured)):
             value[c], slope[c] = fit_parabola(
-                t[near], values[near, c], mask[near, c], values[i, c]
+                t, values[near, c], mask[near, c], values[i, c]
             )
             if start == "causal" and mask[i, c]:
                 value[c] = values[i, c]

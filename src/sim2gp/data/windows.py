@@ -1,6 +1,6 @@
 """Logs cut into padded windows: what a likelihood of real logs is evaluated on."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -63,6 +63,31 @@ class Windows(Pieces):
 
     def __len__(self) -> int:
         return len(self.y)
+
+    @property
+    def length(self) -> int:
+        """Rows of each window."""
+        return int(self.span.shape[1])
+
+    @property
+    def counts(self) -> Float[np.ndarray, "W c"]:
+        """Samples of each window and channel."""
+        return np.sum(self.mask, axis=1, dtype=float)
+
+    @property
+    def seconds(self) -> Float[np.ndarray, " W"]:
+        """How long each lasts."""
+        return np.asarray(self.span).sum(axis=1)
+
+    def masked(self, used: Bool[np.ndarray, " W"]) -> "Windows":
+        """The same, where nothing is measured in the others."""
+        mask = np.asarray(self.mask) & used[:, None, None]
+        found: Windows = eqx.tree_at(lambda w: w.mask, self, mask)
+        return found
+
+    def in_parts(self, size: int) -> Iterator[tuple[Int[np.ndarray, " w"], "Windows"]]:
+        """All of them, and their numbers."""
+        yield np.arange(len(self)), self
 
     def some(self, which: Bool[np.ndarray, " W"] | Int[np.ndarray, " w"]) -> "Windows":
         """The windows chosen by a mask or by number; the floor belongs to all."""
