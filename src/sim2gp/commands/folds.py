@@ -13,10 +13,11 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Int
 
+from sim2gp.data.cuts import Cuts
 from sim2gp.data.grid import CURVE, PERIOD, Grid, steps_of
 from sim2gp.data.logs import Log
 from sim2gp.data.windows import Windows
-from sim2gp.data.windows_likelihood import WindowsLikelihood
+from sim2gp.data.windows_likelihood import likelihood_of
 from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.forecasts.baselines import regression_errors
 from sim2gp.identification.forecasts.forecast import Band, Forecast, fit_band
@@ -90,7 +91,7 @@ def recording_of_windows(
 
 def split_held_out(
     logs: Sequence[Log],
-    windows: Windows,
+    windows: Windows | Cuts,
     places: Sequence[tuple[int, int]],
     grid: Grid,
 ) -> Part | None:
@@ -103,12 +104,12 @@ def split_held_out(
         first, end = float(logs[0].time[0]), float(logs[-1].time[-1])
         split = end - LAST * (end - first)
         since = np.asarray([logs[k].time[row] for k, row in places])
-        train = since + np.asarray(windows.span).sum(axis=1) <= split
+        train = since + windows.seconds <= split
         known, test = grid.since + CURVE[0] <= split, grid.since >= split
         words = f"the last {100 * LAST:.0f} % of the log {logs[0].name}"
         recording = recording_of_windows(logs, of)
         found = Part(train, known, test, recording, 1, words, split)
-    seen = np.asarray(windows.mask)[found.train].any()
+    seen = windows.counts[found.train].any()
     judged_by = np.asarray(grid.windows.mask)[
         found.test, scored_rows(CURVE[0])[0]
     ].any()
@@ -117,7 +118,7 @@ def split_held_out(
 
 def fit_fold(
     project: Project,
-    windows: Windows,
+    windows: Windows | Cuts,
     grid: Grid,
     part: Part,
     horizon: float,
@@ -132,8 +133,7 @@ def fit_fold(
     Raises as `sim2gp.identification.fit.fit_windows` does.
     """
     rows = scored_rows(horizon)
-    mask = np.asarray(windows.mask) & part.train[:, None, None]
-    kept = eqx.tree_at(lambda w: w.mask, windows, mask)
+    kept = windows.masked(part.train)
     robust = project.spec.likelihood.robust
     fitted = fit_windows(
         project.system,
@@ -144,7 +144,7 @@ def fit_fold(
         warm_start=warm_start,
     )
     known = fitted.with_measurements(project.system.parameters)
-    start = at_zero(WindowsLikelihood(project.system, kept), known, part.recording)
+    start = at_zero(likelihood_of(project.system, kept), known, part.recording)
     machine = fit_forecast_machine(start, part.recording, robust=robust)
     result = forecast_grid(machine.system, machine.posterior, grid, horizon)
     train, tested = subset(grid, part.known), subset(grid, part.test)

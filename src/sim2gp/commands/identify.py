@@ -12,14 +12,14 @@ import jax
 from sim2gp.commands.first_answer import FirstAnswer
 from sim2gp.commands.identification import Identification
 from sim2gp.data.clock import clock_lines
+from sim2gp.data.cuts import Cuts
 from sim2gp.data.grid import CURVE, Grid, evaluation_windows
 from sim2gp.data.logs import Log, note_lines
 from sim2gp.data.windows import Windows
-from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.identification.fit import fit_windows
 from sim2gp.project import Project
 from sim2gp.project.in_memory import Logs, project_and_logs
-from sim2gp.project.training_windows import cut_places
+from sim2gp.project.training_windows import cut_for_fit
 from sim2gp.runs import Progress
 from sim2gp.runs.provenance import provenance
 from sim2gp.systems.base import AbstractSystem
@@ -56,7 +56,7 @@ def identify(
         sampler()  # before the work
     project, logs = project_and_logs(machine, logs)
     with progress.task("identify", 3) as task:
-        windows, places = cut_places(project, logs)
+        windows, places = cut_for_fit(project, logs)
         task.advance(f"{len(windows)} windows")
         key, robust = jax.random.key(seed), project.spec.likelihood.robust
         grid = evaluation_windows(logs, project.system, longest=CURVE[-1])
@@ -78,8 +78,8 @@ def identify(
         )
         summary, arrays, honest = found
         task.advance("forecasts")
-        likelihood = WindowsLikelihood(project.system, windows)
-        summary |= results.held_against(likelihood, fitted, seed, check, nuts)
+        of = project.system, windows
+        summary |= results.held_against(*of, fitted, seed, check, nuts)
         if longer:
             progress.say("fitting longer windows")
         alarm = summary["misfit"]["alarm"]
@@ -88,7 +88,7 @@ def identify(
     return Identification(summary, arrays, {}, project, logs=tuple(logs))
 
 
-def _sizes(project: Project, logs: Sequence[Log], windows: Windows) -> str:
+def _sizes(project: Project, logs: Sequence[Log], windows: Windows | Cuts) -> str:
     """What a fit is about, and in which steps it simulates, before it begins."""
     parameters, columns = len(project.system.parameters), len(windows.outputs)
     length = project.spec.likelihood.window
@@ -100,7 +100,7 @@ def _sizes(project: Project, logs: Sequence[Log], windows: Windows) -> str:
     return "\n".join([sizes, *clock_lines(logs, project.system), *still])
 
 
-def _compile(system: AbstractSystem, grid: Grid, windows: Windows) -> None:
+def _compile(system: AbstractSystem, grid: Grid, windows: Windows | Cuts) -> None:
     """Begin to compile what follows the fit, where JAX moves the machine."""
     if simulator_of(system) is not None:
         return

@@ -10,10 +10,16 @@ from sim2gp.commands.folds import recording_of_windows
 from sim2gp.commands.identification import physical_mode
 from sim2gp.commands.unseen import Unseen, forecast_unseen
 from sim2gp.data.clock import clock_warnings
+from sim2gp.data.cuts import Cuts
 from sim2gp.data.grid import CURVE, Grid
 from sim2gp.data.logs import Log, note_lines
 from sim2gp.data.windows import Windows
-from sim2gp.data.windows_likelihood import WindowsLikelihood, information_at
+from sim2gp.data.windows_likelihood import (
+    AnyWindows,
+    WindowsLikelihood,
+    information_at,
+    likelihood_of,
+)
 from sim2gp.identification import diagnose
 from sim2gp.identification.configurations import configuration_entries
 from sim2gp.identification.exact_posterior.importance import check_windows
@@ -53,6 +59,7 @@ from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.parameters import Parameters
 from sim2gp.project import Project
 from sim2gp.reports.motion import film
+from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.host import simulator_of
 
 #: Forecasts to draw: of which machine, and what and where they are.
@@ -63,7 +70,7 @@ _SHORTEST = 4  # windows: a film of fewer held-out ones is not worth watching
 def identification_results(
     project: Project,
     logs: Sequence[Log],
-    cuts: tuple[Windows, list[tuple[int, int]]],
+    cuts: tuple[Windows | Cuts, list[tuple[int, int]]],
     grid: Grid,
     fitted: Estimate,
     seed: int,
@@ -73,7 +80,7 @@ def identification_results(
     table, (windows, places) = project.system.parameters, cuts
     of = np.asarray([k for k, _ in places])
     known = fitted.with_measurements(table)
-    likelihood = WindowsLikelihood(project.system, windows)
+    likelihood = likelihood_of(project.system, windows)
     start = at_zero(likelihood, known, of)
     recording, robust = recording_of_windows(logs, of), project.spec.likelihood.robust
     machine = fit_forecast_machine(start, recording, robust=robust)
@@ -140,7 +147,7 @@ def _stored(
 def _identification_summary(
     project: Project,
     logs: Sequence[Log],
-    likelihood: WindowsLikelihood,
+    likelihood: AnyWindows,
     fitted: Estimate,
     honest: CorrectedFit,
     band: Band,
@@ -222,7 +229,7 @@ def _count_of_logs(logs: Sequence[Log]) -> str:
 def _noise_words(
     names: Sequence[str],
     noise: dict[str, float],
-    windows: Windows,
+    windows: Windows | Cuts,
     unit: dict[str, str],
 ) -> list[str]:
     """What the window noise contains in addition to the sensor's own."""
@@ -264,15 +271,19 @@ def _drawings(
 
 
 def held_against(
-    likelihood: WindowsLikelihood,
+    system: AbstractSystem,
+    windows: Windows | Cuts,
     fitted: Estimate,
     seed: int,
     check: bool,
     nuts: bool,
 ) -> dict[str, Any]:
     """What the exact posterior says of Laplace's, where it is asked."""
-    names, key = likelihood.system.parameters.names, jax.random.key(seed)
     out: dict[str, Any] = {}
+    if not check and not nuts:
+        return out
+    names, key = system.parameters.names, jax.random.key(seed)
+    likelihood = WindowsLikelihood(system, windows.whole())
     if check:
         checked = check_windows(likelihood, fitted, key=jax.random.fold_in(key, 2))
         out["check"] = checked.as_dict(names)

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from sim2gp.commands.folds import Fold, fit_fold, split_held_out
+from sim2gp.data.cuts import Cuts
 from sim2gp.data.grid import CURVE, Grid, steps_of
 from sim2gp.data.logs import Log
 from sim2gp.data.windows import Windows
@@ -45,7 +46,7 @@ class Unseen(NamedTuple):
 def forecast_unseen(
     project: Project,
     logs: Sequence[Log],
-    windows: Windows,
+    windows: Windows | Cuts,
     places: Sequence[tuple[int, int]],
     grid: Grid,
     whole: Estimate,

@@ -68,6 +68,11 @@ class Cuts:
         return self._sizes[0]
 
     @property
+    def most(self) -> int:
+        """Rows of the log in the window that has most."""
+        return int(np.max(self.pieces[:, 2] - self.pieces[:, 1]))
+
+    @property
     def counts(self) -> Float[np.ndarray, "W c"]:
         """Samples of each window and channel."""
         return self._sizes[2] * self.used[:, None]

@@ -75,9 +75,18 @@ class Windows(Pieces):
         return np.sum(self.mask, axis=1, dtype=float)
 
     @property
+    def most(self) -> int:
+        """Measured rows of the window that has most."""
+        return int(np.asarray(self.mask).any(axis=2).sum(axis=1).max())
+
+    @property
     def seconds(self) -> Float[np.ndarray, " W"]:
         """How long each lasts."""
         return np.asarray(self.span).sum(axis=1)
+
+    def whole(self) -> "Windows":
+        """All of them."""
+        return self
 
     def masked(self, used: Bool[np.ndarray, " W"]) -> "Windows":
         """The same, where nothing is measured in the others."""

@@ -13,7 +13,7 @@ so memory and time are linear in the data. ``w`` is one Student-t weight per win
 if off). ``window = 0`` is the paper's one-step likelihood: two rows, and ``S0 = 0``.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import equinox as eqx
@@ -23,13 +23,14 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sim2gp.compilation import compile_async
+from sim2gp.data.cuts import Cuts
 from sim2gp.data.window_slopes import HostRun, about
-from sim2gp.data.windows import Windows
+from sim2gp.data.windows import AT_A_TIME, Windows
 from sim2gp.inference.arrowhead import Blocks, Noise, eliminate
 from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.least_squares import factor
 from sim2gp.inference.likelihood import AbstractLikelihood, Trial
-from sim2gp.inference.linalg import library
+from sim2gp.inference.linalg import library, triangular
 from sim2gp.inference.linearized import value_and_jacobian
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.host import simulator_of
@@ -50,12 +51,14 @@ class WindowsLikelihood(AbstractLikelihood):
     most: int = eqx.field(static=True)  # samples of a channel in a window
 
     @in_float64
-    def __init__(self, system: AbstractSystem, windows: Windows) -> None:
+    def __init__(
+        self, system: AbstractSystem, windows: Windows, most: int | None = None
+    ) -> None:
         keep = jax.device_put if simulator_of(system) is None else np.asarray
         self.system, self.windows = system, jax.tree.map(keep, windows)
-        counts = np.sum(windows.mask, axis=1, dtype=float)
+        counts = windows.counts
         self.counts, self.floor = keep(counts), self.windows.floor
-        self.most = int(counts.max(initial=0.0))
+        self.most = int(counts.max(initial=0.0)) if most is None else most
 
     @property
     def n_nuisances(self) -> int:
@@ -68,6 +71,13 @@ class WindowsLikelihood(AbstractLikelihood):
     def some(self, which: Int[np.ndarray, " w"]) -> "WindowsLikelihood":
         """The likelihood of some of the windows, by number."""
         return WindowsLikelihood(self.system, self.windows.some(which))
+
+    def parts(
+        self, size: int | None = None
+    ) -> Iterator[tuple[Int[np.ndarray, " w"], "WindowsLikelihood"]]:
+        """All windows, and their numbers."""
+        del size
+        yield np.arange(len(self.windows)), self
 
     def thinned(self, count: int) -> "WindowsLikelihood":
         """Of a quarter as many windows, evenly spread: each has several rows."""
@@ -178,6 +188,40 @@ class WindowsLikelihood(AbstractLikelihood):
         return Noise(*jax.device_put((sd, xp.ones(len(y)))))
 
 
+class CutsLikelihood:
+    """The same of windows that are made when they are asked for."""
+
+    def __init__(self, system: AbstractSystem, windows: Cuts) -> None:
+        self.system, self.windows = system, windows
+        self.counts, self.floor = windows.counts, windows.floor
+
+    def some(self, which: Int[np.ndarray, " w"]) -> WindowsLikelihood:
+        """The likelihood of some of the windows, by number."""
+        return WindowsLikelihood(self.system, self.windows.some(which))
+
+    def parts(
+        self, size: int | None = None
+    ) -> Iterator[tuple[Int[np.ndarray, " w"], WindowsLikelihood]]:
+        """So many windows at a time, and their numbers; all parts share a program.
+
+        Windows that fill up the last part have no data.
+        """
+        size = size or max(1, AT_A_TIME // self.windows.length)
+        most = int(self.counts.max(initial=0.0))
+        for own, windows in self.windows.in_parts(size):
+            yield own, WindowsLikelihood(self.system, windows, most)
+
+
+AnyWindows = WindowsLikelihood | CutsLikelihood
+
+
+def likelihood_of(system: AbstractSystem, windows: Windows | Cuts) -> AnyWindows:
+    """That of windows as they are."""
+    if isinstance(windows, Cuts):
+        return CutsLikelihood(system, windows)
+    return WindowsLikelihood(system, windows)
+
+
 def _residual(
     windows: Windows, states: Float[AnyArray, "*W L n"]
 ) -> Float[AnyArray, "*W L c"]:
@@ -205,11 +249,11 @@ class Linearised(NamedTuple):
     input: Float[Array, "W L m"]
 
 
-def together(system: AbstractSystem, windows: Windows) -> int:
+def together(system: AbstractSystem, windows: Windows | Cuts) -> int:
     """How many of the windows to linearise at a time: all, if they are not many."""
-    (W, L), n = windows.span.shape, windows.start.shape[1]
-    each = L * n * (n + len(system.parameters))
-    return max(1, min(W, TOGETHER // max(each, 1)))
+    n = windows.start.shape[1]
+    each = windows.length * n * (n + len(system.parameters))
+    return max(1, min(len(windows), TOGETHER // max(each, 1)))
 
 
 @in_float64
@@ -225,7 +269,7 @@ def linearise(
 
 
 @in_float64
-def compile_linearise(system: AbstractSystem, windows: Windows) -> None:
+def compile_linearise(system: AbstractSystem, windows: Windows | Cuts) -> None:
     """Start to compile `linearise` for windows like these and a fit to come.
 
     For as many as are linearised at a time.
@@ -233,7 +277,8 @@ def compile_linearise(system: AbstractSystem, windows: Windows) -> None:
     if simulator_of(system) is not None:
         return  # nothing to compile: its programs are small
     size = together(system, windows)
-    windows = windows if size == len(windows) else windows.some(np.arange(size))
+    if size < len(windows) or isinstance(windows, Cuts):
+        windows = windows.some(np.arange(size))
     prior, likelihood = system.parameters.prior(), WindowsLikelihood(system, windows)
     e = jnp.zeros(windows.start.shape)
     _linearise.compile_for(likelihood, e, prior.mean, prior.scale)
@@ -270,17 +315,21 @@ def _linearise(
 
 
 def information_at(
-    likelihood: WindowsLikelihood, fitted: Estimate
+    likelihood: AnyWindows, fitted: Estimate
 ) -> Callable[[Float[Array, " p"]], Float[Array, "p p"]]:
     """The factor of the data's Fisher, whitened by the prior, at any virtual vector.
 
     The start states stay where their windows put them, the noise as it was learned.
     """
-    n = fitted.nuisances.shape[1]
+    n, size = fitted.nuisances.shape[1], together(likelihood.system, likelihood.windows)
 
     def information(tt: Float[Array, " p"]) -> Float[Array, "p p"]:
-        found = linearise(likelihood, fitted, tt)
-        return _information(found.jacobian, found.residual, fitted.noise, n)
+        factors = []
+        for own, part in likelihood.parts(size):
+            known = fitted.some(np.resize(own, len(part.counts)))
+            found = linearise(part, known, tt)
+            factors.append(_information(found.jacobian, found.residual, known.noise, n))
+        return factors[0] if len(factors) == 1 else triangular(jnp.concatenate(factors))
 
     return in_float64(information)
 

@@ -1,5 +1,6 @@
 """The posterior of a machine's parameters, from windows of its logs."""
 
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -8,12 +9,14 @@ import numpy as np
 from jaxtyping import Int
 
 from sim2gp import checks
-from sim2gp.data.windows import Windows
-from sim2gp.data.windows_likelihood import WindowsLikelihood
+from sim2gp.data.cuts import Cuts
+from sim2gp.data.windows import AT_A_TIME, Windows
+from sim2gp.data.windows_likelihood import CutsLikelihood, WindowsLikelihood
 from sim2gp.errors import NotConverged
 from sim2gp.inference.arrowhead import Noise
 from sim2gp.inference.estimate import Estimate, Report, drawn_starts, estimate
 from sim2gp.inference.gaussian import Gaussian
+from sim2gp.inference.in_parts import estimate_in_parts
 from sim2gp.inference.prior import ParameterPrior
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import Key, in_float64
@@ -29,7 +32,7 @@ FREEDOM = 4.0  # degrees of freedom of the Student-t weight
 @in_float64
 def fit_windows(
     system: AbstractSystem,
-    windows: Windows,
+    windows: Windows | Cuts,
     *,
     key: Key,
     prior: Gaussian | None = None,
@@ -45,7 +48,7 @@ def fit_windows(
     elsewhere, or at the ``warm_start``, another fit of windows like these: that is
     quick, and with as many ``starts`` compiles nothing. Where a simulator on the host
     moves the machine, ``report`` is called after each step, and starts are compared on
-    some of the windows.
+    some of the windows. `Cuts` are fitted in parts, after some of their windows.
     Raises `NotConverged`, `NotFinite` or `DeadParameters`, and `InputError` E148 for no
     starts, E140 for a prior of another number of parameters.
     """
@@ -53,6 +56,12 @@ def fit_windows(
     prior = system.parameters.prior() if prior is None else prior
     p = len(system.parameters)
     checks.same_shape("fit_windows", (p,), prior=prior.mean)
+    about = ParameterPrior(prior, system.parameters)
+    if isinstance(windows, Cuts):
+        how: dict[str, Any] = {"key": key, "robust": robust, "starts": starts}
+        known = warm_start or _fit_of_some(system, windows, prior=prior, **how)
+        found = _fit_in_parts(CutsLikelihood(system, windows), about, known, robust)
+        return _checked(found, system, len(windows))
     likelihood = WindowsLikelihood(system, windows)
     if warm_start is None:
         zeros = np.zeros if likelihood.on_host else jnp.zeros
@@ -66,7 +75,6 @@ def fit_windows(
     # By way of NumPy: JAX compiles again for numbers whose type it calls weak.
     begin = jax.device_put(jax.tree.map(np.asarray, begin))
     first, e, noise, freedom = begin
-    about = ParameterPrior(prior, system.parameters)
     same: dict[str, Any] = {"freedom": freedom, "report": report}
     some = _first_windows(likelihood) if warm_start is None else None
     if some is not None:
@@ -76,12 +84,35 @@ def fit_windows(
         noise = Noise(found.noise.sd, jnp.ones(len(windows)))
     from_here = {"starts": first, "nuisances": e, "noise": noise}
     found = estimate(likelihood, about, **from_here, **same)
+    return _checked(found, system, len(windows))
+
+
+def _checked(found: Estimate, system: AbstractSystem, count: int) -> Estimate:
+    """The estimate, if its descent has ended at a MAP; its error knows it."""
     try:
-        found.convergence.check(system.parameters.names, f"{len(windows)} windows")
+        found.convergence.check(system.parameters.names, f"{count} windows")
     except NotConverged as error:
         error.known = found
         raise
     return found
+
+
+def _fit_of_some(system: AbstractSystem, windows: Cuts, **how: Any) -> Estimate:
+    """Of windows that are spread over all; the others are at their guessed starts."""
+    W, size = len(windows), max(LEAST, AT_A_TIME // windows.length)
+    some = np.linspace(0, W - 1, min(W, size)).round().astype(int)
+    found = fit_windows(system, windows.some(some), **how)
+    e = np.zeros((W, found.nuisances.shape[1]))
+    e[some] = found.nuisances
+    return replace(found, nuisances=e, noise=Noise(found.noise.sd, np.ones(W)))
+
+
+def _fit_in_parts(
+    likelihood: CutsLikelihood, prior: ParameterPrior, first: Estimate, robust: bool
+) -> Estimate:
+    freedom = FREEDOM if robust else np.inf
+    data = likelihood.parts, likelihood.counts, likelihood.floor
+    return estimate_in_parts(*data, prior, first, freedom)
 
 
 def _first_windows(likelihood: WindowsLikelihood) -> Int[np.ndarray, " w"] | None:

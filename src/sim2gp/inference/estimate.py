@@ -150,7 +150,7 @@ def _estimate_on_host(
 
     def about(found: Progress) -> Estimate:
         args = found.noise, of_prior, counts, found.steps, found.away
-        known: Estimate = jax.device_put(_about(found.found, *args))
+        known: Estimate = jax.device_put(about_point(found.found, *args))
         return known
 
     learned = update if learn else None
@@ -160,7 +160,7 @@ def _estimate_on_host(
     return about(found)
 
 
-def _about(
+def about_point(
     found: Laplace,
     noise: Noise,
     prior: AbstractPrior,
@@ -238,7 +238,7 @@ def _estimate(
         if scales or until:
             learning = learning._replace(until=until or NEAR, still=STILL)
     at, noise, prior, steps, _ = multi_start(likelihood, prior, *start, learning)
-    return _about(laplace(at, noise), noise, prior, counts, steps)
+    return about_point(laplace(at, noise), noise, prior, counts, steps)
 
 
 def _is_scaled(prior: AbstractPrior) -> TypeGuard[ParameterPrior]:

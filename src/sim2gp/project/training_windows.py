@@ -4,10 +4,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sim2gp.data.cuts import Cuts
 from sim2gp.data.logs import Log
-from sim2gp.data.split_log import cut
+from sim2gp.data.split_log import cuts_of
 from sim2gp.data.windows import Windows
 from sim2gp.project import Project
+from sim2gp.systems.host import simulator_of
+
+#: Rows of windows, steps of their simulation included, that are fitted all at once.
+MANY = 500_000
 
 
 def cut_logs(
@@ -25,10 +30,25 @@ def cut_places(
 
     Or so many ``times`` as long.
     """
+    cuts = _cuts(project, logs, times)
+    return cuts.whole(), cuts.places
+
+
+def cut_for_fit(
+    project: Project, logs: Sequence[Log]
+) -> tuple[Windows | Cuts, list[tuple[int, int]]]:
+    """As `cut_places`; of so many rows that they are fitted in parts, as `Cuts`."""
+    cuts = _cuts(project, logs)
+    few = len(cuts) * cuts.length <= MANY
+    whole = few or simulator_of(project.system) is not None
+    return cuts.whole() if whole else cuts, cuts.places
+
+
+def _cuts(project: Project, logs: Sequence[Log], times: float = 1.0) -> Cuts:
     stated = project.spec.likelihood
     names = [channel.name for channel in project.system.physical_states]
     measured = [n for n in names if any(n in log.channels for log in logs)]
-    return cut(
+    return cuts_of(
         logs,
         project.system,
         window=times * stated.window,

@@ -175,11 +175,10 @@ def _helpful(fit: AtZero, recording: Int[np.ndarray, " W"]) -> dict[str, float]:
     """Scales of the kinds that predict recordings left out."""
     if not fit.forces:
         return {}
-    windows, whole, own = fit.likelihood.windows, fit.fitted, fit.own
-    rows = fit.rows
+    whole, own, rows = fit.fitted, fit.own, fit.rows
     if not rows.finite:
         return {}
-    data = np.asarray(windows.mask).any(axis=(1, 2))
+    data = np.asarray(fit.likelihood.counts).any(axis=1)
     seen = np.logical_or.reduceat(data, rows.first)
     factors, part = rows.factors[seen], recordings_or_parts(recording[rows.first][seen])
     k = factors.shape[-1]

@@ -12,6 +12,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from sim2gp.data.cuts import Cuts
 from sim2gp.data.grid import CURVE, PERIOD, Grid, steps_of
 from sim2gp.data.logs import Log
 from sim2gp.data.windows import Windows
@@ -31,7 +32,7 @@ def recording_names(logs: Sequence[Log]) -> list[str]:
     return [log.source for log in logs]
 
 
-def channels(system: AbstractSystem, windows: Windows) -> list[str]:
+def channels(system: AbstractSystem, windows: Windows | Cuts) -> list[str]:
     """Names of the measured states, in the windows' order."""
     return [system.physical_states[i].name for i in windows.outputs]
 

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.linalg import eigh
 
+from sim2gp.data.cuts import Cuts
 from sim2gp.data.windows import Windows
 from sim2gp.data.windows_likelihood import compile_linearise
 from sim2gp.identification.intervals.averaging import Groups
@@ -51,7 +52,7 @@ ROUNDS = 6  # linearisations
 SETTLED = 0.1  # of its sd: no parameter's centre moves by more than this
 
 
-def compile_corrected(system: AbstractSystem, cut: Windows) -> None:
+def compile_corrected(system: AbstractSystem, cut: Windows | Cuts) -> None:
     """Start to compile what `corrected_windows` will ask, while a fit goes on.
 
     The machine's own linearisation, which others ask, too, comes first.

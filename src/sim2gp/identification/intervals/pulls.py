@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from sim2gp.data.windows_likelihood import (
+    AnyWindows,
     WindowsLikelihood,
     linearise,
     together,
@@ -92,7 +93,7 @@ class Pulls:
 
 @in_float64
 def pulls_of_windows(
-    likelihood: WindowsLikelihood, fitted: Estimate, group: Int[np.ndarray, " W"]
+    likelihood: AnyWindows, fitted: Estimate, group: Int[np.ndarray, " W"]
 ) -> Pulls:
     """Of a fit and its windows, start states eliminated; ``group`` numbers their logs.
 
@@ -111,7 +112,7 @@ def pulls_of_rows(rows: WindowRows, group: Int[np.ndarray, " W"]) -> Pulls:
 
 
 def rows_of(
-    likelihood: WindowsLikelihood,
+    likelihood: AnyWindows,
     fitted: Estimate,
     tt: Array,
     group: Int[np.ndarray, " W"],
@@ -122,7 +123,7 @@ def rows_of(
     are large. Of more windows than `MOST` runs of one ``group``.
     """
     W, size = len(likelihood.windows), together(likelihood.system, likelihood.windows)
-    most = int(np.asarray(likelihood.windows.mask).any(axis=2).sum(axis=1).max())
+    most = likelihood.windows.most
     found, count = [], -(-W // MOST)
     for begin in range(0, W, size):
         own = np.arange(begin, min(begin + size, W))
@@ -134,14 +135,14 @@ def rows_of(
 
 
 def _some_rows(
-    likelihood: WindowsLikelihood,
+    likelihood: AnyWindows,
     fitted: Estimate,
     tt: Array,
     which: Int[np.ndarray, " w"],
     most: int,
 ) -> tuple[Float[np.ndarray, "w q p1"], Float[np.ndarray, " w"]]:
     """Factors and costs of some windows, none with more than ``most`` measured rows."""
-    if len(which) < len(fitted.nuisances):
+    if not isinstance(likelihood, WindowsLikelihood) or len(which) < len(fitted.scores):
         likelihood, fitted = likelihood.some(which), fitted.some(which)
     e, p = np.asarray(fitted.nuisances), fitted.prior.mean.size
     n = e.shape[1]

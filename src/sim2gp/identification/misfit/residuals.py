@@ -14,6 +14,7 @@ from sim2gp.data.one_step import OneStepLikelihood, compiled_rows
 from sim2gp.data.transitions import earlier_inputs, episode_numbers
 from sim2gp.data.windows import Windows
 from sim2gp.data.windows_likelihood import (
+    AnyWindows,
     WindowsLikelihood,
     linearise,
     together,
@@ -55,14 +56,14 @@ def misfit_of_transitions(
 
 
 @in_float64
-def misfit_of_windows(likelihood: WindowsLikelihood, fitted: Estimate) -> Misfit:
+def misfit_of_windows(likelihood: AnyWindows, fitted: Estimate) -> Misfit:
     """Of a fit and its windows; of very many, of some that are evenly spread.
 
     One-step windows have no start state of their own, and are tested as transitions.
     """
     system, W = likelihood.system, len(likelihood.windows)
     size = together(system, likelihood.windows)
-    if size < W:
+    if size < W or not isinstance(likelihood, WindowsLikelihood):
         which = np.linspace(0, W - 1, size).round().astype(int)
         likelihood, fitted = likelihood.some(which), fitted.some(which)
     cut = likelihood.windows

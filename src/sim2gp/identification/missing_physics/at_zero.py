@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
-from sim2gp.data.windows_likelihood import WindowsLikelihood
+from sim2gp.data.windows_likelihood import AnyWindows, likelihood_of
 from sim2gp.identification.intervals.pulls import WindowRows, rows_of
 from sim2gp.identification.missing_physics.reach import Range, box_of
 from sim2gp.inference.estimate import Estimate
@@ -36,7 +36,7 @@ class AtZero:
 
     machine: AbstractSystem
     alone: Estimate
-    likelihood: WindowsLikelihood
+    likelihood: AnyWindows
     fitted: Estimate
     group: Int[np.ndarray, " W"]
     own: Int[np.ndarray, " p"]
@@ -52,7 +52,7 @@ class AtZero:
 
 @in_float64
 def at_zero(
-    likelihood: WindowsLikelihood,
+    likelihood: AnyWindows,
     fitted: Estimate,
     group: Int[np.ndarray, " W"],
     forces: Sequence[AbstractUnknownFunction] | None = None,
@@ -65,7 +65,7 @@ def at_zero(
     box = box_of(machine, cut)
     given = forces_of(machine, box) if forces is None else tuple(forces)
     system, whole, own = forces_at_zero(machine, fitted, given)
-    wider = WindowsLikelihood(system, cut)
+    wider = likelihood_of(system, cut)
     group = np.asarray(group)
     return AtZero(machine, fitted, wider, whole, group, own, given, box)
 

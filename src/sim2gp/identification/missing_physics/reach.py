@@ -5,7 +5,8 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sim2gp.data.windows import Windows
+from sim2gp.data.cuts import Cuts
+from sim2gp.data.windows import AT_A_TIME, Windows
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.types import AnyArray
 
@@ -13,7 +14,7 @@ SPAN = 0.05  # s over which a velocity is a difference of positions
 Range = tuple[float, float]
 
 
-def box_of(system: AbstractSystem, windows: Windows) -> dict[str, Range]:
+def box_of(system: AbstractSystem, windows: Windows | Cuts) -> dict[str, Range]:
     """The range of each channel; of one that no recording tells, its limits, or one.
 
     Ends are rounded outwards: recordings that are alike share a program that has them
@@ -23,20 +24,30 @@ def box_of(system: AbstractSystem, windows: Windows) -> dict[str, Range]:
     limits = {c.name: (c.low, c.high) for c in channels}
     unlimited = (-1.0, 1.0)
     found = {k: x if np.isfinite(x).all() else unlimited for k, x in limits.items()}
-    names = [c.name for c in system.physical_states]
+    seen: dict[str, list[float]] = {}
+    for _, some in windows.in_parts(max(1, AT_A_TIME // windows.length)):
+        for name, values in _visited(system, some).items():
+            if values.size:
+                ends = [float(np.min(values)), float(np.max(values))]
+                seen[name] = [*seen.get(name, []), *ends]
+    return found | {name: _rounded(np.asarray(ends)) for name, ends in seen.items()}
+
+
+def _visited(
+    system: AbstractSystem, windows: Windows
+) -> dict[str, Float[np.ndarray, "*k"]]:
+    """Values of each channel that windows tell of, and of inputs without limits."""
+    names, found = [c.name for c in system.physical_states], {}
     y, known = np.asarray(windows.y), np.asarray(windows.mask)
     time = np.cumsum(np.asarray(windows.span), axis=1)
     for k, i in enumerate(windows.outputs):
-        if not known[..., k].any():
-            continue
-        found[names[i]] = _rounded(y[..., k][known[..., k]])
+        found[names[i]] = y[..., k][known[..., k]]
         rate = f"{names[i]}.velocity"
         if rate in names and names.index(rate) not in windows.outputs:
-            speeds = _speeds(y[..., k], known[..., k], time)
-            found |= {rate: _rounded(speeds)} if speeds.size else {}
+            found[rate] = _speeds(y[..., k], known[..., k], time)
     for j, channel in enumerate(system.actions):
         if not math.isfinite(channel.low + channel.high):
-            found[channel.name] = _rounded(_inputs(windows)[..., j])
+            found[channel.name] = _inputs(windows)[..., j]
     return found
 
 
