@@ -25,7 +25,7 @@ from sim2gp.systems.base import LONGEST_MEAN, AbstractSystem
 PERIOD = 2e-3  # s
 SAMPLES = 25  # of the filter
 ORDER = 2
-MOST = 20_000  # windows: of longer logs they start further apart
+MOST = 10_000  # windows: of longer logs they start further apart
 CURVE = tuple(round(0.1 * k, 1) for k in range(1, 11))  # s, horizons of the error curve
 
 
@@ -55,7 +55,7 @@ def evaluation_windows(
     """Windows of up to ``longest`` seconds of all logs; rows are grid samples.
 
     A window whose start rests on a masked sample is left out; a masked row is not
-    compared. Of logs of more than 2,000 s together they start further apart.
+    compared. Of logs of more than 1,000 s together they start further apart.
     Raises `InputError` E148 for a length that is not positive.
     """
     checks.positive("evaluation_windows", longest=longest)

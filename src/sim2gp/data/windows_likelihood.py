@@ -37,8 +37,8 @@ from sim2gp.systems.host import simulator_of
 from sim2gp.systems.simulate import inputs_of, simulate
 from sim2gp.types import AnyArray, in_float64
 
-#: Derivatives of windows that are in memory at once (256 MiB).
-TOGETHER = 2**25
+#: Derivatives of windows that are in memory at once (64 MiB).
+TOGETHER = 2**23
 
 
 class WindowsLikelihood(AbstractLikelihood):

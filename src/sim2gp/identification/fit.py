@@ -102,9 +102,9 @@ def _fit_of_some(system: AbstractSystem, windows: Cuts, **how: Any) -> Estimate:
     W, size = len(windows), max(LEAST, AT_A_TIME // windows.length)
     some = np.linspace(0, W - 1, min(W, size)).round().astype(int)
     found = fit_windows(system, windows.some(some), **how)
-    e = np.zeros((W, found.nuisances.shape[1]))
-    e[some] = found.nuisances
-    return replace(found, nuisances=e, noise=Noise(found.noise.sd, np.ones(W)))
+    e, scores = (np.zeros((W, x.shape[1])) for x in (found.nuisances, found.scores))
+    e[some], noise = found.nuisances, Noise(found.noise.sd, np.ones(W))
+    return replace(found, nuisances=e, noise=noise, scores=scores)
 
 
 def _fit_in_parts(

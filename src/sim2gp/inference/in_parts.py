@@ -101,7 +101,8 @@ def _passed(
     cost = sum(x.at.cost for x in each) + 0.5 * offset @ offset
     by_z = sum(x.at.by_z for x in each) + rows[:, :-1].T @ offset
     by_e, scores = joined(lambda x: x.at.by_e), joined(lambda x: x.at.scores)
-    at = Point(np.asarray(z), e, each[0].at.blocks, rows, cost, by_z, by_e, scores)
+    none = joined(lambda x: x.at.blocks)
+    at = Point(np.asarray(z), e, none, rows, cost, by_z, by_e, scores)
     data = triangular(joined(lambda x: x.arrow.data))
     R11, slope = joined(lambda x: x.arrow.R11), joined(lambda x: x.arrow.slope)
     squares, spread = joined(lambda x: x.squares), joined(lambda x: x.spread)
@@ -123,7 +124,7 @@ def _linearised(
     arrow = eliminate(at.blocks, e, noise)
     squares = Laplace(at, arrow, full).squares()
     # The factors of all windows are what does not fit into memory.
-    at = eqx.tree_at(lambda at: at.blocks, at, at.blocks[:0])
+    at = eqx.tree_at(lambda at: at.blocks, at, at.blocks[:, :, :0])
     return _Part(at, arrow, *squares)
 
 
@@ -134,7 +135,7 @@ def _of_windows(part: _Part, count: int) -> _Part:
         return x[:count]
 
     at, arrow = part.at, part.arrow
-    own = lambda at: (at.e, at.by_e, at.scores)  # noqa: E731
+    own = lambda at: (at.e, at.blocks, at.by_e, at.scores)  # noqa: E731
     at = eqx.tree_at(own, at, tuple(map(cut, own(at))))
     arrow = Elimination(arrow.data, cut(arrow.R11), cut(arrow.slope))
     return _Part(at, arrow, cut(part.squares), cut(part.spread))

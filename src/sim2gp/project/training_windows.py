@@ -12,7 +12,7 @@ from sim2gp.project import Project
 from sim2gp.systems.host import simulator_of
 
 #: Rows of windows, steps of their simulation included, that are fitted all at once.
-MANY = 500_000
+MANY = 100_000
 
 
 def cut_logs(

@@ -23,8 +23,9 @@ from sim2gp.identification.misfit.tests import must_be_finite
 from sim2gp.inference.estimate import Estimate
 from sim2gp.types import in_float64
 
-#: Of more windows, successive ones are one: as many say how far they scatter.
-MOST = 4096
+#: Of more windows, successive ones are one: as many say how far they scatter. Numbers
+#: that the factors of all may have (64 MiB): of hundreds of forces they are large.
+MOST, ROOM = 4096, 2**23
 
 
 class WindowRows(NamedTuple):
@@ -120,11 +121,12 @@ def rows_of(
     """The windows at virtual values ``tt``, from the starts of the fit.
 
     Some windows at a time, all as many: of hundreds of forces all derivatives at once
-    are large. Of more windows than `MOST` runs of one ``group``.
+    are large. Of more windows than `MOST` runs of one ``group``, or than have `ROOM`.
     """
     W, size = len(likelihood.windows), together(likelihood.system, likelihood.windows)
     most = likelihood.windows.most
-    found, count = [], -(-W // MOST)
+    runs = max(1, min(MOST, ROOM // (fitted.prior.mean.size + 1) ** 2))
+    found, count = [], -(-W // runs)
     for begin in range(0, W, size):
         own = np.arange(begin, min(begin + size, W))
         some = _some_rows(likelihood, fitted, tt, np.resize(own, size), most)
