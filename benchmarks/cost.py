@@ -21,8 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import matplotlib
-import mujoco
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -46,9 +44,6 @@ from sim2gp.planning.tasks import cartpole_swingup, furuta_swingup  # noqa: E402
 from sim2gp.project import load_project  # noqa: E402
 from sim2gp.project.training_windows import cut_places  # noqa: E402
 from sim2gp.systems import Furuta, UniformRodArm  # noqa: E402
-
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt  # noqa: E402
 
 Job = tuple[int, Callable[[], object]]
 TURNS, LAST = 3, 3  # calls of a size; sizes that an exponent rests on
@@ -83,6 +78,8 @@ def _arms(count: int) -> list[Any]:
 
 def constants() -> Iterator[Job]:
     """Fits of a log of twelve joints with so many constants open."""
+    import mujoco
+
     paths = [q.format(k) for q in QUANTITIES for k in range(1, JOINTS + 1)]
     with tempfile.TemporaryDirectory() as name:
         folder, model = Path(name), servo_arm.model_text(arms=2)
@@ -157,6 +154,11 @@ def exponent(sizes: list[int], times: list[float]) -> float:
 
 def draw(curves: dict[str, Any], out: Path) -> None:
     """A panel for each curve, both axes logarithmic."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
     figure, axes = plt.subplots(1, len(curves), figsize=(2.6 * len(curves), 2.6))
     for axis, (name, curve) in zip(np.atleast_1d(axes), curves.items(), strict=True):
         axis.loglog(curve["sizes"], curve["seconds"], "o-", color="#1f77b4")

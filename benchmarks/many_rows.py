@@ -113,6 +113,7 @@ def main() -> None:
     if given.one:
         print(json.dumps(identified(given.one, at_once=given.at_once)))
         return
+    given.out.mkdir(parents=True, exist_ok=True)
     target = given.out / "many_rows.json"
     found = json.loads(target.read_text()) if target.exists() else {}
     for rows in given.rows:

@@ -72,7 +72,7 @@ class Windows(Pieces):
     @property
     def counts(self) -> Float[np.ndarray, "W c"]:
         """Samples of each window and channel."""
-        return np.sum(self.mask, axis=1, dtype=float)
+        return np.asarray(np.asarray(self.mask).sum(axis=1), float)
 
     @property
     def most(self) -> int:
