@@ -26,15 +26,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
 import servo_arm  # noqa: E402
-from interval_arms import (  # noqa: E402
-    CONDITIONS,
-    NOISE,
-    PERIOD,
-    Recordings,
-    flown,
-    multisine,
-    physical,
-)
+from many_rows import EACH, logs_of  # noqa: E402
 from sim2gp.commands.bench_jobs import plan, random_rows  # noqa: E402
 from sim2gp.data.split_log import cut  # noqa: E402
 from sim2gp.identification.fit import fit_windows  # noqa: E402
@@ -57,23 +49,11 @@ QUANTITIES = (
 
 
 def rows(most: int) -> Iterator[Job]:
-    """Fits of so many rows in logs of 1,000."""
-    for count in (10**k for k in range(3, 9)):
+    """Fits of so many rows, in logs of 2,000."""
+    for count in (EACH * 10**k for k in range(5)):
         if count <= most:
-            logs = _arms(count // 1000)
-            windows, _ = cut(logs, UniformRodArm(), window=WINDOW)
+            windows, _ = cut(logs_of(count)[1], UniformRodArm(), window=WINDOW)
             yield count, lambda w=windows: _fit(UniformRodArm(), w)
-
-
-def _arms(count: int) -> list[Any]:
-    """Logs of ten seconds of one arm, each with its own torques."""
-    rng = np.random.default_rng(0)
-    values = np.repeat(rng.standard_normal((1, 4)), count, axis=0)
-    torque = multisine(rng, 1000 * PERIOD, count)
-    angles = flown(physical(values), torque, CONDITIONS["white"])[..., :2]
-    angles = angles + NOISE * rng.standard_normal(angles.shape)
-    found = Recordings(values, torque, angles)
-    return [found.log(s) for s in range(count)]
 
 
 def constants() -> Iterator[Job]:
@@ -175,7 +155,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     made = {f.__name__: f for f in (rows, constants, sequences, steps, features)}
     parser.add_argument("--only", nargs="*", choices=[*made], default=[*made])
-    parser.add_argument("--rows", type=int, default=100_000, help="at most")
+    parser.add_argument("--rows", type=int, default=200_000, help="at most")
     parser.add_argument("--out", type=Path, default=ROOT / "results" / "cost")
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
