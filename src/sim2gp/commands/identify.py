@@ -78,8 +78,8 @@ def identify(
         )
         summary, arrays, honest = found
         task.advance("forecasts")
-        of = project.system, windows
-        summary |= results.held_against(*of, fitted, seed, check, nuts)
+        asked = fitted, seed, check, nuts
+        summary |= results.held_against(project.system, windows, *asked)
         if longer:
             progress.say("fitting longer windows")
         alarm = summary["misfit"]["alarm"]

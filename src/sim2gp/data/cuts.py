@@ -5,7 +5,7 @@ steps of their simulation and their inputs they are several times the logs. `Cut
 what a fit in parts needs of them: some, all as large, one part after the other.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sim2gp.data.logs import Log
-from sim2gp.data.windows import Windows
+from sim2gp.data.windows import Windows, parts_of
 from sim2gp.systems.base import DELAY_BLUR, AbstractSystem, steps_in
 
 
@@ -97,14 +97,8 @@ class Cuts:
         return replace(self, used=self.used & used)
 
     def in_parts(self, size: int) -> Iterator[tuple[Int[np.ndarray, " w"], Windows]]:
-        """So many windows at a time, and their numbers.
-
-        The last part is filled up with windows in which nothing is measured.
-        """
-        for begin in range(0, len(self), size):
-            own = np.arange(begin, min(begin + size, len(self)))
-            windows = self.some(np.resize(own, size))
-            yield own, windows.masked(np.arange(size) < len(own))
+        """So many windows at a time, and their numbers (`parts_of`)."""
+        yield from parts_of(self.some, len(self), size)
 
     def some(self, which: Bool[np.ndarray, " W"] | Int[np.ndarray, " w"]) -> Windows:
         """The windows chosen by a mask or by number."""
@@ -179,7 +173,7 @@ def integration_steps(
 
 
 def inputs_since(
-    held: Mapping[int, tuple[np.ndarray, np.ndarray]] | Sequence[tuple],
+    held: Sequence[tuple[np.ndarray, np.ndarray]],
     spans: Sequence[tuple[int, float, float]],
     delay: float,
 ) -> tuple[Float[np.ndarray, "W H"], Float[np.ndarray, "W H m"]]:

@@ -95,8 +95,11 @@ class Windows(Pieces):
         return found
 
     def in_parts(self, size: int) -> Iterator[tuple[Int[np.ndarray, " w"], "Windows"]]:
-        """All of them, and their numbers."""
-        yield np.arange(len(self)), self
+        """So many windows at a time, and their numbers (`parts_of`)."""
+        if size >= len(self):
+            yield np.arange(len(self)), self
+        else:
+            yield from parts_of(self.some, len(self), size)
 
     def some(self, which: Bool[np.ndarray, " W"] | Int[np.ndarray, " w"]) -> "Windows":
         """The windows chosen by a mask or by number; the floor belongs to all."""
@@ -115,6 +118,20 @@ class Windows(Pieces):
         floor = jnp.broadcast_to(self.floor, (len(self), self.floor.size))
         whole: Windows = eqx.tree_at(lambda w: w.floor, self, floor)
         return whole
+
+
+def parts_of(
+    some: Callable[[Int[np.ndarray, " w"]], Windows], count: int, size: int
+) -> Iterator[tuple[Int[np.ndarray, " w"], Windows]]:
+    """So many of ``count`` windows at a time, and their numbers: all parts as large.
+
+    ``some`` gives windows by number. The last part is filled up with windows in which
+    nothing is measured.
+    """
+    for begin in range(0, count, size):
+        own = np.arange(begin, min(begin + size, count))
+        windows = some(np.resize(own, size))
+        yield own, windows.masked(np.arange(size) < len(own))
 
 
 def channel_motion(windows: Windows) -> Float[np.ndarray, "W c"]:

@@ -73,11 +73,14 @@ class WindowsLikelihood(AbstractLikelihood):
         return WindowsLikelihood(self.system, self.windows.some(which))
 
     def parts(
-        self, size: int | None = None
+        self, size: int
     ) -> Iterator[tuple[Int[np.ndarray, " w"], "WindowsLikelihood"]]:
-        """All windows, and their numbers."""
-        del size
-        yield np.arange(len(self.windows)), self
+        """So many windows at a time, and their numbers (`parts_of`)."""
+        if size >= len(self.windows):
+            yield np.arange(len(self.windows)), self
+            return
+        for own, windows in self.windows.in_parts(size):
+            yield own, WindowsLikelihood(self.system, windows, self.most)
 
     def thinned(self, count: int) -> "WindowsLikelihood":
         """Of a quarter as many windows, evenly spread: each has several rows."""
@@ -202,9 +205,9 @@ class CutsLikelihood:
     def parts(
         self, size: int | None = None
     ) -> Iterator[tuple[Int[np.ndarray, " w"], WindowsLikelihood]]:
-        """So many windows at a time, and their numbers; all parts share a program.
+        """So many windows at a time, and their numbers (`parts_of`).
 
-        Windows that fill up the last part have no data.
+        All parts share a program.
         """
         size = size or max(1, AT_A_TIME // self.windows.length)
         most = int(self.counts.max(initial=0.0))
@@ -276,11 +279,9 @@ def compile_linearise(system: AbstractSystem, windows: Windows | Cuts) -> None:
     """
     if simulator_of(system) is not None:
         return  # nothing to compile: its programs are small
-    size = together(system, windows)
-    if size < len(windows) or isinstance(windows, Cuts):
-        windows = windows.some(np.arange(size))
-    prior, likelihood = system.parameters.prior(), WindowsLikelihood(system, windows)
-    e = jnp.zeros(windows.start.shape)
+    size, prior = together(system, windows), system.parameters.prior()
+    _, likelihood = next(likelihood_of(system, windows).parts(size))
+    e = jnp.zeros(likelihood.windows.start.shape)
     _linearise.compile_for(likelihood, e, prior.mean, prior.scale)
 
 

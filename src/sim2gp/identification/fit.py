@@ -57,10 +57,12 @@ def fit_windows(
     p = len(system.parameters)
     checks.same_shape("fit_windows", (p,), prior=prior.mean)
     about = ParameterPrior(prior, system.parameters)
+    freedom = FREEDOM if robust else np.inf
     if isinstance(windows, Cuts):
         how: dict[str, Any] = {"key": key, "robust": robust, "starts": starts}
         known = warm_start or _fit_of_some(system, windows, prior=prior, **how)
-        found = _fit_in_parts(CutsLikelihood(system, windows), about, known, robust)
+        data = CutsLikelihood(system, windows)
+        found = estimate_in_parts(data, about, known, freedom)
         return _checked(found, system, len(windows))
     likelihood = WindowsLikelihood(system, windows)
     if warm_start is None:
@@ -71,7 +73,7 @@ def fit_windows(
         z = prior.whitened(warm_start.posterior.mean)
         first = jnp.full((starts, p), jnp.nan).at[0].set(z)
         e, noise = warm_start.nuisances, warm_start.noise
-    begin = first, e, noise, FREEDOM if robust else np.inf
+    begin = first, e, noise, freedom
     # By way of NumPy: JAX compiles again for numbers whose type it calls weak.
     begin = jax.device_put(jax.tree.map(np.asarray, begin))
     first, e, noise, freedom = begin
@@ -105,14 +107,6 @@ def _fit_of_some(system: AbstractSystem, windows: Cuts, **how: Any) -> Estimate:
     e, scores = (np.zeros((W, x.shape[1])) for x in (found.nuisances, found.scores))
     e[some], noise = found.nuisances, Noise(found.noise.sd, np.ones(W))
     return replace(found, nuisances=e, noise=noise, scores=scores)
-
-
-def _fit_in_parts(
-    likelihood: CutsLikelihood, prior: ParameterPrior, first: Estimate, robust: bool
-) -> Estimate:
-    freedom = FREEDOM if robust else np.inf
-    data = likelihood.parts, likelihood.counts, likelihood.floor
-    return estimate_in_parts(*data, prior, first, freedom)
 
 
 def _first_windows(likelihood: WindowsLikelihood) -> Int[np.ndarray, " w"] | None:

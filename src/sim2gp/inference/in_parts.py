@@ -7,8 +7,8 @@ step of EM for the noise. Steps are not damped: the first fit, of some of the da
 near. Where passes rest, the estimate is that of all data at once.
 """
 
-from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from collections.abc import Iterator
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from sim2gp.inference.arrowhead import Elimination, Noise, eliminate
+from sim2gp.inference.arrowhead import Blocks, Elimination, Noise, eliminate
 from sim2gp.inference.estimate import Estimate, about_point
 from sim2gp.inference.laplace import Laplace, expected_noise
 from sim2gp.inference.least_squares import Factor, gauss_newton_step, stack
@@ -24,33 +24,48 @@ from sim2gp.inference.levenberg_marquardt import Point, blocks_of, point
 from sim2gp.inference.likelihood import AbstractLikelihood
 from sim2gp.inference.linalg import triangular
 from sim2gp.inference.prior import AbstractPrior
-from sim2gp.types import AnyArray, in_float64
+from sim2gp.types import AnyArray, AnyScalar, in_float64
 
 #: Passes at most; Newton's step in posterior sd, and the noise's relative change, where
 #: they end.
 MOST, SHORT, STILL = 50, 1e-9, 1e-7
 
-#: Windows by number, all parts as many (fewer in the last), and their likelihood.
-Parts = Callable[[], Iterator[tuple[Int[np.ndarray, " w"], AbstractLikelihood]]]
+
+@runtime_checkable
+class DataInParts(Protocol):
+    """Data of `AbstractLikelihood`, as likelihoods of some windows after the other."""
+
+    counts: Float[np.ndarray, "W c"]
+    floor: Float[np.ndarray, " c"]
+
+    def parts(self) -> Iterator[tuple[Int[np.ndarray, " w"], AbstractLikelihood]]:
+        """Numbers of windows, and their likelihood; the last is filled up."""
 
 
-class _Part(NamedTuple):
-    """A part linearised; ``squares`` and ``spread`` are those of `Laplace.squares`."""
+class _OfWindows(NamedTuple):
+    """What is kept of each window: of `Point`, `Elimination` and `Laplace.squares`."""
 
-    at: Point
-    arrow: Elimination
+    blocks: Blocks
+    by_e: Float[AnyArray, "W n"]
+    scores: Float[AnyArray, "W p"]
+    R11: Float[AnyArray, "W n n"]
+    slope: Float[AnyArray, "W n p1"]
     squares: Float[AnyArray, "W c"]
     spread: Float[AnyArray, "W c"]
 
 
+class _Part(NamedTuple):
+    """A part linearised, without the prior."""
+
+    cost: AnyScalar
+    by_z: Float[AnyArray, " p"]
+    data: Factor
+    windows: _OfWindows
+
+
 @in_float64
 def estimate_in_parts(
-    parts: Parts,
-    counts: Float[np.ndarray, "W c"],
-    floor: Float[np.ndarray, " c"],
-    prior: AbstractPrior,
-    first: Estimate,
-    freedom: float,
+    data: DataInParts, prior: AbstractPrior, first: Estimate, freedom: float
 ) -> Estimate:
     """From ``first``, a fit of some of the data with nuisances and weights of all.
 
@@ -63,50 +78,47 @@ def estimate_in_parts(
     full, change, steps = np.pad(R, (0, 1)), np.inf, 0
     while steps < MOST:
         steps += 1
-        at, arrow, squares, spread = _passed(parts, prior, z, e, noise, full)
-        found = Laplace(at, arrow, stack(arrow.data, at.prior))
+        found, squares = _passed(data, prior, z, e, noise, full)
         if found.newton_step_sd() <= SHORT and change <= STILL:
             break
-        learned = expected_noise(noise, squares, spread, counts, floor, freedom)
+        learned = expected_noise(noise, *squares, data.counts, data.floor, freedom)
         change = np.max(np.abs(np.log(learned.sd / noise.sd)))
         dz = gauss_newton_step(found.full)
-        e = e - (arrow.slope[..., -1] + arrow.slope[..., :-1] @ dz)
+        slope = found.arrow.slope
+        e = e - (slope[..., -1] + slope[..., :-1] @ dz)
         z, noise, full = z + dz, learned, found.full
-    ended: Estimate = jax.device_put(about_point(found, noise, prior, counts, steps))
-    return ended
+    ended = about_point(found, noise, prior, data.counts, steps)
+    known: Estimate = jax.device_put(ended)
+    return known
 
 
 def _passed(
-    parts: Parts,
+    data: DataInParts,
     prior: AbstractPrior,
     z: Float[AnyArray, " p"],
     e: Float[np.ndarray, "W n"],
     noise: Noise,
     full: Factor,
-) -> _Part:
-    """All parts linearised, and put together with the prior."""
-    each: list[_Part] = []
-    for own, likelihood in parts():
-        size = len(likelihood.counts)
-        which = np.resize(own, size)
+) -> tuple[Laplace, tuple[Float[np.ndarray, "W c"], Float[np.ndarray, "W c"]]]:
+    """All parts linearised and put together with the prior; `Laplace.squares`."""
+    parts: list[_Part] = []
+    for own, likelihood in data.parts():
+        which = np.resize(own, len(likelihood.counts))
         here = Noise(noise.sd, noise.weights[which])
-        found = _linearised(likelihood, prior, z, e[which], here, full)
-        each.append(_of_windows(jax.device_get(found), len(own)))
+        part = jax.device_get(_linearised(likelihood, prior, z, e[which], here, full))
+        kept = slice(len(own))
+        windows = jax.tree.map(lambda x, kept=kept: x[kept], part.windows)
+        parts.append(part._replace(windows=windows))
+    each = jax.tree.map(lambda *x: np.concatenate(x), *(x.windows for x in parts))
     rows = np.asarray(prior.rows(z))
     offset = rows[:, -1]
-
-    def joined(get: Callable[[_Part], AnyArray]) -> np.ndarray:
-        return np.concatenate([get(x) for x in each])
-
-    cost = sum(x.at.cost for x in each) + 0.5 * offset @ offset
-    by_z = sum(x.at.by_z for x in each) + rows[:, :-1].T @ offset
-    by_e, scores = joined(lambda x: x.at.by_e), joined(lambda x: x.at.scores)
-    none = joined(lambda x: x.at.blocks)
-    at = Point(np.asarray(z), e, none, rows, cost, by_z, by_e, scores)
-    data = triangular(joined(lambda x: x.arrow.data))
-    R11, slope = joined(lambda x: x.arrow.R11), joined(lambda x: x.arrow.slope)
-    squares, spread = joined(lambda x: x.squares), joined(lambda x: x.spread)
-    return _Part(at, Elimination(data, R11, slope), squares, spread)
+    cost = sum(x.cost for x in parts) + 0.5 * offset @ offset
+    by_z = sum(x.by_z for x in parts) + rows[:, :-1].T @ offset
+    z = np.asarray(z)
+    at = Point(z, e, each.blocks, rows, cost, by_z, each.by_e, each.scores)
+    R = stack(*(x.data for x in parts))
+    found = Laplace(at, Elimination(R, each.R11, each.slope), stack(R, rows))
+    return found, (each.squares, each.spread)
 
 
 @eqx.filter_jit
@@ -124,18 +136,6 @@ def _linearised(
     arrow = eliminate(at.blocks, e, noise)
     squares = Laplace(at, arrow, full).squares()
     # The factors of all windows are what does not fit into memory.
-    at = eqx.tree_at(lambda at: at.blocks, at, at.blocks[:, :, :0])
-    return _Part(at, arrow, *squares)
-
-
-def _of_windows(part: _Part, count: int) -> _Part:
-    """The first windows; the others fill up a part, and nothing is measured in them."""
-
-    def cut(x: AnyArray) -> AnyArray:
-        return x[:count]
-
-    at, arrow = part.at, part.arrow
-    own = lambda at: (at.e, at.blocks, at.by_e, at.scores)  # noqa: E731
-    at = eqx.tree_at(own, at, tuple(map(cut, own(at))))
-    arrow = Elimination(arrow.data, cut(arrow.R11), cut(arrow.slope))
-    return _Part(at, arrow, cut(part.squares), cut(part.spread))
+    none = at.blocks[:, :, :0]
+    own = _OfWindows(none, at.by_e, at.scores, arrow.R11, arrow.slope, *squares)
+    return _Part(at.cost, at.by_z, arrow.data, own)

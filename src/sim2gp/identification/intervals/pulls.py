@@ -127,9 +127,9 @@ def rows_of(
     most = likelihood.windows.most
     runs = max(1, min(MOST, ROOM // (fitted.prior.mean.size + 1) ** 2))
     found, count = [], -(-W // runs)
-    for begin in range(0, W, size):
-        own = np.arange(begin, min(begin + size, W))
-        some = _some_rows(likelihood, fitted, tt, np.resize(own, size), most)
+    for own, part in likelihood.parts(size):
+        known = fitted.some(np.resize(own, len(part.windows)))
+        some = _some_rows(part, known, tt, most)
         factors, costs = (x[: len(own)] for x in some)
         rows = WindowRows(factors, costs, own)
         found.append(rows.in_runs(np.asarray(group)[own], count))
@@ -137,15 +137,9 @@ def rows_of(
 
 
 def _some_rows(
-    likelihood: AnyWindows,
-    fitted: Estimate,
-    tt: Array,
-    which: Int[np.ndarray, " w"],
-    most: int,
+    likelihood: WindowsLikelihood, fitted: Estimate, tt: Array, most: int
 ) -> tuple[Float[np.ndarray, "w q p1"], Float[np.ndarray, " w"]]:
     """Factors and costs of some windows, none with more than ``most`` measured rows."""
-    if not isinstance(likelihood, WindowsLikelihood) or len(which) < len(fitted.scores):
-        likelihood, fitted = likelihood.some(which), fitted.some(which)
     e, p = np.asarray(fitted.nuisances), fitted.prior.mean.size
     n = e.shape[1]
     found = linearise(likelihood, fitted, tt)
