@@ -17,9 +17,12 @@ from descents import estimate_of
 from sim2gp.data.split_log import cut
 from sim2gp.data.windows_likelihood import WindowsLikelihood
 from sim2gp.identification.fit import fit_windows
-from sim2gp.identification.intervals import scatter as intervals
 from sim2gp.identification.intervals.averaging import NONE, NOTHING, SHARES, averaged
-from sim2gp.identification.intervals.discrepancy import _apart, corrected_windows
+from sim2gp.identification.intervals.discrepancy import (
+    _apart,
+    _next,
+    corrected_windows,
+)
 from sim2gp.identification.intervals.pulls import Pulls
 from sim2gp.identification.intervals.scatter import CorrectedFit, correct_posterior
 from sim2gp.identification.intervals.words import interval_entry, missing_forces_table
@@ -123,6 +126,22 @@ def test_what_acts_as_a_parameter_is_no_force() -> None:
     lengths = np.linalg.svd(rest)[1] / np.linalg.norm(G @ kept, 2)
     assert lengths.min() > 0.1
     assert _apart(np.zeros((30, 2)), np.linalg.qr(own)[0]).shape == (2, 0)
+
+
+@pytest.mark.parametrize("gain", [-1.0, -1.3, 0.3])
+def test_a_centre_that_is_overshot_is_found(gain: float) -> None:
+    """Without halves, a gain of -1 goes to and fro for ever."""
+    centre, sd = np.array([1.0, -2.0]), np.array([0.1, 3.0])
+    before = at = centre + 0.8 * sd
+    settled, rounds = False, 0
+    while not settled:
+        rounds += 1
+        mean = centre + gain * (at - centre)
+        posterior = Gaussian(jnp.asarray(mean), jnp.diag(jnp.asarray(sd)))
+        to, settled = _next(posterior, before, at)
+        before, at = at, to
+        assert rounds < 5
+    assert np.max(np.abs(at - centre) / sd) < 0.1
 
 
 def told(model: Linear, y: np.ndarray, allowed: bool) -> CorrectedFit:
@@ -346,48 +365,3 @@ def test_a_belief_keeps_its_parameters_among_forces() -> None:
     mean = wider.parameters.prior().mean
     np.testing.assert_array_equal(whole.posterior.mean[others], mean[others])
     assert not np.any(np.asarray(whole.prior.scale)[np.ix_(own, others)])
-
-
-def test_the_words_say_whether_physics_is_missing() -> None:
-    posterior = gaussian(np.zeros(1), np.eye(1))
-    found = CorrectedFit(posterior, 1.0, 1, 30.0, True, {NONE: 0.03, "ripple": 0.97})
-    text = intervals.describe_intervals(found, [1.0, 4.0], 40)
-    assert text.startswith("Intervals are 1 to 4 times as wide as if every sample were")
-    assert "coloured" not in text
-    assert "lacks physics with a probability of 97 %: intervals allow for" in text
-    assert "sim2gp explain" in text
-    sound = CorrectedFit(posterior, 9.0, 1, 30.0, True, {NONE: 0.96, "ripple": 0.04})
-    text = intervals.describe_intervals(sound, [3.0], 40)
-    assert "coloured and pull the parameters 3 times" in text
-    assert "missing, which has a probability of 4 %" in text
-    unlikely = CorrectedFit(
-        posterior, 9.0, 1, 30.0, True, {NONE: 0.9999, "ripple": 1e-4}
-    )
-    text = intervals.describe_intervals(unlikely, [3.0], 40)
-    assert "which has a probability of less than 1 %" in text
-    none = CorrectedFit(posterior, 9.0, 1, 30.0, True)
-    assert "not physics that the model lacks" in intervals.describe_intervals(
-        none, [3.0], 40
-    )
-
-
-def test_a_wide_interval_says_why_in_one_sentence() -> None:
-    """Where the two sd differ by more than a factor of 3, and only there."""
-    flat = Gaussian(jnp.zeros(1), jnp.ones((1, 1)))
-    coloured = CorrectedFit(flat, 81.0, 1, 40.0, True)
-    assert intervals.explain_widening(coloured, [0.9, 3.0], 340) is None
-    assert (
-        intervals.explain_widening(CorrectedFit(flat, 81.0, 1, 2.0, False), [9.0], 3)
-        is None
-    )
-    text = intervals.explain_widening(coloured, [12.0, 41.0], 340)
-    assert text is not None
-    assert "12 to 41 times" in text
-    assert "9 times as far" in text
-    assert "physics" not in text
-    missing = CorrectedFit(flat, 1.0, 1, 40.0, True, {NONE: 0.07, "ripple": 0.93})
-    text = intervals.explain_widening(missing, [1.0, 5.0], 340)
-    assert text is not None
-    assert "93 %" in text
-    assert "white noise" not in text
-    assert text.count(". ") == 0

@@ -50,6 +50,9 @@ GAIN = 0.5  # of a gain that the linear misfit predicts: what may fail to come
 HALVINGS = 6
 ROUNDS = 6  # linearisations
 SETTLED = 0.1  # of its sd: no parameter's centre moves by more than this
+#: The same where it goes back: halfway is then as near. Delays and dry friction bend a
+#: simulation where a linearisation cannot see it, and others would go on for ever.
+SETTLED_BACK = 0.5
 
 
 def compile_corrected(system: AbstractSystem, cut: Windows | Cuts) -> None:
@@ -80,19 +83,19 @@ def corrected_windows(start: AtZero) -> CorrectedFit:
     prior = Gaussian(jnp.zeros(k), jnp.eye(k))
     at = np.zeros(k)
     at[:p] = np.asarray(whole.prior.whitened(whole.posterior.mean))[own]
-    onto = _Onto(mean, scale @ T)
+    onto, before = _Onto(mean, scale @ T), at
     for _ in range(ROUNDS):
         now = Gaussian(jnp.asarray(at), prior.scale)
         found = correct_posterior(prior, now, pulls.onto(T), groups)
         if not found.enough:
             return replace(found, posterior=start.alone.posterior)
-        to, sd = (np.asarray(x) for x in (found.posterior.mean, found.posterior.sd()))
-        # So near, there is nothing to try: a linearisation of all forces is saved.
-        near = groups and np.max(np.abs(to - at) / sd) <= SETTLED
-        if not near:
-            inflation = found.inflation
-            to, rows = _trusted(start, rows, pulls.onto(T), onto, at, to, inflation)
-        moved, at = np.abs(to - at) / sd, to
+        to, settled = _next(found.posterior, before, at)
+        before = at
+        if groups and settled:  # a linearisation of all forces is saved
+            at = to
+            break
+        at, rows = _trusted(start, rows, pulls.onto(T), onto, at, to, found.inflation)
+        moved = np.abs(at - before) / np.asarray(found.posterior.sd())
         if not groups or np.max(moved) <= SETTLED:
             break
         pulls = pulls_of_rows(rows, start.group)
@@ -104,6 +107,20 @@ def corrected_windows(start: AtZero) -> CorrectedFit:
         posterior=both.marginal(own),
         curves=curves_of(system, start.forces, start.box, both),
     )
+
+
+def _next(
+    posterior: Gaussian, before: Float[np.ndarray, " k"], at: Float[np.ndarray, " k"]
+) -> tuple[Float[np.ndarray, " k"], bool]:
+    """The next centre, and whether it is as good as ``at``, which followed ``before``.
+
+    Halfway to the posterior's where that is back: the last step was too long.
+    """
+    to, sd = np.asarray(posterior.mean), np.asarray(posterior.sd())
+    last, here, there = (np.asarray(posterior.whitened(x)) for x in (before, at, to))
+    back = (there - here) @ (here - last) < 0.0
+    settled = np.max(np.abs(to - at) / sd) <= (SETTLED_BACK if back else SETTLED)
+    return 0.5 * (at + to) if back else to, bool(settled)
 
 
 class _Onto(NamedTuple):

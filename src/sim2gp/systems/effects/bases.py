@@ -7,16 +7,21 @@ On an interval these are the reduced-rank features of a squared-exponential kern
 
     phi_k(z) = sin(k pi (z + L) / 2L),
     S_k      = sqrt(2 pi) l / L exp(-1/2 (l k pi / 2L)^2)
+
+All but `Sines` are constants of a compiled program, and plain classes: an engine asks
+for them at each of its steps, where an attribute of an Equinox module takes 10 us.
 """
 
 import abc
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from equinox import AbstractVar
+from jax.tree_util import register_static
 from jaxtyping import Array, Float
 
 from sim2gp.inference.linalg import library
@@ -32,17 +37,17 @@ SHAPE_SD = 0.6  # of the logarithms of a dead zone's width and of this softness
 
 #: One value, or a batch of them in NumPy.
 Points = Float[AnyArray, "*b"]
-Number = float | Float[AnyArray, ""]
+Number = float | Float[AnyArray, "*g"]
 
 
-class AbstractHarmonics(eqx.Module):
+class AbstractHarmonics(abc.ABC):
     """``sin(k angle(z))``, then ``cos(k angle(z))``, ``k = 1, 2, ...``
 
     ``sines`` and ``cosines`` are the weights' sds for a function whose own sd is one:
     as many of each, or no cosines. Of NumPy arrays, points may come in batches.
     """
 
-    sines: AbstractVar[tuple[float, ...]]
+    sines: tuple[float, ...]
 
     @property
     def cosines(self) -> tuple[float, ...]:
@@ -88,12 +93,14 @@ class AbstractHarmonics(eqx.Module):
         return xp.stack(found, axis=-1)
 
 
+@register_static
+@dataclass(frozen=True)
 class Harmonics(AbstractHarmonics):
     """Of an angle that turns round; ``frequency`` in a turn."""
 
-    sines: tuple[float, ...] = eqx.field(static=True)
-    cosines: tuple[float, ...] = eqx.field(static=True, default=())
-    frequency: float = eqx.field(static=True, default=1.0)
+    sines: tuple[float, ...]
+    cosines: tuple[float, ...] = ()
+    frequency: float = 1.0
 
     def angle(self, z: Points) -> tuple[Points, AnyArray]:
         return self.frequency * z, library(z).asarray(self.frequency, z.dtype)
@@ -102,8 +109,8 @@ class Harmonics(AbstractHarmonics):
 class AbstractSines(AbstractHarmonics):
     """``sin(k pi (z - start) / span)``; zero beyond both ends."""
 
-    start: AbstractVar[Number]
-    span: AbstractVar[Number]
+    start: Number
+    span: Number
 
     def angle(self, z: Points) -> tuple[Points, AnyArray]:
         xp = library(z)
@@ -113,7 +120,7 @@ class AbstractSines(AbstractHarmonics):
         return w * xp.clip(along, 0.0, span), xp.where(inside, w, xp.zeros_like(w))
 
 
-class Sines(AbstractSines):
+class Sines(AbstractSines, eqx.Module):
     """Their ends are inputs of a compiled program, which serves other ends as well."""
 
     start: Float[AnyArray, ""]
@@ -121,13 +128,15 @@ class Sines(AbstractSines):
     sines: tuple[float, ...] = eqx.field(static=True)
 
 
+@register_static
+@dataclass(frozen=True)
 class FixedSines(AbstractSines):
     """Their ends are part of a compiled program: an engine on the host needs numbers
     while JAX traces."""
 
-    start: float = eqx.field(static=True)
-    span: float = eqx.field(static=True)
-    sines: tuple[float, ...] = eqx.field(static=True)
+    start: Number
+    span: Number
+    sines: tuple[float, ...]
 
 
 def _times_order(x: Float[AnyArray, "k *b"]) -> Float[AnyArray, "k *b"]:
@@ -197,10 +206,12 @@ def ripple(count: int) -> Harmonics:
     return Harmonics(sds, sds)
 
 
-class Sign(eqx.Module):
+@register_static
+@dataclass(frozen=True)
+class Sign:
     """Dry friction: against a velocity, smoothed over each of the ``widths``."""
 
-    widths: tuple[float, ...] = eqx.field(static=True)
+    widths: tuple[Number, ...]
 
     @property
     def sds(self) -> tuple[float, ...]:
@@ -229,15 +240,17 @@ class Sign(eqx.Module):
         return library(z).tanh(z / self.widths[k])
 
 
-class Gap(eqx.Module):
+@register_static
+@dataclass(frozen=True)
+class Gap:
     """A dead zone of an unknown width: of all bases only this has shapes to learn.
 
     ``width`` is the width's median, ``softness`` that of the share of the width in
     which it ends; their logarithms have the sd `SHAPE_SD`.
     """
 
-    width: float = eqx.field(static=True)
-    softness: float = eqx.field(static=True, default=SOFT)
+    width: float
+    softness: float = SOFT
     sds: ClassVar[tuple[float, ...]] = (1.0,)
 
     def value(self, x: Float[AnyArray, " 3"], z: Points) -> Points:
@@ -257,3 +270,36 @@ class Gap(eqx.Module):
 
 StateBasis = AbstractHarmonics | Sign
 Basis = StateBasis | Gap
+
+
+def alike(bases: Sequence[StateBasis]) -> list[tuple[StateBasis, list[int]]]:
+    """Each kind as one basis, whose points have a row for each of these; and which.
+
+    In NumPy a call costs more than a few numbers: an arm of six joints has 18 bases of
+    two kinds.
+    """
+    kinds: dict[tuple, list[int]] = {}
+    for i, basis in enumerate(bases):
+        kinds.setdefault(_kind(basis), []).append(i)
+    return [(_joined([bases[i] for i in each]), each) for each in kinds.values()]
+
+
+def _kind(basis: StateBasis) -> tuple:
+    if isinstance(basis, Sign):
+        return Sign, len(basis.widths)
+    if isinstance(basis, AbstractSines):
+        return AbstractSines, basis.sines
+    return type(basis), basis
+
+
+def _joined(bases: Sequence[StateBasis]) -> StateBasis:
+    """Bases of one kind as one."""
+    first = bases[0]
+    if isinstance(first, Sign):
+        widths = [basis.widths for basis in bases if isinstance(basis, Sign)]
+        return Sign(tuple(np.asarray(widths).T[..., None]))
+    if isinstance(first, AbstractSines):
+        ends = [(b.start, b.span) for b in bases if isinstance(b, AbstractSines)]
+        start, span = np.asarray(ends).T[..., None]
+        return FixedSines(start, span, first.sines)
+    return first
