@@ -282,3 +282,11 @@ def test_the_process_ends_with_its_command(
     )
     assert done.returncode == code
     assert getattr(done, stream).strip()
+
+
+def test_the_package_is_the_command(capsys: pytest.CaptureFixture[str]) -> None:
+    """``python -m sim2gp``, where no script is on the path."""
+    assert main(["--version"]) == 0
+    command = [sys.executable, "-m", "sim2gp", "--version"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout) == (0, capsys.readouterr().out)

@@ -9,6 +9,7 @@ from sim2gp.errors import NotFinite
 from sim2gp.identification.misfit.tests import (
     LAGS,
     Misfit,
+    ProjectedResiduals,
     ljung_box,
     ljung_box_tail,
     misfit,
@@ -119,6 +120,23 @@ def test_ljung_box_keeps_to_episodes_and_rows_that_exist() -> None:
     N = valid.sum()
     assert lags == 20
     assert pytest.approx(expected * (N + 2) / N, rel=1e-12) == Q
+
+
+def test_ljung_box_has_its_level_with_very_many_short_windows() -> None:
+    """Of 1e5 rows the start states take a tenth, which all lags would see."""
+    N, L = 100_000, 20
+    run, along = np.repeat(np.arange(N // L), L), np.tile(np.arange(L) / L, N // L)
+    own = np.stack([np.ones(N), along], axis=1)[:, None]
+    rng, found = np.random.default_rng(7), []
+    for _ in range(10):
+        r, J = rng.standard_normal((2, N, 1, 1))
+        data = ProjectedResiduals(r, J, own, run, valid := np.ones((N, 1), bool))
+        e, hat = data.e[:, 0] / data.rms(), data.hat[:, 0]
+        found.append(ljung_box(e, run, valid[:, 0], hat)[:2])
+    Q, lags = np.asarray(found).T
+    assert set(lags) == {L - 1}
+    # Ten chi-squared variables have a mean to within 4 sd of it.
+    assert abs(Q.mean() - lags[0]) < 4.0 * np.sqrt(2.0 * lags[0] / 10)
 
 
 @pytest.mark.nightly

@@ -240,11 +240,13 @@ def ljung_box(
 
     Only pairs of rows of one run count, and at each lag the number of pairs takes the
     place of ``N - k``. The projection alone leaves ``-h_t h_s`` in the mean of a
-    product (in units of the noise): it is taken off. With one run, no mask and no
-    ``hat`` this is the textbook's statistic.
+    product (in units of the noise, of which ``e`` has the share that the projection
+    left): it is taken off. With one run, no mask and no ``hat`` this is the textbook's
+    statistic.
     """
     N = int(valid.sum())
     noise = max(float(np.sum(e[valid] ** 2)) / max(N, 1), 0.25)
+    left = max(N - float(np.sum(hat[valid] ** 2)), 1.0) / max(N, 1)
     total, lags, first = 0.0, 0, 0.0
     for k in range(1, min(LAGS, len(e) - 1) + 1):
         pair = (run[k:] == run[:-k]) & valid[k:] & valid[:-k]
@@ -252,7 +254,7 @@ def ljung_box(
         if pairs < PAIRS:
             continue
         product = float(np.sum((e[k:] * e[:-k])[pair]))
-        bias = -noise * float(np.sum((hat[k:] * hat[:-k])[pair]))
+        bias = -noise / left * float(np.sum((hat[k:] * hat[:-k])[pair]))
         total += ((product - bias) / noise) ** 2 / pairs
         first = product / noise / pairs if k == 1 else first
         lags += 1
