@@ -240,9 +240,8 @@ def ljung_box(
 
     Only pairs of rows of one run count, and at each lag the number of pairs takes the
     place of ``N - k``. The projection alone leaves ``-h_t h_s`` in the mean of a
-    product (in units of the noise, of which ``e`` has the share that the projection
-    left): it is taken off. With one run, no mask and no ``hat`` this is the textbook's
-    statistic.
+    product, in units of the noise before it: it is taken off. With one run, no mask and
+    no ``hat`` this is the textbook's statistic.
     """
     N = int(valid.sum())
     noise = max(float(np.sum(e[valid] ** 2)) / max(N, 1), 0.25)
