@@ -9,7 +9,7 @@ On an interval these are the reduced-rank features of a squared-exponential kern
     S_k      = sqrt(2 pi) l / L exp(-1/2 (l k pi / 2L)^2)
 
 All but `Sines` are constants of a compiled program, and plain classes: an engine asks
-for them at each of its steps, where an attribute of an Equinox module takes 10 us.
+for them at each of its steps, and a call of an Equinox module takes 50 us.
 """
 
 import abc
