@@ -134,6 +134,11 @@ def parts_of(
         yield own, windows.masked(np.arange(size) < len(own))
 
 
+def evenly_spread(size: int, count: int) -> Int[np.ndarray, " w"]:
+    """Numbers of ``size`` of ``count`` windows, from the first to the last."""
+    return np.linspace(0, count - 1, min(size, count)).round().astype(int)
+
+
 def channel_motion(windows: Windows) -> Float[np.ndarray, "W c"]:
     """Mean square of how far each channel went within a window."""
     y, mask = np.asarray(windows.y), np.asarray(windows.mask)

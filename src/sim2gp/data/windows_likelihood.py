@@ -25,7 +25,7 @@ from jaxtyping import Array, Float, Int
 from sim2gp.compilation import compile_async
 from sim2gp.data.cuts import Cuts
 from sim2gp.data.window_slopes import HostRun, about
-from sim2gp.data.windows import AT_A_TIME, Windows
+from sim2gp.data.windows import AT_A_TIME, Windows, evenly_spread
 from sim2gp.inference.arrowhead import Blocks, Noise, eliminate
 from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.least_squares import factor
@@ -84,8 +84,7 @@ class WindowsLikelihood(AbstractLikelihood):
 
     def thinned(self, count: int) -> "WindowsLikelihood":
         """Of a quarter as many windows, evenly spread: each has several rows."""
-        W = len(self.windows)
-        which = np.linspace(0, W - 1, min(W, count // 4)).round().astype(int)
+        which = evenly_spread(count // 4, len(self.windows))
         some = self.windows.some(which), self.counts[which]
         thin: WindowsLikelihood = eqx.tree_at(
             lambda one: (one.windows, one.counts), self, some

@@ -10,7 +10,7 @@ from jaxtyping import Int
 
 from sim2gp import checks
 from sim2gp.data.cuts import Cuts
-from sim2gp.data.windows import AT_A_TIME, Windows
+from sim2gp.data.windows import AT_A_TIME, Windows, evenly_spread
 from sim2gp.data.windows_likelihood import CutsLikelihood, WindowsLikelihood
 from sim2gp.errors import NotConverged
 from sim2gp.inference.arrowhead import Noise
@@ -102,7 +102,7 @@ def _checked(found: Estimate, system: AbstractSystem, count: int) -> Estimate:
 def _fit_of_some(system: AbstractSystem, windows: Cuts, **how: Any) -> Estimate:
     """Of windows that are spread over all; the others are at their guessed starts."""
     W, size = len(windows), max(LEAST, AT_A_TIME // windows.length)
-    some = np.linspace(0, W - 1, min(W, size)).round().astype(int)
+    some = evenly_spread(size, W)
     found = fit_windows(system, windows.some(some), **how)
     e, scores = (np.zeros((W, x.shape[1])) for x in (found.nuisances, found.scores))
     e[some], noise = found.nuisances, Noise(found.noise.sd, np.ones(W))
@@ -116,4 +116,4 @@ def _first_windows(likelihood: WindowsLikelihood) -> Int[np.ndarray, " w"] | Non
     few = likelihood.windows.span.size < MANY
     if not likelihood.on_host or few or 2 * count > W:
         return None
-    return np.linspace(0, W - 1, count).round().astype(int)
+    return evenly_spread(count, W)

@@ -51,7 +51,7 @@ HALVINGS = 6
 ROUNDS = 6  # linearisations
 SETTLED = 0.1  # of its sd: no parameter's centre moves by more than this
 #: The same where it goes back: halfway is then as near. Delays and dry friction bend a
-#: simulation where a linearisation cannot see it, and others would go on for ever.
+#: simulation where a linearisation cannot see it: smaller steps may never come.
 SETTLED_BACK = 0.5
 
 
@@ -86,7 +86,8 @@ def corrected_windows(start: AtZero) -> CorrectedFit:
     onto, before = _Onto(mean, scale @ T), at
     for _ in range(ROUNDS):
         now = Gaussian(jnp.asarray(at), prior.scale)
-        found = correct_posterior(prior, now, pulls.onto(T), groups)
+        here = pulls.onto(T)
+        found = correct_posterior(prior, now, here, groups)
         if not found.enough:
             return replace(found, posterior=start.alone.posterior)
         to, settled = _next(found.posterior, before, at)
@@ -94,7 +95,7 @@ def corrected_windows(start: AtZero) -> CorrectedFit:
         if groups and settled:  # a linearisation of all forces is saved
             at = to
             break
-        at, rows = _trusted(start, rows, pulls.onto(T), onto, at, to, found.inflation)
+        at, rows = _trusted(start, rows, here, onto, at, to, found.inflation)
         moved = np.abs(at - before) / np.asarray(found.posterior.sd())
         if not groups or np.max(moved) <= SETTLED:
             break

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from sim2gp.data.one_step import OneStepLikelihood, compiled_rows
 from sim2gp.data.transitions import earlier_inputs, episode_numbers
-from sim2gp.data.windows import Windows
+from sim2gp.data.windows import Windows, evenly_spread
 from sim2gp.data.windows_likelihood import (
     AnyWindows,
     WindowsLikelihood,
@@ -64,7 +64,7 @@ def misfit_of_windows(likelihood: AnyWindows, fitted: Estimate) -> Misfit:
     system, W = likelihood.system, len(likelihood.windows)
     size = together(system, likelihood.windows)
     if size < W or not isinstance(likelihood, WindowsLikelihood):
-        which = np.linspace(0, W - 1, size).round().astype(int)
+        which = evenly_spread(size, W)
         likelihood, fitted = likelihood.some(which), fitted.some(which)
     cut = likelihood.windows
     found = linearise(likelihood, fitted, fitted.posterior.mean)

@@ -275,8 +275,8 @@ Basis = StateBasis | Gap
 def alike(bases: Sequence[StateBasis]) -> list[tuple[StateBasis, list[int]]]:
     """Each kind as one basis, whose points have a row for each of these; and which.
 
-    In NumPy a call costs more than a few numbers: an arm of six joints has 18 bases of
-    two kinds.
+    In NumPy a call costs more than a few numbers: an arm of six joints has 18 bases or
+    more, of few kinds.
     """
     kinds: dict[tuple, list[int]] = {}
     for i, basis in enumerate(bases):
