@@ -7,6 +7,7 @@ import scipy.stats
 
 from sim2gp.identification.missing_physics.held_out_gain import (
     LEVEL,
+    MOST,
     SCALES,
     WORTH,
     LeaveOneOut,
@@ -101,3 +102,9 @@ def test_few_recordings_are_cut_into_parts_in_order() -> None:
     assert len(np.unique(few)) == 3
     many = np.array([0, 0, 1, 2, 3])
     np.testing.assert_array_equal(recordings_or_parts(many), many)
+
+
+def test_very_many_recordings_are_joined_in_order() -> None:
+    """A fit for each of thousands would be asked for a fit of all others."""
+    found = recordings_or_parts(np.repeat(np.arange(3, 1003), 2))
+    np.testing.assert_array_equal(found, np.repeat(np.arange(MOST), 20))

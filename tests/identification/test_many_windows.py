@@ -69,6 +69,11 @@ def test_a_program_of_some_windows_at_a_time(
     np.testing.assert_allclose(parts, whole, rtol=1e-12, atol=1e-12)
 
 
+def gram(factors: np.ndarray) -> np.ndarray:
+    """Fisher information of windows together, added up one by one."""
+    return np.sum([F.T @ F for F in factors], axis=0)
+
+
 def test_runs_of_windows_say_what_their_windows_say() -> None:
     """Of one group alone, in their order."""
     rng = np.random.default_rng(31)
@@ -82,24 +87,33 @@ def test_runs_of_windows_say_what_their_windows_say() -> None:
     members = np.split(each, [3, 6, 9, 12, 14, 17, 20])
     assert joined.first.tolist() == [own[0] for own in members]
     for run, own in enumerate(members):
-        fisher = alone.fisher[own].sum(axis=0)
-        np.testing.assert_allclose(runs.fisher[run], fisher, atol=1e-12)
+        pair = gram(runs.factors[run : run + 1]), gram(alone.factors[own])
+        np.testing.assert_allclose(*pair, atol=1e-12)
         score = alone.scores[own].sum(axis=0)
         np.testing.assert_allclose(runs.scores[run], score, atol=1e-12)
         assert joined.costs[run] == pytest.approx(costs[own].sum())
 
 
+@pytest.mark.parametrize(
+    ("group", "of_runs"),
+    [
+        (np.repeat([0, 1], [11, 12]), [0] * 4 + [1] * 4),
+        (np.arange(COUNT), [0, 3, 6, 9, 12, 15, 18, 21]),  # logs of one window each
+    ],
+)
 def test_of_many_windows_rows_are_those_of_runs(
-    fitted: tuple[WindowsLikelihood, Estimate], monkeypatch: pytest.MonkeyPatch
+    group: np.ndarray,
+    of_runs: list[int],
+    fitted: tuple[WindowsLikelihood, Estimate],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """All that intervals ask of the windows together stays."""
     likelihood, found = fitted
-    group = np.repeat([0, 1], [11, 12])
     whole = pulls.pulls_of_windows(likelihood, found, group)
     monkeypatch.setattr(pulls, "MOST", 8)
     runs = pulls.pulls_of_windows(likelihood, found, group)
-    assert runs.group.tolist() == [0] * 4 + [1] * 4
-    totals = (x.fisher.sum(axis=0) for x in (runs, whole))
+    assert runs.group.tolist() == of_runs
+    totals = runs.fisher, gram(whole.factors)
     np.testing.assert_allclose(*totals, rtol=1e-10)
     totals = (x.scores.sum(axis=0) for x in (runs, whole))
     np.testing.assert_allclose(*totals, rtol=1e-7, atol=1e-9)

@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Int
 
 from sim2gp.commands.folds import recording_of_windows
 from sim2gp.commands.identification import physical_mode
@@ -81,11 +82,9 @@ def identification_results(
     of = np.asarray([k for k, _ in places])
     known = fitted.with_measurements(table)
     likelihood = likelihood_of(project.system, windows)
-    start = at_zero(likelihood, known, of)
     recording, robust = recording_of_windows(logs, of), project.spec.likelihood.robust
-    machine = fit_forecast_machine(start, recording, robust=robust)
+    machine, honest = _with_forces(likelihood, known, of, recording, robust)
     band, own = _own_forecasts(machine, grid, logs)
-    honest = corrected_windows(start)
     summary = _identification_summary(
         project, logs, likelihood, known, honest, band, seed
     )
@@ -100,6 +99,19 @@ def identification_results(
     )
     said, drawings = _drawings(project, logs, own, other)
     return summary | said, arrays | drawings, honest
+
+
+def _with_forces(
+    likelihood: AnyWindows,
+    known: Estimate,
+    of: Int[np.ndarray, " W"],
+    recording: Int[np.ndarray, " W"],
+    robust: bool,
+) -> tuple[ForecastMachine, CorrectedFit]:
+    """What forecasts, and the corrected posterior: both ask the same linearisation."""
+    start = at_zero(likelihood, known, of)
+    machine = fit_forecast_machine(start, recording, robust=robust)
+    return machine, corrected_windows(start)
 
 
 def _own_forecasts(

@@ -7,7 +7,7 @@ what a fit in parts needs of them: some, all as large, one part after the other.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -173,18 +173,21 @@ def integration_steps(
 
 
 def inputs_since(
-    held: Sequence[tuple[np.ndarray, np.ndarray]],
+    logs: Sequence[Log],
+    actions: Sequence[str],
     spans: Sequence[tuple[int, float, float]],
     delay: float,
 ) -> tuple[Float[np.ndarray, "W H"], Float[np.ndarray, "W H m"]]:
     """Padded knots and integrals of the inputs for each (log, since, length) in s.
 
     They reach ``delay`` seconds (and a blur's width) back; knots count from ``since``.
+    Spans come log by log.
     """
-    ends = [knot_range(held[k][0], since, s, delay) for k, since, s in spans]
+    held = lru_cache(maxsize=1)(lambda k: knots_of(logs[k], actions, delay))
+    ends = [knot_range(held(k)[0], since, s, delay) for k, since, s in spans]
     H = max(last - first for first, last in ends)
     rows = [
-        padded_knots(held[k], own, since, H)
+        padded_knots(held(k), own, since, H)
         for (k, since, _), own in zip(spans, ends, strict=True)
     ]
     knots, area = (np.stack(x) for x in zip(*rows, strict=True))

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 
 from sim2gp import checks
 from sim2gp.data.clock import step_between
-from sim2gp.data.cuts import inputs_since, knots_of
+from sim2gp.data.cuts import inputs_since
 from sim2gp.data.logs import Log
 from sim2gp.data.split_log import SPACING, measured_states, resolution
 from sim2gp.data.windows import Windows
@@ -77,12 +77,11 @@ def evaluation_windows(
         since = log.time[0] + PERIOD * first
         spans += [(k, float(s), PERIOD * (L - 1)) for s in since]
     y, mask, start, lag, which = (np.concatenate(x) for x in zip(*parts, strict=True))
-    held = [knots_of(log, actions, system.longest_delay) for log in logs]
-    knots, area = inputs_since(held, spans, system.longest_delay)
-    span = np.full(y.shape[:2], PERIOD)
-    span[:, 0] = 0.0
+    knots, area = inputs_since(logs, actions, spans, system.longest_delay)
+    span = np.full(L, PERIOD)
+    span[0] = 0.0
     windows = Windows(
-        span,
+        np.broadcast_to(span, mask.shape[:2]),  # one row, however many there are
         knots,
         area,
         y,

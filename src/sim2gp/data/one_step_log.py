@@ -104,8 +104,7 @@ def samples_of(logs: Sequence[Log], stepper: AbstractSystem, period: float) -> S
         parts.append((y[around], np.full(len(at), k), len(spans) + follows, held))
         spans += [(k, float(s) - PERIOD * half, 2 * PERIOD * half) for s in since]
     y, which, first, held = (np.concatenate(x) for x in zip(*parts, strict=True))
-    knots_by_log = [knots_of(log, actions, stepper.longest_delay) for log in logs]
-    knots, area = inputs_since(knots_by_log, spans, stepper.longest_delay)
+    knots, area = inputs_since(logs, actions, spans, stepper.longest_delay)
     span = np.full(y.shape[:2], PERIOD)
     span[:, 0] = 0.0
     local = _parabolas(y)

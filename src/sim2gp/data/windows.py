@@ -139,6 +139,12 @@ def evenly_spread(size: int, count: int) -> Int[np.ndarray, " w"]:
     return np.linspace(0, count - 1, min(size, count)).round().astype(int)
 
 
+def at_most(count: int, group: Int[np.ndarray, " W"]) -> Int[np.ndarray, " W"]:
+    """Numbers of groups; of more than ``count``, successive ones are one."""
+    names, own = np.unique(group, return_inverse=True)
+    return group if len(names) <= count else own * count // len(names)
+
+
 def channel_motion(windows: Windows) -> Float[np.ndarray, "W c"]:
     """Mean square of how far each channel went within a window."""
     y, mask = np.asarray(windows.y), np.asarray(windows.mask)

@@ -101,24 +101,29 @@ def _passed(
     full: Factor,
 ) -> tuple[Laplace, tuple[Float[np.ndarray, "W c"], Float[np.ndarray, "W c"]]]:
     """All parts linearised and put together with the prior; `Laplace.squares`."""
-    parts: list[_Part] = []
+    z, rows = np.asarray(z), np.asarray(prior.rows(z))
+    offset = rows[:, -1]
+    cost, by_z = 0.5 * offset @ offset, rows[:, :-1].T @ offset
+    factors, each = [], None
     for own, likelihood in data.parts():
         which = np.resize(own, len(likelihood.counts))
         here = Noise(noise.sd, noise.weights[which])
         part = jax.device_get(_linearised(likelihood, prior, z, e[which], here, full))
-        kept = slice(len(own))
-        windows = jax.tree.map(lambda x, kept=kept: x[kept], part.windows)
-        parts.append(part._replace(windows=windows))
-    each = jax.tree.map(lambda *x: np.concatenate(x), *(x.windows for x in parts))
-    rows = np.asarray(prior.rows(z))
-    offset = rows[:, -1]
-    cost = sum(x.cost for x in parts) + 0.5 * offset @ offset
-    by_z = sum(x.by_z for x in parts) + rows[:, :-1].T @ offset
-    z = np.asarray(z)
+        cost, by_z = cost + part.cost, by_z + part.by_z
+        factors.append(part.data)
+        each = each or _for_all(part.windows, len(e))
+        for whole, some in zip(each, part.windows, strict=True):
+            whole[own] = some[: len(own)]
+    assert each is not None
     at = Point(z, e, each.blocks, rows, cost, by_z, each.by_e, each.scores)
-    R = stack(*(x.data for x in parts))
+    R = stack(*factors)
     found = Laplace(at, Elimination(R, each.R11, each.slope), stack(R, rows))
     return found, (each.squares, each.spread)
+
+
+def _for_all(some: _OfWindows, count: int) -> _OfWindows:
+    """Room for so many windows: to join parts at the end takes twice the memory."""
+    return _OfWindows(*(np.empty((count, *x.shape[1:]), x.dtype) for x in some))
 
 
 @eqx.filter_jit

@@ -193,7 +193,7 @@ def _trusted(
     should, or half of what is gained.
     """
     dz = to - at
-    score, F = pulls.scores.sum(axis=0), pulls.fisher.sum(axis=0)
+    score, F = pulls.scores.sum(axis=0), pulls.fisher
     for share in 0.5 ** np.arange(HALVINGS):
         there = at + share * (to - at)
         tt = jnp.asarray(onto(there))

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from sim2gp.data.windows import at_most
 from sim2gp.data.windows_likelihood import (
     AnyWindows,
     WindowsLikelihood,
@@ -79,9 +80,10 @@ class Pulls:
     group: Int[np.ndarray, " W"]
 
     @property
-    def fisher(self) -> Float[np.ndarray, "W p p"]:
-        """``F_w``."""
-        return np.swapaxes(self.factors, 1, 2) @ self.factors
+    def fisher(self) -> Float[np.ndarray, "p p"]:
+        """``F``, of all windows together."""
+        A = self.factors.reshape(-1, self.factors.shape[2])
+        return A.T @ A
 
     def onto(self, T: Float[np.ndarray, "p k"]) -> "Pulls":
         """Those of ``c`` where ``z = T c``."""
@@ -89,7 +91,8 @@ class Pulls:
 
     def at(self, dz: Float[np.ndarray, " p"]) -> "Pulls":
         """The pulls where the parameters are ``dz`` further, for a linear machine."""
-        return Pulls(self.factors, self.scores + self.fisher @ dz, self.group)
+        more = np.einsum("wkp,wk->wp", self.factors, self.factors @ dz)
+        return Pulls(self.factors, self.scores + more, self.group)
 
 
 @in_float64
@@ -121,18 +124,19 @@ def rows_of(
     """The windows at virtual values ``tt``, from the starts of the fit.
 
     Some windows at a time, all as many: of hundreds of forces all derivatives at once
-    are large. Of more windows than `MOST` runs of one ``group``, or than have `ROOM`.
+    are large. Of more windows than `MOST` runs of one ``group``, or than have `ROOM`;
+    of more groups, successive ones are one.
     """
     W, size = len(likelihood.windows), together(likelihood.system, likelihood.windows)
     most = likelihood.windows.most
     runs = max(1, min(MOST, ROOM // (fitted.prior.mean.size + 1) ** 2))
-    found, count = [], -(-W // runs)
+    found, count, group = [], -(-W // runs), at_most(runs, np.asarray(group))
     for own, part in likelihood.parts(size):
         known = fitted.some(np.resize(own, len(part.windows)))
         some = _some_rows(part, known, tt, most)
         factors, costs = (x[: len(own)] for x in some)
         rows = WindowRows(factors, costs, own)
-        found.append(rows.in_runs(np.asarray(group)[own], count))
+        found.append(rows.in_runs(group[own], count))
     return WindowRows(*(np.concatenate(x) for x in zip(*found, strict=True)))
 
 

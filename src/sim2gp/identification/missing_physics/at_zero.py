@@ -107,6 +107,6 @@ def forces_at_zero(
         prior=about,
         posterior=Gaussian(mean, scale),
         information=jnp.zeros_like(scale),  # of another machine
-        scores=jnp.zeros((len(fitted.scores), len(scale))),
+        scores=np.broadcast_to(0.0, (len(fitted.scores), len(scale))),
     )
     return system, whole, own

@@ -24,10 +24,13 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import stdtr
 
+from sim2gp.data.windows import at_most
+
 LEVEL = 0.05
 WORTH = 0.01  # of the squared error: less is not worth a force
 SCALES = tuple(10.0 ** (-0.5 * k) for k in range(6))
 FEW, PARTS = 4, 10  # fewer recordings are cut, to so many parts in all or more
+MOST = 100  # parts: of more recordings, successive ones are one
 
 Places = Int[np.ndarray, " _"]
 #: Rows ``[A r]`` of one recording, or a triangular factor of them.
@@ -37,11 +40,11 @@ Rows = Float[np.ndarray, "_ pr"]
 def recordings_or_parts(recording: Int[np.ndarray, " W"]) -> Int[np.ndarray, " W"]:
     """The number of each window's recording, or of its part where those are few.
 
-    Windows of one recording follow each other.
+    Windows of one recording follow each other. Many recordings are joined.
     """
     names, count = np.unique(recording, return_counts=True)
     if len(names) >= FEW:
-        return recording
+        return at_most(MOST, recording)
     each = -(-PARTS // len(names))
     found = np.zeros(len(recording), int)
     for k, (name, n) in enumerate(zip(names, count, strict=True)):
