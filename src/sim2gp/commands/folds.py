@@ -92,11 +92,11 @@ def recording_of_windows(
 def split_held_out(
     logs: Sequence[Log],
     windows: Windows | Cuts,
-    places: Sequence[tuple[int, int]],
+    places: Int[np.ndarray, "W 2"],
     grid: Grid,
 ) -> Part | None:
     """The last recording, or the last quarter of the only one; None if too short."""
-    files, of = recording_names(logs), np.asarray([k for k, _ in places])
+    files, of = recording_names(logs), places[:, 0]
     if len(set(files)) > 1:
         last = [k for k, source in enumerate(files) if source == files[-1]]
         found = leave_out(last, logs, of, grid)

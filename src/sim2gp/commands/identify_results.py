@@ -71,7 +71,7 @@ _SHORTEST = 4  # windows: a film of fewer held-out ones is not worth watching
 def identification_results(
     project: Project,
     logs: Sequence[Log],
-    cuts: tuple[Windows | Cuts, list[tuple[int, int]]],
+    cuts: tuple[Windows | Cuts, Int[np.ndarray, "W 2"]],
     grid: Grid,
     fitted: Estimate,
     seed: int,
@@ -79,7 +79,7 @@ def identification_results(
 ) -> tuple[dict[str, Any], dict[str, np.ndarray], CorrectedFit]:
     """The run's summary and arrays, and the corrected intervals."""
     table, (windows, places) = project.system.parameters, cuts
-    of = np.asarray([k for k, _ in places])
+    of = places[:, 0]
     known = fitted.with_measurements(table)
     likelihood = likelihood_of(project.system, windows)
     recording, robust = recording_of_windows(logs, of), project.spec.likelihood.robust

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Int
 
 from sim2gp.commands.folds import Fold, fit_fold, split_held_out
 from sim2gp.data.cuts import Cuts
@@ -47,7 +48,7 @@ def forecast_unseen(
     project: Project,
     logs: Sequence[Log],
     windows: Windows | Cuts,
-    places: Sequence[tuple[int, int]],
+    places: Int[np.ndarray, "W 2"],
     grid: Grid,
     whole: Estimate,
 ) -> Unseen:

@@ -84,9 +84,9 @@ class Cuts:
         return np.asarray([time[k][j - 1] - time[k][i] for k, i, j in self.pieces])
 
     @property
-    def places(self) -> list[tuple[int, int]]:
+    def places(self) -> Int[np.ndarray, "W 2"]:
         """Log and first row of each window."""
-        return [(k, i) for k, i, _ in self.pieces.tolist()]
+        return self.pieces[:, :2]
 
     def whole(self) -> Windows:
         """All windows at once."""

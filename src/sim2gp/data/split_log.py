@@ -40,7 +40,7 @@ def cut(
     start_sd: dict[str, float] | None = None,
     floor: dict[str, float] | None = None,
     start: Start = "smoothed",
-) -> tuple[Windows, list[tuple[int, int]]]:
+) -> tuple[Windows, Int[np.ndarray, "W 2"]]:
     """Windows of ``window`` seconds that use every row once, and (log, row) of each.
 
     ``window = 0`` gives the one-step likelihood, which needs every state measured.

@@ -75,11 +75,11 @@ def estimate_in_parts(
     noise = Noise(np.asarray(noise.sd), np.asarray(noise.weights))
     scales = first.posterior.scale, prior.gaussian.scale
     R = triangular(np.linalg.solve(*map(np.asarray, scales)))
-    full, change, steps = np.pad(R, (0, 1)), np.inf, 0
-    while steps < MOST:
-        steps += 1
+    full, change = np.pad(R, (0, 1)), np.inf
+    for steps in range(1, MOST + 1):
         found, squares = _passed(data, prior, z, e, noise, full)
-        if found.newton_step_sd() <= SHORT and change <= STILL:
+        rests = found.newton_step_sd() <= SHORT and change <= STILL
+        if rests or steps == MOST:
             break
         learned = expected_noise(noise, *squares, data.counts, data.floor, freedom)
         change = np.max(np.abs(np.log(learned.sd / noise.sd)))
@@ -87,6 +87,7 @@ def estimate_in_parts(
         slope = found.arrow.slope
         e = e - (slope[..., -1] + slope[..., :-1] @ dz)
         z, noise, full = z + dz, learned, found.full
+        del found, squares, slope  # of all windows, as what the next pass makes
     ended = about_point(found, noise, prior, data.counts, steps)
     known: Estimate = jax.device_put(ended)
     return known

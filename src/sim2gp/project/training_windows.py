@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Int
 
 from sim2gp.data.cuts import Cuts
 from sim2gp.data.logs import Log
@@ -20,12 +21,12 @@ def cut_logs(
 ) -> tuple[Windows, np.ndarray]:
     """Training windows as `cut_places` makes them, and the log of each."""
     windows, places = cut_places(project, logs, times)
-    return windows, np.asarray([k for k, _ in places])
+    return windows, places[:, 0]
 
 
 def cut_places(
     project: Project, logs: Sequence[Log], times: float = 1.0
-) -> tuple[Windows, list[tuple[int, int]]]:
+) -> tuple[Windows, Int[np.ndarray, "W 2"]]:
     """Training windows as the project states them, and log and first row of each.
 
     Or so many ``times`` as long.
@@ -36,7 +37,7 @@ def cut_places(
 
 def cut_for_fit(
     project: Project, logs: Sequence[Log]
-) -> tuple[Windows | Cuts, list[tuple[int, int]]]:
+) -> tuple[Windows | Cuts, Int[np.ndarray, "W 2"]]:
     """As `cut_places`; of so many rows that they are fitted in parts, as `Cuts`."""
     cuts = _cuts(project, logs)
     few = len(cuts) * cuts.length <= MANY
