@@ -16,7 +16,6 @@ import os
 import resource
 import subprocess
 import sys
-import tempfile
 import time
 from pathlib import Path
 from typing import Any
@@ -35,6 +34,8 @@ from interval_arms import (
 from sim2gp.data.logs import Log
 
 ROOT = Path(__file__).resolve().parents[1]
+#: Of glibc: large arrays are given back when they are freed, not kept for others.
+GIVE_BACK = {"MALLOC_MMAP_THRESHOLD_": "131072", "MALLOC_ARENA_MAX": "2"}
 EACH, AT_ONCE = 2_000, 50  # rows of a log; logs that are simulated at a time
 
 
@@ -130,18 +131,13 @@ def main() -> None:
         print(found["in parts, and at once"])
 
 
-#: Of glibc: large arrays are given back when they are freed, not kept for others.
-GIVE_BACK = {"MALLOC_MMAP_THRESHOLD_": "131072", "MALLOC_ARENA_MAX": "2"}
-
-
 def _process(rows: int, *more: str) -> dict[str, Any]:
     command = [sys.executable, __file__, "--one", str(rows), *more]
-    kept = tempfile.TemporaryDirectory()
-    how = os.environ | GIVE_BACK | {"JAX_COMPILATION_CACHE_DIR": kept.name}
-    with kept:
-        done = subprocess.run(
-            command, check=True, stdout=subprocess.PIPE, text=True, env=how
-        )
+    how = os.environ | GIVE_BACK
+    how.pop("JAX_COMPILATION_CACHE_DIR", None)
+    done = subprocess.run(
+        command, check=True, stdout=subprocess.PIPE, text=True, env=how
+    )
     found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return found
 

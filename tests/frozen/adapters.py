@@ -143,7 +143,7 @@ def cut_and_fit(
         start_states(windows, found),
         found.log_evidence,
     )
-    return windows, np.asarray([k for k, _ in places]), fitted
+    return windows, places[:, 0], fitted
 
 
 def intervals(fitted: Fitted, windows: Any, of: np.ndarray) -> Any:
@@ -164,7 +164,7 @@ def slopes(fitted: Fitted, windows: Any) -> tuple[np.ndarray, np.ndarray]:
 def gains(machine: Any, logs: Sequence[Any]) -> dict[str, float]:
     """What each effect of a library is worth, by one linearisation, nats."""
     _, places = cut(logs, machine, window=0.2)
-    of = np.asarray([k for k, _ in places])
+    of = places[:, 0]
     data = WindowData(machine, lambda m: cut(logs, m, window=0.2)[0], of, of)
     scored = score_candidates(data, data.fit(), sy.candidates(machine, windows=True))
     names = {one.candidate.name: one.gain for one in scored}

@@ -78,10 +78,8 @@ def evaluation_windows(
         spans += [(k, float(s), PERIOD * (L - 1)) for s in since]
     y, mask, start, lag, which = (np.concatenate(x) for x in zip(*parts, strict=True))
     knots, area = inputs_since(logs, actions, spans, system.longest_delay)
-    span = np.full(L, PERIOD)
-    span[0] = 0.0
     windows = Windows(
-        np.broadcast_to(span, mask.shape[:2]),  # one row, however many there are
+        even_spans(*mask.shape[:2]),
         knots,
         area,
         y,
@@ -94,6 +92,13 @@ def evaluation_windows(
     )
     since = np.asarray([s for _, s, _ in spans])
     return Grid(windows, which, since, lag, _every(logs, system))
+
+
+def even_spans(count: int, rows: int) -> Float[np.ndarray, "count rows"]:
+    """Of windows whose rows are grid samples: in memory one row for all."""
+    span = np.full(rows, PERIOD)
+    span[0] = 0.0
+    return np.broadcast_to(span, (count, rows))
 
 
 def _every(logs: Sequence[Log], system: AbstractSystem) -> int:

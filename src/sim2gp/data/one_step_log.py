@@ -25,6 +25,7 @@ from sim2gp.data.grid import (
     PERIOD,
     SAMPLES,
     Grid,
+    even_spans,
     on_grid,
     parabola_weights,
     states_from,
@@ -105,12 +106,10 @@ def samples_of(logs: Sequence[Log], stepper: AbstractSystem, period: float) -> S
         spans += [(k, float(s) - PERIOD * half, 2 * PERIOD * half) for s in since]
     y, which, first, held = (np.concatenate(x) for x in zip(*parts, strict=True))
     knots, area = inputs_since(logs, actions, spans, stepper.longest_delay)
-    span = np.full(y.shape[:2], PERIOD)
-    span[:, 0] = 0.0
     local = _parabolas(y)
     start = _parabola_state(local, -PERIOD * half, names, measured)
     windows = Windows(
-        span,
+        even_spans(*y.shape[:2]),
         knots,
         area,
         y,

@@ -145,7 +145,7 @@ def _identifiable(
     may show too little of its friction to tell it from damping, and of all inputs the
     gains may be the masses' scale.
     """
-    A = np.asarray(np.linalg.qr(np.concatenate(list(pulls.factors)), mode="r"))
+    A = np.asarray(np.linalg.qr(pulls.rows, mode="r"))
     Q, R = np.linalg.qr(A[:, own])
     Q = Q[:, np.abs(np.diag(R)) > 1e-12 * np.abs(R).max(initial=0.0)]
     parts, found, start = [np.eye(A.shape[1])[:, own]], {}, len(own)

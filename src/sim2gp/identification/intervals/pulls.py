@@ -80,10 +80,15 @@ class Pulls:
     group: Int[np.ndarray, " W"]
 
     @property
+    def rows(self) -> Float[np.ndarray, "Wk p"]:
+        """The factors of all windows, stacked."""
+        W, k, p = self.factors.shape
+        return self.factors.reshape(W * k, p)
+
+    @property
     def fisher(self) -> Float[np.ndarray, "p p"]:
         """``F``, of all windows together."""
-        A = self.factors.reshape(-1, self.factors.shape[2])
-        return A.T @ A
+        return self.rows.T @ self.rows
 
     def onto(self, T: Float[np.ndarray, "p k"]) -> "Pulls":
         """Those of ``c`` where ``z = T c``."""

@@ -261,7 +261,7 @@ def _at_the_map(
     """The MAP of what is linear, whitened, and the pulls there: the same where ``at``
     is it; the factor of the data's information, and R, that of the posterior's."""
     z = np.asarray(prior.whitened(jnp.asarray(at)))
-    data = np.asarray(np.linalg.qr(np.concatenate(list(pulls.factors)), mode="r"))
+    data = np.asarray(np.linalg.qr(pulls.rows, mode="r"))
     R = np.asarray(np.linalg.qr(np.concatenate([data, np.eye(len(z))]), mode="r"))
     step = -np.linalg.solve(R, np.linalg.solve(R.T, z + pulls.scores.sum(axis=0)))
     return z + step, pulls.at(step), data, R
