@@ -6,10 +6,10 @@ from scipy import signal, stats
 
 from misfit_pendulum import alarms
 from sim2gp.errors import NotFinite
+from sim2gp.identification.misfit.projection import ProjectedResiduals
 from sim2gp.identification.misfit.tests import (
     LAGS,
     Misfit,
-    ProjectedResiduals,
     ljung_box,
     ljung_box_tail,
     misfit,
