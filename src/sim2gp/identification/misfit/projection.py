@@ -30,9 +30,8 @@ class ProjectedResiduals:
     ) -> None:
         self.r, self.J, self.own, self.run, self.valid = r, J, own, run, valid
         self.own_basis, self.own_rank = _grouped_basis(own, run)
-        J = self._without_own(J)
-        flat = J.reshape(-1, J.shape[-1])
-        self.basis, self.size = _orthonormal_basis(flat, RANK_TOLERANCE)
+        flat = self._without_own(J).reshape(-1, J.shape[2])
+        self.basis, self.size = _orthonormal_basis(flat)
         self.e = self.without(r)[..., 0]
         self.count = int(valid.sum())
         self.freedom = self.count - self.own_rank - self.basis.shape[1]
@@ -46,9 +45,10 @@ class ProjectedResiduals:
 
     def _without_own(self, A: Columns) -> Columns:
         """``A`` minus its projection on the nuisances of each group."""
-        own, found = self.own_basis, np.empty_like(A)
+        own = self.own_basis
         if own.shape[2] == 0:
             return A
+        found = np.empty_like(A)
         first = np.flatnonzero(np.diff(self.run, prepend=-1))
         for j in range(A.shape[2]):  # all products at once are several times ``A``
             products = np.einsum("ndi,nd->ni", own, A[..., j])
@@ -94,14 +94,11 @@ class ProjectedResiduals:
 
 
 def _orthonormal_basis(
-    A: Float[np.ndarray, "M c"], tolerance: float
+    A: Float[np.ndarray, "M c"],
 ) -> tuple[Float[np.ndarray, "M q"], Float[np.ndarray, " q"]]:
-    """Orthonormal columns that span ``A``'s, and their singular values.
-
-    Those below ``tolerance`` of the largest are left out.
-    """
+    """Orthonormal columns that span ``A``'s (`RANK_TOLERANCE`), and singular values."""
     U, s, _ = np.linalg.svd(A, full_matrices=False)
-    kept = s > tolerance * np.max(s, initial=0.0)
+    kept = s > RANK_TOLERANCE * np.max(s, initial=0.0)
     return U[:, kept], s[kept]
 
 
@@ -125,7 +122,7 @@ def _grouped_basis(own: Columns, run: Int[np.ndarray, " N"]) -> tuple[Columns, i
         return own[..., :0], 0
     edges = np.flatnonzero(np.diff(run, prepend=-1, append=-1))
     for i, j in pairwise(edges):
-        U, _ = _orthonormal_basis(own[i:j].reshape(-1, own.shape[2]), RANK_TOLERANCE)
+        U, _ = _orthonormal_basis(own[i:j].reshape(-1, own.shape[2]))
         basis[i:j, :, : U.shape[1]] = U.reshape(j - i, own.shape[1], -1)
         rank += U.shape[1]
     return basis, rank
