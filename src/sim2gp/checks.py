@@ -1,4 +1,4 @@
-"""What users give, checked once where they give it: settings, and functions.
+"""Checks: of settings and functions, once where users give them, and of results.
 
 Settings are numbers that something real must be able to have: a period is positive, a
 standard deviation is not negative, bounds are in order. Only numbers that are known are
@@ -18,7 +18,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from sim2gp.errors import InputError, Sim2GPError, error, nearest
+from sim2gp.errors import InputError, NotFinite, Sim2GPError, error, nearest
 
 #: What calls return that were traced already; more than so many are forgotten.
 _KNOWN: dict[Any, Any] = {}
@@ -304,3 +304,12 @@ def _kind(called: Any) -> Any:
     except TypeError:
         return None
     return kind
+
+
+# -------------------------------------------------------------------------- results
+def finite_results(where: str, what: str, A: np.ndarray) -> None:
+    """E203 (`NotFinite`) for an array of results with entries that are not finite."""
+    bad = int(np.sum(~np.isfinite(A)))
+    if bad:
+        got = f"{bad} of {A.size}"
+        raise error("results_not_finite", NotFinite, where=where, got=got, what=what)

@@ -14,6 +14,7 @@ from crawler import written
 from key_changes import GROUP, write_files
 from sim2gp import systems as sy
 from sim2gp.data.transitions import Transitions
+from sim2gp.identification.misfit.tests import misfit
 from sim2gp.inference.convergence import STALLED, Convergence
 from sim2gp.models.nlm import checked
 from sim2gp.project import Project, load_project
@@ -241,6 +242,11 @@ WRITTEN: tuple[Case, ...] = (
         136,
         "fits that fail",
         refusal("map_not_reached", stalled, "k (1 sd)"),
+        refusal(
+            "results_not_finite",
+            lambda: misfit(np.full((9, 1), np.nan), np.zeros((9, 1))),
+            "9 of 9",
+        ),
         refusal("no_finite_checkpoint", not_finite, "0 transitions"),
     ),
 )

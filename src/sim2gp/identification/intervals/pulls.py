@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from sim2gp import checks
 from sim2gp.data.windows import at_most
 from sim2gp.data.windows_likelihood import (
     AnyWindows,
@@ -20,7 +21,6 @@ from sim2gp.data.windows_likelihood import (
     linearise,
     together,
 )
-from sim2gp.identification.misfit.tests import must_be_finite
 from sim2gp.inference.estimate import Estimate
 from sim2gp.types import in_float64
 
@@ -115,7 +115,7 @@ def pulls_of_windows(
 def pulls_of_rows(rows: WindowRows, group: Int[np.ndarray, " W"]) -> Pulls:
     """Of runs of windows whose ``group`` is given; raises `NotFinite` E203."""
     R = rows.factors
-    must_be_finite("derivatives or residuals", R, "the intervals")
+    checks.finite_results("the intervals", "derivatives or residuals", R)
     scores = np.einsum("wkp,wk->wp", R[..., :-1], R[..., -1])
     return Pulls(R[..., :-1], scores, np.asarray(group)[rows.first])
 

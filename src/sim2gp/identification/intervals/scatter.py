@@ -57,9 +57,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from sim2gp import checks
 from sim2gp.identification.intervals.averaging import NONE, NOTHING, Groups, averaged
 from sim2gp.identification.intervals.pulls import Pulls
-from sim2gp.identification.misfit.tests import must_be_finite
 from sim2gp.identification.missing_physics.curves import Curve
 from sim2gp.identification.words import digits
 from sim2gp.inference.gaussian import Gaussian
@@ -123,7 +123,7 @@ def correct_posterior(
     `NotFinite` E203 for a pull that is not a number.
     """
     for what in (pulls.factors, pulls.scores):
-        must_be_finite("pulls of windows", what, "the intervals")
+        checks.finite_results("the intervals", "pulls of windows", what)
     L0, mu0 = np.asarray(prior.scale), np.asarray(prior.mean)
     z, pulls, data, R = _at_the_map(prior, plain.mean, pulls)
     p = len(mu0)

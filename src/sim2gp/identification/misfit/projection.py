@@ -29,7 +29,8 @@ class ProjectedResiduals:
         valid: Bool[np.ndarray, "N d"],
     ) -> None:
         self.r, self.J, self.own, self.run, self.valid = r, J, own, run, valid
-        self.own_basis, self.own_rank = _grouped_basis(own, run)
+        self.first = np.flatnonzero(np.diff(run, prepend=-1))  # rows of the groups
+        self.own_basis, self.own_rank = _grouped_basis(own, self.first)
         flat = self._without_own(J).reshape(-1, J.shape[2])
         self.basis, self.size = _orthonormal_basis(flat)
         self.e = self.without(r)[..., 0]
@@ -49,10 +50,9 @@ class ProjectedResiduals:
         if own.shape[2] == 0:
             return A
         found = np.empty_like(A)
-        first = np.flatnonzero(np.diff(self.run, prepend=-1))
         for j in range(A.shape[2]):  # all products at once are several times ``A``
             products = np.einsum("ndi,nd->ni", own, A[..., j])
-            sums = np.add.reduceat(products, first, axis=0)[self.run]
+            sums = np.add.reduceat(products, self.first, axis=0)[self.run]
             found[..., j] = A[..., j] - np.einsum("ndi,ni->nd", own, sums)
         return found
 
@@ -115,13 +115,12 @@ def _gains(
     return np.asarray((U.T @ R[:c, c])[s > limit])
 
 
-def _grouped_basis(own: Columns, run: Int[np.ndarray, " N"]) -> tuple[Columns, int]:
+def _grouped_basis(own: Columns, first: Int[np.ndarray, " G"]) -> tuple[Columns, int]:
     """An orthonormal basis of each group's own columns, in its rows; and all ranks."""
     basis, rank = np.zeros_like(own), 0
     if own.shape[2] == 0 or not own.any():
         return own[..., :0], 0
-    edges = np.flatnonzero(np.diff(run, prepend=-1, append=-1))
-    for i, j in pairwise(edges):
+    for i, j in pairwise([*first.tolist(), len(own)]):
         U, _ = _orthonormal_basis(own[i:j].reshape(-1, own.shape[2]))
         basis[i:j, :, : U.shape[1]] = U.reshape(j - i, own.shape[1], -1)
         rank += U.shape[1]

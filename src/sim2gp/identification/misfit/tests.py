@@ -28,7 +28,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.special import chdtrc, gammaincc
 
-from sim2gp.errors import NotFinite
+from sim2gp import checks
 from sim2gp.identification.misfit.projection import SPARE, ProjectedResiduals
 from sim2gp.identification.misfit.words import Finding, make_finding, misfit_verdict
 
@@ -100,7 +100,7 @@ def misfit(
     named = {"residuals": (r,), "Jacobian": (J, own), "inputs": (x, extra)}
     for what, arrays in named.items():
         for A in arrays:
-            must_be_finite(what, A, "the misfit tests")
+            checks.finite_results("the misfit tests", what, A)
     x, extra = _standardised(x, used), _standardised(extra, used)
     names = list(channels) or [f"channel {c + 1}" for c in range(d)]
 
@@ -266,16 +266,3 @@ def _standardised(
     live = ~(spread <= 1e-9 * (np.abs(middle) + spread))
     z = (x[:, live] - middle[live]) / spread[live]
     return np.where(used[:, None], z, 0.0)
-
-
-def must_be_finite(what: str, A: np.ndarray, where: str) -> None:
-    """Raise E203 where an entry is not a number."""
-    bad = int(np.sum(~np.isfinite(A)))
-    if bad:
-        raise NotFinite(
-            "E203",
-            f"{what} that are not numbers",
-            where=where,
-            got=f"{bad} of {A.size}",
-            fix="mask the rows, or look for the state at which the simulation fails",
-        )
