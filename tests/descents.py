@@ -82,6 +82,14 @@ def some_noise():
     return Noise(jnp.asarray([0.2, 0.05]), jnp.asarray([1.0, 0.6, 2.0]))
 
 
+def stacked(x):
+    """All whitened rows, priors included, of ``x = (z, e)``: one dense problem."""
+    z, e = x[:2], x[2:].reshape(3, 2)
+    noise = some_noise()
+    weight = jnp.sqrt(noise.weights)[:, None, None] / noise.sd[None, None]
+    return jnp.concatenate([(curves(z, e) * weight).reshape(-1), x])
+
+
 class Curves(AbstractLikelihood):
     """The same as a likelihood."""
 

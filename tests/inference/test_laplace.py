@@ -7,7 +7,7 @@ import pytest
 import scipy.optimize
 
 import descents
-from descents import Curves, curves, some_noise, whitened
+from descents import Curves, curves, some_noise, stacked, whitened
 from sim2gp.errors import DeadParameters, NotConverged, NotFinite
 from sim2gp.inference import estimate as estimates
 from sim2gp.inference.arrowhead import Noise
@@ -309,14 +309,6 @@ def test_a_step_that_gains_nothing_is_not_taken():
 
 
 # Nuisances
-
-
-def stacked(x):
-    """All whitened rows, priors included, of ``x = (z, e)``: one dense problem."""
-    z, e = x[:2], x[2:].reshape(3, 2)
-    noise = some_noise()
-    weight = jnp.sqrt(noise.weights)[:, None, None] / noise.sd[None, None]
-    return jnp.concatenate([(curves(z, e) * weight).reshape(-1), x])
 
 
 def fit_of_curves():
