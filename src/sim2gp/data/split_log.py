@@ -23,12 +23,14 @@ from sim2gp.systems.base import AbstractSystem, index_of
 HALF_WIDTH = 0.025  # s, half the span of the local parabola that guesses a start
 PAST = 0.049  # s, the span of the causal one: 25 samples of 2 ms
 SPACING = 0.1  # s, between the starts of forecasts
-#: A start's unmeasured rate may lie so many times its rms away, or what slopes over
-#: different times differ by. A servo forgets its start's rate at once: only this prior
-#: keeps it from where forces saturate, where a simulation jumps (with 10 in place of 3
-#: one of the thirty windows of an arm's log began there, and the parameters followed
-#: it).
-FAR = 3.0
+#: Prior sd of a start's unmeasured rate in windows of LONG seconds: so many times its
+#: rms, or what slopes over different times differ by. A servo forgets its start's rate
+#: at once: only this prior keeps it from where forces saturate, where a simulation
+#: jumps (with 10 in place of 3 one of the thirty windows of an arm's log began there,
+#: and the parameters followed it). A guess is wrong where the input jumps, so its
+#: prior pulls at the parameters: of shorter windows, as there are more of them, it is
+#: wider, and a second of log has the same share of pulls.
+FAR, LONG = 3.0, 5.0
 Start = Literal["smoothed", "causal"]
 
 
@@ -87,7 +89,7 @@ def cuts_of(
         x0 = _recorded_starts(logs, pieces, measured, system)
         sd = np.zeros_like(x0)
     else:
-        x0, sd = _guessed_starts(logs, pieces, measured, system, start, quantum)
+        x0, sd = _guessed_starts(logs, pieces, measured, system, start, quantum, window)
     # A first row that is the start itself is no measurement of it.
     first, used = int(window == 0.0), np.ones(len(pieces), bool)
     cuts = Cuts(system, logs, pieces, measured, x0, sd, quantum, used, first)
@@ -151,6 +153,7 @@ def _guessed_starts(
     system: AbstractSystem,
     start: Start,
     quantum: Float[np.ndarray, " c"],
+    window: float,
 ) -> tuple[Float[np.ndarray, "W n"], Float[np.ndarray, "W n"]]:
     """Starts of windows, and the sd of their prior.
 
@@ -170,7 +173,8 @@ def _guessed_starts(
             wider[w] = start_of(names, measured, *twice(i))
     # Slopes over twice the time differ by about what either is wrong by.
     doubt = np.sqrt(np.mean((x0 - wider) ** 2, axis=0))
-    spread = FAR * np.minimum(np.sqrt(np.mean(x0**2, axis=0)), doubt)
+    far = FAR * math.sqrt(max(LONG / window, 1.0))
+    spread = far * np.minimum(np.sqrt(np.mean(x0**2, axis=0)), doubt)
     for name, step in zip(measured, quantum, strict=True):
         spread[names.index(name)] = 100.0 * step
     spread = np.where(spread > 0.0, spread, 1.0)
