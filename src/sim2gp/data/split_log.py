@@ -30,7 +30,7 @@ SPACING = 0.1  # s, between the starts of forecasts
 #: and the parameters followed it). A guess is wrong where the input jumps, so its
 #: prior pulls at the parameters: of shorter windows, as there are more of them, it is
 #: wider, and a second of log has the same share of pulls.
-FAR, LONG = 3.0, 5.0
+FAR, LONG = 3.0, 2.0
 Start = Literal["smoothed", "causal"]
 
 
