@@ -60,8 +60,8 @@ def record(path: Path, seconds: float) -> None:
 
     model = mujoco.MjModel.from_xml_string(ARM)
     data, rng, rows = mujoco.MjData(model), np.random.default_rng(1), []
-    count, gear = round(seconds / 0.02), model.actuator_gear[:, 0]
-    gear *= 1.3
+    model.actuator_gear[:, 0] *= 1.3
+    count = round(seconds / 0.02)
     u = np.repeat(rng.uniform(-1.0, 1.0, (count // 5 + 1, 2)), 5, axis=0)
     for k in range(count):
         u[k] = np.clip(u[k] - 0.3 * (data.qpos + data.qvel), -1.0, 1.0)

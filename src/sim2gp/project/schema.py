@@ -195,7 +195,8 @@ class LikelihoodSpec(Section):
     and collisions."""
     start_sd: Positive | dict[str, Positive] | None = None
     """Sd of the start about that guess, by channel or for all. By default 100 sensor
-    steps if the state is measured, else 3 to 10 times the guess's own error."""
+    steps if the state is measured, else 3 times the error of the guess, more in windows
+    below 2 s."""
     noise_floor: Positive | dict[str, Positive] | None = None
     """The smallest noise sd, by channel or for all; by default the sensor's step, which
     is read from the log."""
