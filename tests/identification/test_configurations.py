@@ -182,12 +182,12 @@ def test_a_linear_machine_has_the_closed_form() -> None:
 
 
 @eqx.filter_jit
-def descend(system: AbstractSystem, windows: Windows) -> Found:
-    prior = system.parameters.prior()
-    W, n = windows.start.shape
+def descend(likelihood: WindowsLikelihood) -> Found:
+    table = likelihood.system.parameters
+    prior = table.prior()
+    W, n = likelihood.windows.start.shape
     noise = Noise(jnp.asarray([1e-3]), jnp.ones(W))
-    likelihood = WindowsLikelihood(system, windows)
-    about = ParameterPrior(prior, system.parameters)
+    about = ParameterPrior(prior, table)
     start, e = jnp.zeros(prior.mean.size), jnp.zeros((W, n))
     return minimise(likelihood, start, e, noise, about)
 
@@ -199,13 +199,13 @@ def test_sharing_nothing_is_two_fits(logs: tuple[Log, Log]) -> None:
     every = machine.parameters.names
     system = joint(*(Variant(n, own=every) for n in ("a", "b")))
     whole, _ = cut(logs, system, window=0.2)
-    both = descend(system, jax.tree.map(jnp.asarray, whole))
+    both = descend(WindowsLikelihood(system, whole))
     order = [[f"{n} @ {c}" for n in every] for c in ("a", "b")]
     cost = evidence = 0.0
     for k, columns in enumerate(order):
         mine = whole.configuration == k
         part = jax.tree.map(lambda x, m=mine: x[m] if len(x) == len(m) else x, whole)
-        one = descend(machine, jax.tree.map(jnp.asarray, part))
+        one = descend(WindowsLikelihood(machine, part))
         at = [system.parameters.names.index(name) for name in columns]
         scale = np.asarray(one.about.scale())
         sd = np.sqrt(np.sum(scale**2, axis=1))
