@@ -231,7 +231,9 @@ def cell(case: Case, pictures: Path | None = None) -> dict[str, Any]:
     names = [c.name for c in found.found]
     result: dict[str, Any] = {**case._asdict(), "reported": names}
     result["probability"] = {k: round(p, 4) for k, p in found.each.items()}
-    if planted is None:
+    if found.failure:  # a fit did not converge: nothing is said of any force
+        result |= {"failure": found.failure, "named": False, "inside": 0.0}
+    if found.failure or planted is None:
         return result
     curve = next(
         c for c in found.curves if (c.where, c.of) == (planted.where, planted.of)
@@ -299,6 +301,7 @@ def claims(found: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
     return {
         "inside": {"right": sum(right), "of": len(right), "bar": 0.9},
+        "failed": sum("failure" in c for c in found),
         "reported where none is": {"count": sum(alarms), "of": len(alarms), "bar": 2},
         "shapes": by,
     }

@@ -1,6 +1,7 @@
 """Forces that are found: their sizes against closed forms, and planted ones."""
 
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +28,7 @@ from sim2gp.identification.missing_physics.forces import (
 )
 from sim2gp.inference.convergence import CONVERGED, NOT_FINITE, STALLED
 from sim2gp.inference.estimate import Estimate, estimate
-from sim2gp.inference.groups import best_ended
+from sim2gp.inference.groups import Start, best_ended, estimate_groups
 from sim2gp.inference.parameters import Parameter, Parameters
 from sim2gp.inference.prior import ParameterPrior
 from sim2gp.inference.relevance import OFF, TRIED
@@ -193,6 +194,24 @@ def test_a_detent_is_drawn_and_nothing_is_not() -> None:
     assert found["error"] < 0.2 * found["size"]
     data, _, _ = study.data_for(study.Case("cartpole", study.NOTHING, 4))
     assert find_forces(data, data.fit()).found == ()
+
+
+@pytest.mark.nightly
+def test_fits_without_a_force_need_their_evidence_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Each ends away from its MAP here; the fit that is drawn does not."""
+
+    def ends(likelihood: Any, prior: ParameterPrior, last: Start) -> Estimate:
+        fit = estimate_groups(likelihood, prior, last)
+        if not bool(last.enough):  # the first
+            return fit
+        how = {"status": jnp.asarray(STALLED), "newton_step_sd": jnp.asarray(0.1)}
+        return replace(fit, convergence=replace(fit.convergence, **how))
+
+    monkeypatch.setattr(forces, "estimate_groups", ends)
+    found = study.cell(study.Case("cartpole", "notch", 4))
+    assert found["reported"] == ["x by x"]
 
 
 @pytest.mark.nightly

@@ -31,8 +31,11 @@ class Convergence(eqx.Module):
         known = {name: x for name, x in finite.items() if math.isfinite(x)}
         return {"steps": int(self.steps), **known}
 
-    def check(self, names: tuple[str, ...], where: str) -> None:
-        """Raise a typed error on the host, naming what to look at."""
+    def check(self, names: tuple[str, ...], where: str, near: float = NEAR) -> None:
+        """Raise a typed error on the host, naming what to look at.
+
+        The MAP may be ``near``, in posterior sd.
+        """
         status = int(self.status)
         if status == NOT_FINITE:
             raise error("fit_not_finite", NotFinite, where=where)
@@ -41,16 +44,16 @@ class Convergence(eqx.Module):
             raise error(
                 "no_parameter_reaches_data", DeadParameters, where=where, got=got
             )
-        if status == STALLED:
+        if status == STALLED and not float(self.newton_step_sd) <= near:
             step = f"{float(self.newton_step_sd):.1e} posterior sd"
             got = (
                 f"scaled gradient {float(self.gradient):.1e} "
                 f"({step}) after {int(self.steps)} steps; farthest off: "
                 f"{self._farthest(names)}"
             )
-            near = f"{NEAR:g}"
+            limit = f"{near:g}"
             raise error(
-                "map_not_reached", NotConverged, where=where, got=got, near=near
+                "map_not_reached", NotConverged, where=where, got=got, near=limit
             )
 
     def _farthest(self, names: tuple[str, ...]) -> str:

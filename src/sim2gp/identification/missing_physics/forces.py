@@ -63,6 +63,7 @@ from sim2gp.systems.mechanism import takes_forces
 from sim2gp.types import in_float64
 
 SHARE = 0.3  # of a force, that its shape may be another
+COMPARED = 1.0  # posterior sd from its MAP, of a fit whose evidence is compared alone
 EXCLUDED = 2.0  # nats less than without it: the data exclude a force of this size
 
 
@@ -132,9 +133,9 @@ def _fitted(
     likelihood = data.likelihood(system)
     first = likelihood.first_noise().sd
 
-    def fit(last: Start) -> _Fit:
+    def fit(last: Start, near: float = NEAR) -> _Fit:
         found = estimate_groups(likelihood, prior, last)
-        found.convergence.check(table.names, "the data")
+        found.convergence.check(table.names, "the data", near)
         return _Fit(found, np.asarray(prior.scales_in(found.prior)))
 
     def without(best: _Fit, name: str) -> _Fit:
@@ -145,7 +146,7 @@ def _fitted(
         scales = jnp.where(off, NEVER, jnp.asarray(best.scales))
         # Only this start: what has no more noise than nothing at all is enough.
         noise = jnp.maximum(first, best.found.noise.sd)
-        return fit(Start(z, noise, scales, jnp.ones((), bool)))
+        return fit(Start(z, noise, scales, jnp.ones((), bool)), COMPARED)
 
     none = jnp.zeros((), bool)
     best = fit(Start(jnp.zeros(p), first, jnp.ones(len(names)), none))
@@ -158,6 +159,7 @@ def _fitted(
         if not gains or min(gains.values()) >= 0.0:
             break
         best = tried[min(gains, key=gains.__getitem__)]
+        best.found.convergence.check(table.names, "the data")
     each = {n: 1.0 / (1.0 + math.exp(-min(g + EARNED, 50.0))) for n, g in gains.items()}
     nothing = math.prod((1.0 - p for p in each.values()), start=1.0)
     most = _largest(best.found, prior.scaled(jnp.asarray(best.scales)), alike)
