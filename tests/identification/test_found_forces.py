@@ -215,7 +215,9 @@ def test_fits_without_a_force_need_their_evidence_alone(
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize(("shape", "index"), [("cable", 1016), ("stribeck", 1010)])
+@pytest.mark.parametrize(
+    ("shape", "index"), [("cable", 1016), ("stribeck", 1010), ("stribeck", 1061)]
+)
 def test_a_force_on_an_arm_is_within_its_band(shape: str, index: int) -> None:
     """In windows of a log: a weak cable, and friction of another shape than ours."""
     found = study.cell(study.Case(study.ARM, shape, index))

@@ -1,5 +1,7 @@
 """One step of a descent, against the dense problem of all unknowns."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -47,3 +49,19 @@ def test_a_step_that_costs_more_is_refused():
     keep, (lowered, refused) = lm.judged(high, low, promised, one, refused)
     assert keep
     assert (float(lowered), float(refused)) == (pytest.approx(0.1), 0.0)
+
+
+@pytest.mark.parametrize(("saved", "kept"), [(0.09, False), (0.11, True)])
+def test_a_step_may_have_to_save_a_share_of_what_it_should(saved, kept):
+    low, high = sorted((here([0.3, 0.2]), here([3.0, -2.0])), key=lambda at: at.cost)
+    promised, one, none = (high.cost - low.cost) / saved, jnp.ones(()), jnp.zeros(())
+    keep, (damping, refused) = lm.judged(high, low, promised, one, none, 0.1)
+    assert bool(keep) == kept
+    assert float(refused) == (0.0 if kept else 1.0)
+    assert float(damping) == pytest.approx(
+        1.0 - (2.0 * saved - 1.0) ** 3 if kept else lm.RAISE
+    )
+    assert lm.judged(high, low, promised, one, none)[0]
+    # A start has nothing to be compared with.
+    nothing = replace(here([0.3, 0.2]), cost=jnp.asarray(jnp.inf))
+    assert lm.judged(nothing, low, jnp.asarray(jnp.nan), one, none)[0]

@@ -8,7 +8,8 @@ Rubin 1977, section 3), until Newton's step and the noise rest.
 In a curved valley a step of Gauss-Newton ends off the floor, where the cost is more,
 and the next one leads back to it. So a step that is refused is followed by one more
 before it is given up (the watchdog: Chamberlain et al. 1982, Mathematical Programming
-Study 16).
+Study 16). Both together must save a share of what the first one should have: where
+friction changes sign, pairs that save next to nothing would follow each other for ever.
 
 Scales of a prior are chosen on the linearised model, which is true nearby alone. A
 choice is judged by the simulator: where the descent after it ends with less evidence,
@@ -52,6 +53,8 @@ MOST_STEPS, FIRST_STEPS = 300, 30
 #: Choices of scales, and steps until the next where the descent does not come close;
 #: and the relative change of a scale that asks for another choice.
 CHOICES, BETWEEN, SAME = 10, 10, 0.1
+#: Of what a step should save, where it and the next one are kept together.
+SUFFICIENT = 0.1
 #: Precision that keeps parameters in place in the first choice, in that of their prior;
 #: what it is multiplied by after one that is undone.
 TRUST, LESS = 10.0, 10.0
@@ -127,7 +130,8 @@ class _State(NamedTuple):
     """A descent between two steps.
 
     The next step is from ``here``, which is ``away`` from the ``best`` point where the
-    last step was refused for the first time. ``newton`` is the undamped step that
+    last step was refused for the first time; that step ``promised`` to save so much.
+    ``newton`` is the undamped step that
     remains at the best, in posterior sd, ``change`` the noise's in the last step.
     Derivatives are ``stale`` where linear parameters have moved since, and the next
     step takes them ``again``. A step in ``vain`` is too short to gain anything.
@@ -143,6 +147,7 @@ class _State(NamedTuple):
     newton: Scalar
     change: Scalar
     away: Bool[Array, ""]
+    promised: Scalar
     stale: Bool[Array, ""]
     again: Bool[Array, ""]
     vain: Bool[Array, ""]
@@ -224,7 +229,7 @@ def _begun(
         trust = jnp.full((), TRUST)
         choice = _Choice(nowhere, noise, prior, -far, trust, zero, zero, far)
     about = nowhere, nowhere, noise, prior, jnp.full((), FIRST_DAMPING), none, zero
-    return _State(*about, far, far, no, no, no, no, choice)
+    return _State(*about, far, far, no, none, no, no, no, choice)
 
 
 def _descend(
@@ -268,7 +273,9 @@ def _stepped(
     z, e = _select(first, (turn.z, turn.e), (z, e))
     found = evaluate(likelihood, s.prior, z, e, s.noise)
     there = relaxed(s.prior, found, s.noise)
-    keep, tried = judged(s.best, there, predicted, s.damping, s.refused)
+    promised = jnp.where(s.away, s.promised, predicted)
+    share = jnp.where(s.away, SUFFICIENT, 0.0)
+    keep, tried = judged(s.best, there, promised, s.damping, s.refused, share)
     refused = ~keep & ~seen
     again = refused & s.stale
     away = refused & ~again & ~s.away & ~first & jnp.isfinite(there.cost)
@@ -281,7 +288,7 @@ def _stepped(
     best = _select(refused, s.best, there)
     here = _select(away, there, best)
     now = s._replace(here=here, best=best, damping=damping, refused=in_turn)
-    now = now._replace(taken=s.taken + 1, away=away)
+    now = now._replace(taken=s.taken + 1, away=away, promised=promised)
     now = now._replace(stale=stale, again=again, vain=vain)
     learned = lambda: _learned(learning, now)  # noqa: E731
     now = jax.lax.cond(turn.searching | away, lambda: now, learned)

@@ -81,14 +81,19 @@ def judged(
     predicted_reduction: AnyScalar,
     damping: Scalar,
     refused: Scalar,
+    share: float | Scalar = 0.0,
 ) -> tuple[Bool[Array, ""], tuple[Scalar, Scalar]]:
-    """Whether a step is kept, the next one's damping, and how many were refused."""
+    """Whether a step is kept, the next one's damping, and how many were refused.
+
+    It is kept where it saves at least this ``share`` of what it should.
+    """
     actual_reduction = here.cost - there.cost
     # Rounding in the cost must not refuse the last, gradient-only digits.
     slack = 1e-12 * (1.0 + there.cost)
     flatter = there.gradient < here.gradient
     lost_in_rounding = (jnp.abs(actual_reduction) <= slack) & flatter
-    keep = (actual_reduction > slack) | lost_in_rounding
+    little = actual_reduction < share * predicted_reduction
+    keep = ((actual_reduction > slack) & ~little) | lost_in_rounding
     ratio = actual_reduction / predicted_reduction
     ratio = jnp.where(lost_in_rounding, 1.0, ratio)  # rounding has none
     refused = jnp.where(keep, 0.0, refused + 1.0)
