@@ -31,10 +31,11 @@ class Convergence(eqx.Module):
         known = {name: x for name, x in finite.items() if math.isfinite(x)}
         return {"steps": int(self.steps), **known}
 
-    def check(self, names: tuple[str, ...], where: str, near: float = NEAR) -> None:
+    def check(self, names: tuple[str, ...], where: str, near: float = 0.0) -> None:
         """Raise a typed error on the host, naming what to look at.
 
-        The MAP may be ``near``, in posterior sd.
+        A fit that has stalled is an answer as well where its MAP is no farther than
+        ``near``, in posterior sd.
         """
         status = int(self.status)
         if status == NOT_FINITE:
@@ -51,7 +52,7 @@ class Convergence(eqx.Module):
                 f"({step}) after {int(self.steps)} steps; farthest off: "
                 f"{self._farthest(names)}"
             )
-            limit = f"{near:g}"
+            limit = f"{max(near, NEAR):g}"
             raise error(
                 "map_not_reached", NotConverged, where=where, got=got, near=limit
             )

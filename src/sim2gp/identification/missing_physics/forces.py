@@ -133,7 +133,7 @@ def _fitted(
     likelihood = data.likelihood(system)
     first = likelihood.first_noise().sd
 
-    def fit(last: Start, near: float = NEAR) -> _Fit:
+    def fit(last: Start, near: float = 0.0) -> _Fit:
         found = estimate_groups(likelihood, prior, last)
         found.convergence.check(table.names, "the data", near)
         return _Fit(found, np.asarray(prior.scales_in(found.prior)))
