@@ -232,8 +232,8 @@ def cell(case: Case, pictures: Path | None = None) -> dict[str, Any]:
     result: dict[str, Any] = {**case._asdict(), "reported": names}
     result["probability"] = {k: round(p, 4) for k, p in found.each.items()}
     if found.failure:  # a fit did not converge: nothing is said of any force
-        result |= {"failure": found.failure, "named": False, "inside": 0.0}
-    if found.failure or planted is None:
+        return result | {"failure": found.failure, "named": False, "inside": 0.0}
+    if planted is None:
         return result
     curve = next(
         c for c in found.curves if (c.where, c.of) == (planted.where, planted.of)

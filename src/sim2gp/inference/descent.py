@@ -131,10 +131,10 @@ class _State(NamedTuple):
 
     The next step is from ``here``, which is ``away`` from the ``best`` point where the
     last step was refused for the first time; that step ``promised`` to save so much.
-    ``newton`` is the undamped step that
-    remains at the best, in posterior sd, ``change`` the noise's in the last step.
-    Derivatives are ``stale`` where linear parameters have moved since, and the next
-    step takes them ``again``. A step in ``vain`` is too short to gain anything.
+    ``newton`` is the undamped step that remains at the best, in posterior sd,
+    ``change`` the noise's in the last step. Derivatives are ``stale`` where linear
+    parameters have moved since, and the next step takes them ``again``. A step in
+    ``vain`` is too short to gain anything.
     """
 
     here: Point
