@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from sim2gp.cli import main
+from sim2gp.commands.example import example
+from sim2gp.commands.init import init
 from sim2gp.data.logs import Column, Log
 from sim2gp.data.split_log import cut
 from sim2gp.errors import InputError
@@ -162,6 +164,18 @@ def test_an_odd_log_becomes_a_project(tmp_path: Path, capsys) -> None:
     assert main(["init", *map(str, words)]) == 2
     assert "E132 file exists" in capsys.readouterr().err
     assert out.read_text() == text
+
+
+def test_a_doubt_that_more_windows_settle_is_none(tmp_path: Path) -> None:
+    """Forty windows leave open how the example's columns are read; all do not."""
+    pytest.importorskip("mujoco", reason="the extra `mujoco` is absent")
+    folder = example(tmp_path / "arm").parent
+    logs = [folder / name for name in ("first.csv", "second.csv")]
+    told = init(folder / "arm.xml", logs, out=folder / "mine.toml")
+    assert told["warnings"] == []
+    for column in told["columns"].values():
+        assert (column["sign"], column["offset"]) == (1, 0.0)
+        assert "the model predicts the log best so" in column["why"]
 
 
 def test_a_coarse_model_is_stepped_as_it_is() -> None:

@@ -6,7 +6,8 @@ reading of a channel. A window's score is the mean over measured channels of
     1/2 log( error^2 / motion^2 )
 
 and one reading beats another where its score is lower in most windows (a sign test).
-All readings are tried where they are few. Otherwise each joint is tried
+Readings that none beats are tried again on twice as many windows (a race; Maron and
+Moore 1994). All readings are tried where they are few. Otherwise each joint is tried
 with the inputs that act on it, twice around, while the other channels keep the best
 reading so far: first by its own prediction, then by those of all. The plainest reading
 stays unless another beats it; what the time did not suffice for, and what no window
@@ -26,7 +27,7 @@ from jaxtyping import Float
 from sim2gp.data.logs import Column, Log
 from sim2gp.data.logs.units import unit_factor
 from sim2gp.data.split_log import cut
-from sim2gp.data.windows import channel_motion
+from sim2gp.data.windows import Windows, channel_motion
 from sim2gp.systems import MuJoCo
 from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.simulate import inputs_of
@@ -34,7 +35,7 @@ from sim2gp.types import in_float64
 
 SURE = 3.0  # (windows won - windows lost) / sqrt(windows): the sign test's z
 WINDOW = 0.2  # s
-WINDOWS = 40  # that are tried
+WINDOWS, STAGES = 40, 4  # tried first; how often their number may double, and once
 SECONDS = 120.0  # of the logs, from which those windows are taken
 EXHAUSTIVE = 256  # readings at most; beyond, one joint after the other
 ROWS = 4096  # windows that are simulated together
@@ -146,29 +147,36 @@ def _settle_readings(
 ) -> None:
     """Try all readings of some channels; the others keep theirs.
 
-    ``alone``: by the predictions of these channels, while others may be misread.
+    Those that none beats are tried on twice as many windows, until none but images are
+    left. ``alone``: by the predictions of these channels, while others may be misread.
     """
     choices = itertools.product(*(asked.options[name] for name in names))
     tried = [dict(zip(names, choice, strict=True)) for choice in choices]
-    judged = names if alone else ()
-    scores = trial.scores([found.readings | each for each in tried], judged)
-    plain = {name: asked.options[name][0] for name in names}
-    mean = scores.mean(axis=1).round(6)
-    best = int(np.argmin(mean))
-    good = np.flatnonzero(_surer(scores, best) <= SURE)
-    chosen = min(good.tolist(), key=lambda k: (_departs(tried[k], plain), mean[k]))
-    same = np.abs(scores - scores[chosen]).max(axis=1) <= _SAME
-    surer = _surer(scores, chosen)
-    found.images *= int(same.sum())
-    for name in names:
-        others = [
-            (float(surer[k]), k)
-            for k, each in enumerate(tried)
-            if each[name] != tried[chosen][name] and not same[k]
-        ]
-        found.surer[name], k = min(others, default=(np.inf, chosen))
-        found.rivals[name] = tried[k]
-    found.readings |= tried[chosen]
+    judged, plain = names if alone else (), {n: asked.options[n][0] for n in names}
+    others, images = dict(found.readings), found.images
+    left, scores = np.arange(len(tried)), np.zeros((len(tried), 0))
+    surer = np.full(len(tried), np.inf)
+    for number in range(trial.stages):
+        more = trial.scores([others | tried[k] for k in left], judged, number)
+        scores = np.concatenate([scores, more], axis=1)
+        mean = scores.mean(axis=1).round(6)
+        behind = _surer(scores, int(np.argmin(mean)))
+        good = np.flatnonzero(behind <= SURE)
+        departs = {i: _departs(tried[left[i]], plain) for i in good.tolist()}
+        own = min(departs, key=lambda i: (departs[i], mean[i]))
+        same = np.abs(scores - scores[own]).max(axis=1) <= _SAME
+        surer[left] = np.where(behind > SURE, behind, _surer(scores, own))
+        surer[left[same]] = np.inf
+        chosen = tried[left[own]]
+        found.images = images * int(same.sum())
+        for name in names:
+            differ = [k for k, each in enumerate(tried) if each[name] != chosen[name]]
+            k = min(differ, key=lambda k: surer[k])
+            found.surer[name], found.rivals[name] = float(surer[k]), tried[k]
+        found.readings |= chosen
+        if same[good].all():
+            return
+        left, scores = left[good], scores[good]
 
 
 def _departs(readings: Readings, plain: Readings) -> tuple[int, int]:
@@ -187,16 +195,18 @@ def _surer(scores: Scores, k: int) -> Float[np.ndarray, " K"]:
 
 
 class _Trial:
-    """What readings of the windows with the most motion are worth."""
+    """What readings are worth on the windows with the most motion."""
 
     def __init__(self, system: AbstractSystem, asked: Question, until: float) -> None:
         windows, _ = cut(_beginning(asked.logs), system, window=WINDOW)
-        most = np.argsort(-channel_motion(windows).mean(axis=1), kind="stable")[
-            :WINDOWS
+        most = np.argsort(-channel_motion(windows).mean(axis=1), kind="stable")
+        ends = WINDOWS * 2 ** np.arange(STAGES)
+        each = (x for x in np.split(most[: ends[-1]], ends[:-1]) if x.size)
+        self.windows = [windows.some(np.sort(x)) for x in each]
+        now = np.zeros(windows.area.shape[-1])
+        self.inputs = [
+            np.stack([inputs_of(x, now) for x in w.held()]) for w in self.windows
         ]
-        self.windows = windows.some(np.sort(most))
-        now = np.zeros(self.windows.area.shape[-1])
-        self.inputs = np.stack([inputs_of(x, now) for x in self.windows.held()])
         self.states = [c.name for c in system.physical_states]
         self.actions = [c.name for c in system.actions]
         self.units = {
@@ -205,28 +215,40 @@ class _Trial:
         self.base = {name: finer(options) for name, options in asked.options.items()}
         self.step, self.until = _nominal_step(system), until
 
-    def scores(self, readings: Sequence[Readings], names: Sequence[str]) -> Scores:
+    @property
+    def stages(self) -> int:
+        """How often windows can be asked for."""
+        return len(self.windows)
+
+    def scores(
+        self, readings: Sequence[Readings], names: Sequence[str], stage: int
+    ) -> Scores:
         """Of each reading and window, by some channels or, where none is measured, all.
 
         Raises `TimeoutError` where time is over.
         """
-        many = max(1, ROWS // len(self.windows))
-        parts = range(0, len(readings), many)
-        each = np.concatenate([self._shares(readings[i : i + many]) for i in parts])
-        seen = [self.states[i].removesuffix(".velocity") for i in self.windows.outputs]
+        w, inputs = self.windows[stage], self.inputs[stage]
+        many = max(1, ROWS // len(w))
+        parts = (readings[i : i + many] for i in range(0, len(readings), many))
+        each = np.concatenate([self._shares(some, w, inputs) for some in parts])
+        seen = [self.states[i].removesuffix(".velocity") for i in w.outputs]
         own = [i for i, name in enumerate(seen) if name in names]
         found: Scores = each[..., own or range(len(seen))].mean(axis=2)
         return found
 
-    def _shares(self, readings: Sequence[Readings]) -> Float[np.ndarray, "K W c"]:
+    def _shares(
+        self,
+        readings: Sequence[Readings],
+        w: Windows,
+        inputs: Float[np.ndarray, "W L m"],
+    ) -> Float[np.ndarray, "K W c"]:
         """Log of error over motion, of each reading, window and channel."""
-        w, K = self.windows, len(readings)
-        seen = list(w.outputs)
+        K, seen = len(readings), list(w.outputs)
         scale, zero = self._read(readings, self.states)
         y = w.y * scale[:, None, None, seen] + zero[:, None, None, seen]
         start = w.start * scale[:, None] + zero[:, None]
         gain, offset = self._read(readings, self.actions)
-        u = self.inputs * gain[:, None, None] + offset[:, None, None]
+        u = inputs * gain[:, None, None] + offset[:, None, None]
         W, L = w.span.shape
         s = start.reshape(K * W, -1)
         u = u.reshape(K * W, L, -1)
