@@ -282,6 +282,7 @@ COMMANDS: tuple[Case, ...] = (
         "runs and horizons of commands",
         line("not_an_identification", "evaluate other --logs a.csv", "got evaluate"),
         line("nothing_to_explain", "explain other", "got evaluate"),
+        line("file_in_place_of_a_run", "explain project.toml", "runs/project"),
         line("one_recording", "evaluate project.toml"),
         line("no_such_part", "identify project.toml --each robot", "{robot}"),
         line(

@@ -330,6 +330,7 @@ SECOND: tuple[Case, ...] = (
         "YAML alias bomb",
         written(BOMB, "project_file_in_yaml", "aliases", name="project.yaml"),
         written(BOMB, "project_file_in_yaml", "aliases"),
+        written("<mujoco/>", "model_as_project_file", "sim2gp init", name="arm.xml"),
     ),
     case(
         64,

@@ -192,7 +192,9 @@ def test_a_coarse_model_is_stepped_as_it_is() -> None:
     np.testing.assert_allclose(spans[spans > 0.0], 0.03, rtol=1e-9)
 
 
-def test_what_a_log_needs_to_be_read_is_said_in_the_draft(tmp_path: Path) -> None:
+def test_what_a_log_needs_to_be_read_is_said_in_the_draft(
+    tmp_path: Path, capsys
+) -> None:
     """A stamp that stands twice, a value that is none: the key, and where."""
     (tmp_path / "pendulum.xml").write_text(MODEL)
     odd_log(tmp_path / "run.csv")
@@ -204,6 +206,9 @@ def test_what_a_log_needs_to_be_read_is_said_in_the_draft(tmp_path: Path) -> Non
     out = tmp_path / "pendulum.toml"
     words = [tmp_path / "pendulum.xml", tmp_path / "run.csv", "--out", out]
     assert main(["init", *map(str, words), "--no-readings"]) == 0
+    told = capsys.readouterr().err
+    assert "the file has keep_first = true: duplicate time stamp in" in told
+    assert "the file has drop_nonfinite = true: value that is not finite in" in told
     text = out.read_text()
     assert "keep_first = true  # duplicate time stamp in" in text
     assert "drop_nonfinite = true  # value that is not finite in" in text

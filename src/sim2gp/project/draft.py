@@ -81,12 +81,16 @@ class Request:
 
 @dataclass(frozen=True)
 class Draft:
-    """What was found: the file's text, each channel's column, and why."""
+    """What was found: the file's text, each channel's column, and why.
+
+    ``mended`` has the keys of `_MENDS` without which the logs cannot be read, and why.
+    """
 
     system: AbstractSystem
     text: str
     columns: dict[str, Match]
     found: BestReadings
+    mended: Mapping[str, str] = field(default_factory=dict)
     selection: Selection | None = None
 
 
@@ -135,7 +139,7 @@ def draft_project(asked: Request) -> Draft:
         text = draft_text(contents)
         replace_project(asked.out, text, lambda _: None)
     asked.step("project file")
-    return Draft(system, text, said, found, contents.selection)
+    return Draft(system, text, said, found, mended, contents.selection)
 
 
 def _find_machine(asked: Request) -> AbstractSystem:
@@ -353,7 +357,9 @@ def draft_summary(draft: Draft, out: Path) -> dict[str, Any]:
         for name, m in draft.columns.items()
         if name not in surer and "not tried" in m.why
     ]
-    warnings = []
+    warnings = [
+        f"the file has {key} = true: {why}" for key, why in draft.mended.items()
+    ]
     if doubts:
         are = "is" if len(doubts) == 1 else "are"
         warnings.append(

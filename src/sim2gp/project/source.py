@@ -76,7 +76,7 @@ def parse_project(text: str, name: str) -> ProjectSource:
     try:
         values = tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError, ValueError) as caught:
-        raise _yaml(name, bare) or _syntax(name, text, str(caught)) from caught
+        raise _other_file(name, bare) or _syntax(name, text, str(caught)) from caught
     lines: dict[Path_, int] = {}
     for key, line in _key_lines(text, bare):
         lines.setdefault(key, line)  # of a table in pieces, the first
@@ -92,9 +92,12 @@ def _too_large(name: str, got: str, expected: str) -> InputError:
     return error("project_file_too_large", where=name, got=got, expected=expected)
 
 
-def _yaml(name: str, bare: str) -> InputError | None:
-    """A file that begins as YAML does is not read, under any name."""
+def _other_file(name: str, bare: str) -> InputError | None:
+    """A file that begins as a model does, or as YAML, is not read, under any name."""
     line = next((x for x in bare.splitlines() if x.strip()), "")
+    if line.lstrip().startswith("<"):
+        got = "XML, as of a model"
+        return error("model_as_project_file", where=name, got=got, name=name)
     if not _YAML.match(line):
         return None
     got = "YAML, whose aliases and tags are not read"

@@ -85,6 +85,9 @@ def read_manifest(path: Path) -> dict[str, Any]:
 
 def not_a_run(path: Path, got: str) -> InputError:
     """E130: nothing that a command of ours wrote."""
+    if path.is_file():
+        where, stem, got = str(path), path.stem, "a file"
+        return error("file_in_place_of_a_run", where=where, got=got, stem=stem)
     return error("not_a_run", where=str(path), got=got)
 
 
