@@ -113,7 +113,7 @@ def entry(mean: float, sd: float, left: float, times: float = 1.0) -> dict[str, 
 @pytest.mark.parametrize(
     ("expected", "nats", "worth", "words"),
     [
-        ({"m": entry(2.0, 0.2, 0.5)}, 3.0, True, "m, known within 10 % now"),
+        ({"m": entry(2.0, 0.2, 0.5)}, 3.0, True, "of m should fall from 10 to 5 %"),
         ({"m": entry(2.0, 0.02, 0.5)}, 3.0, False, "m known within 2 % already"),
         ({"m": entry(2.0, 0.2, 0.999)}, 0.001, False, "nothing narrows m"),
         # Little of many constants adds up to nats, and to no reason.
@@ -136,7 +136,7 @@ def entry(mean: float, sd: float, left: float, times: float = 1.0) -> dict[str, 
             {"m": entry(2.0, 0.2, 0.5, 3.0)},
             3.0,
             True,
-            "m, known within 30 %, should come from 10 to 5 %",
+            "from 10 to 5 % of its value; with the model's errors it is 30 % now",
         ),
     ],
 )

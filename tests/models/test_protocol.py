@@ -70,7 +70,7 @@ CERTAIN = {n for n in MODELS if n.startswith(("PointEstimate", "PriorMean", "Aut
 WITHOUT = {"NLM", "PointEstimate(NLM)", "Auto", "PointEstimate(Auto)"}
 KNOWING = set(MODELS) - WITHOUT
 #: Of a function's numbers; `Auto` adds the index of its choice.
-SINGLE = {jnp.dtype("float32"), jnp.dtype("int64")}
+SINGLE = {jnp.dtype("float32"), jnp.dtype("int32")}
 
 
 def rows():

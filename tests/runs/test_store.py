@@ -266,19 +266,20 @@ def test_time_left_is_at_the_same_pace() -> None:
     assert time_left(2, 4, 600.0) == "10 min left"
     assert [time_left(n, 4, 1.0) for n in (0, 4)] == ["", ""]
     assert time_left(9, 10, 1.0) == ""
+    assert time_left(1, 3, 20.0) == ""  # stages, none of which is like another
 
 
 def test_time_left_falls_while_a_part_is_under_way() -> None:
     """A part that says more than once how far it is does not seem to take longer."""
     shown: list[str] = []
-    task = Task("fit", 3, lambda task, note: shown.append(task.left()))
+    task = Task("fit", 4, lambda task, note: shown.append(task.left()))
     task.started -= 10.0
     task.advance()
     for _ in range(2):
         task.moved -= 5.0
         task.started -= 5.0
         task.advance("a step", 0)
-    assert shown == ["20 s left", "15 s left", "10 s left"]
+    assert shown == ["30 s left", "25 s left", "20 s left"]
 
 
 def test_a_notebook_has_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -27,6 +27,7 @@ from sim2gp.types import in_float64
 
 #: Of where a channel may be, what it must cover to say anything of a force there.
 COVERED = 0.1
+CERTAIN = 100  # nats
 
 
 @in_float64
@@ -89,13 +90,18 @@ def not_excited(shown: dict[str, dict[str, Any]]) -> list[str]:
 def forces_table(shown: dict[str, dict[str, Any]]) -> dict[str, Any]:
     """The same as a table of the summary."""
     rows = [
-        [name, digits(e["nats"], 2), f"{digits(e['sd'], 2)} {e['unit']}"]
+        [name, _in_words(e["nats"]), f"{digits(e['sd'], 2)} {e['unit']}"]
         for name, e in shown.items()
     ]
     return {
         "title": "Forces that may be missing: would the experiment show them?",
-        "columns": ["force", "evidence", "if it is about"],
+        "columns": ["force", "evidence, nats", "if it is about"],
         "rows": rows,
-        "note": "Nats that the experiment is expected to give for a force of that size "
-        f"(the prior's sd). Below {EARNED:g} it does not exclude the force.",
+        "note": "What the experiment is expected to say for a force of that size (the "
+        f"prior's sd). Below {EARNED:g} nats, a factor of 20, it does not exclude it.",
     }
+
+
+def _in_words(nats: float) -> str:
+    """Beyond a hundred nobody doubts any more."""
+    return digits(nats, 2) if nats < CERTAIN else f"over {CERTAIN}"

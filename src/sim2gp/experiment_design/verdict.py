@@ -95,14 +95,13 @@ def experiment_verdict(
     now, after = (
         digits(share[worst] * x, 2) for x in (1, expected[worst]["of_before"])
     )
-    text = f"Worth running: {nats:.1f} nats. {worst}, known within"
+    text = (
+        f"Worth running: {nats:.1f} nats. The sd of {worst} should fall from {now} to "
+        f"{after} % of its value"
+    )
     if wide[worst] > share[worst]:
-        text += (
-            f" {digits(wide[worst], 2)} %, should come from {now} to {after} % but for "
-            "the model's errors"
-        )
-        return True, f"{text}.{rest}"
-    return True, f"{text} {now} % now, should be within {after} % after.{rest}"
+        text += f"; with the model's errors it is {digits(wide[worst], 2)} % now"
+    return True, f"{text}.{rest}"
 
 
 def prediction_verdict(

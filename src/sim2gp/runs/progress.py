@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 from sim2gp import cleanup
 
 T = TypeVar("T")
+FEW = 3  # parts of a job are stages of their own: none says how long the next takes
 
 
 @dataclass
@@ -97,9 +98,10 @@ class Progress:
 def time_left(done: int, total: int, seconds: float, since: float = 0.0) -> str:
     """How long the rest takes at the same pace; nothing below a second, or unknown.
 
-    ``done`` parts took so many ``seconds``; the last was done ``since`` s ago.
+    ``done`` parts took so many ``seconds``; the last was done ``since`` s ago. Of a
+    `FEW` parts it is not known.
     """
-    if not 0 < done < total:
+    if not 0 < done < total or total <= FEW:
         return ""
     left = seconds * (total - done) / done - since
     if left < 1.0:
