@@ -232,6 +232,12 @@ def test_draws_are_machines_and_keep_what_ties_their_constants(tmp_path: Path) -
     assert about["constants"][name]["unit"] == table.units[0]
     low, high = np.quantile(rows[:, 0], [0.45, 0.55])
     assert low <= about["constants"][name]["map"] <= high
+    sd = [about["constants"][name]["sd"] for name in table.names]
+    np.testing.assert_allclose(sd, rows.std(axis=0), rtol=0.06)
+    few = tmp_path / "few"  # the posterior's, however many are drawn of it
+    export_model(belief, few, system, dt=0.02, draws=2, key=KEY)
+    constants = load_run(few).summary["model"]["constants"]
+    assert [constants[name]["sd"] for name in table.names] == sd
     assert not (out / "step.jax").exists()
 
 

@@ -36,4 +36,5 @@ def export(
     )
     about = {"run": found.name, **posterior_entries(found.summary, posterior)}
     key = jax.random.key(seed)
-    return write_model(own, Path(out), system, draws=draws, key=key, about=about)
+    summary = write_model(own, Path(out), system, draws=draws, key=key, about=about)
+    return summary | {"headline": f"{draws} machines as arrays and files: {out}"}

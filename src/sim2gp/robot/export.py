@@ -14,6 +14,7 @@ import numpy as np
 from sim2gp import checks
 from sim2gp.belief import AbstractBelief
 from sim2gp.errors import error
+from sim2gp.identification.identifiability.table import physical_moments
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.planning import Policy
 from sim2gp.robot.format import FORMAT, check_shapes, check_values, header
@@ -115,11 +116,14 @@ def write_model(
     rows, central = _draw_constants(posterior, system, draws, key)
     table = system.parameters
     units = dict(zip(table.names, table.units, strict=True))
+    mean, scale = np.asarray(posterior.mean), np.asarray(posterior.scale)
+    known = physical_moments(table, mean, np.linalg.norm(scale, axis=1))["sd"]
+    sds = dict(zip(table.names, known.tolist(), strict=True))
     constants = {
         name: {
             "unit": units.get(name),
             "map": central[name],
-            "sd": float(np.std(rows[name])) if draws > 1 and name in units else None,
+            "sd": sds.get(name),
         }
         for name in central
     }
