@@ -96,6 +96,29 @@ def test_the_only_joint_that_slides_is_x_and_the_only_hinge_theta() -> None:
         match(swap, T, joints("left", "right"), [Channel("slide", "1")], "")
 
 
+def test_columns_whose_names_say_nothing_are_given() -> None:
+    """The others are looked for as before: a velocity by what it is the rate of."""
+    columns = {"first": Q[1], "other": Q[2], "rate": V[2], "v_cmd": U[1]}
+    asked = T, joints("left", "right"), [Channel("motor", "N m")], "run.csv"
+    found = match(columns, *asked, {"right": "other", "left": "first"})
+    assert {name: m.column.column for name, m in found.items()} == {
+        "left": "first",
+        "right": "other",
+        "right.velocity": "rate",
+        "motor": "v_cmd",
+    }
+    assert [found[name].why for name in ("left", "right")] == 2 * ["as given"]
+    del columns["rate"]  # whose integral is a position under any name
+    for given, said in (
+        ({}, "E103 no column for joint left, right .* --column left=COLUMN"),
+        ({"motor": "v_cmd"}, "E103 no column for joint left, right"),
+        ({"lefd": "first"}, "E103 unknown channel .* did you mean left"),
+        ({"left": "frist"}, "E103 missing column frist in run.csv.* mean first"),
+    ):
+        with pytest.raises(InputError, match=said):
+            match(columns, *asked, given)
+
+
 @pytest.mark.parametrize(
     ("position", "velocity", "units"),
     [

@@ -117,6 +117,11 @@ def refuse(given: object, options: Iterable[str], expected: str, or_: str) -> No
             raise usage_error("too much", f"--{option}", expected, fix)
 
 
+def parse_words(option: str, words: Iterable[str]) -> dict[str, str]:
+    """``NAME=WORD`` words by name (E160 for another form, or a name twice)."""
+    return {name: value for name, value, _ in _named_values(option, words)}
+
+
 def parse_numbers(option: str, words: Iterable[str]) -> dict[str, float]:
     """``NAME=NUMBER`` words by name (E160 for another form, or a name twice)."""
     return {

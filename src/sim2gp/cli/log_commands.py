@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from sim2gp.cli.arguments import parse_numbers, refuse, usage_error
+from sim2gp.cli.arguments import parse_numbers, parse_words, refuse, usage_error
 from sim2gp.cli.late import (
     Call,
     FirstFolder,
@@ -69,6 +69,8 @@ class Init(Common):
     """Time between rows in s, where no column says it."""
     constant: Annotated[tuple[str, ...], option("NAME=VALUE...")] = ()
     """Inputs that the logs have no column of, and the number they were held at."""
+    column: Annotated[tuple[str, ...], option("NAME=COLUMN...")] = ()
+    """Joints and inputs whose columns have other names."""
     budget: Seconds = 60.0
     """What it may take; readings that were not tried by then are named in the file."""
     no_readings: Flag = False
@@ -85,6 +87,7 @@ class Init(Common):
             root=self.root,
             period=self.period,
             constant=parse_numbers("--constant", self.constant),
+            columns=parse_words("--column", self.column),
             readings=not self.no_readings,
             seconds=self.budget,
             seed=self.seed,

@@ -25,6 +25,7 @@ def init(
     root: Path | None = None,
     period: float | None = None,
     constant: Mapping[str, float] | None = None,
+    columns: Mapping[str, str] | None = None,
     readings: bool = True,
     seconds: float = 60.0,
     seed: int = 0,
@@ -35,6 +36,7 @@ def init(
     ``model`` is a bundled machine's name or a model's file, whose name is ``out``'s
     where that is None. ``root`` holds all files of the model, ``period`` is the time
     between rows in s where no column says it, ``constant`` the inputs without a column.
+    ``columns`` has those of channels whose names do not say it.
     ``readings`` tries signs, units and zeros, in so many ``seconds``. Raises
     `InputError` as `sim2gp.project.draft.draft_project` does, and E132 where ``out``
     exists.
@@ -49,6 +51,7 @@ def init(
         root=root,
         period=period,
         constant=constant or {},
+        columns=columns or {},
         readings=readings,
         seconds=seconds,
         started=time.monotonic(),
@@ -62,21 +65,27 @@ def init(
         summary = draft_summary(draft, out)
         if logs:
             return summary
+        said = f"Wrote {out}, which says what a log needs"
         if not draft.system.actions:
             task.advance("no experiment: the machine has no inputs")
-            return summary | {"headline": f"Wrote {out}, which says what a log needs"}
+            return summary | {"headline": said}
         until = asked.started + seconds
         found = safe_excitation(draft.system, key=jax.random.key(seed), until=until)
         task.advance("a first experiment")
-    summary["experiment"] = found.words
-    if found.commands is not None and found.states is not None:
-        replace_file(table, _csv(draft.system, found).encode(), lambda _: None)
-        summary["commands"] = str(table)
-    summary["headline"] = (
-        f"Wrote {out}, which says what a log needs; for an experiment that is chosen "
-        f"for what it tells: sim2gp design {out} (slow on a MuJoCo model)"
-    )
-    return summary
+    better = f"sim2gp design {out} (slow on a MuJoCo model)"
+    said += f"; for an experiment that is chosen for what it tells: {better}"
+    return summary | {"headline": said} | _experiment(draft.system, found, table)
+
+
+def _experiment(
+    system: AbstractSystem, found: Excitation, table: Path
+) -> dict[str, Any]:
+    """What is said of a first experiment, whose commands are written if there are any."""
+    told = {"experiment": found.words}
+    if found.commands is None or found.states is None:
+        return told
+    replace_file(table, _csv(system, found).encode(), lambda _: None)
+    return told | {"commands": str(table)}
 
 
 def _csv(system: AbstractSystem, found: Excitation) -> str:

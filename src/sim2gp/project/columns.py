@@ -14,10 +14,11 @@ import scipy.optimize
 from jaxtyping import Float
 
 from sim2gp.data.logs import Column
+from sim2gp.data.logs.arrays import missing_column
 from sim2gp.data.logs.checks import follows
 from sim2gp.data.logs.units import UNITS
 from sim2gp.errors import InputError, error
-from sim2gp.systems.base import Channel
+from sim2gp.systems.base import Channel, index_of
 
 Values = Float[np.ndarray, " N"]
 Words = tuple[str, ...]
@@ -127,20 +128,27 @@ def match(
     states: Sequence[Channel],
     actions: Sequence[Channel],
     where: str,
+    given: Mapping[str, str] | None = None,
 ) -> dict[str, Match]:
     """The columns of positions, velocities and inputs, by channel.
 
-    ``columns`` without that of time, whose values are in s. Raises `InputError` E103
-    where no joint finds a column, or not every input.
+    ``columns`` without that of time, whose values are in s; those of channels that are
+    ``given`` are not looked for. Raises `InputError` E103 where no joint finds a
+    column, or not every input, and for a channel or column that is not there.
     """
+    known = _as_given(given or {}, (*states, *actions), columns, where)
     links = _links(columns, time)
-    joints = [c for c in states if not c.name.endswith(".velocity")]
+    columns = {k: v for k, v in columns.items() if k not in (given or {}).values()}
+    every = [c for c in states if not c.name.endswith(".velocity")]
+    states, actions, joints = (
+        [c for c in each if c.name not in known] for each in (states, actions, every)
+    )
     integrals, rates = {i for i, _ in links}, {j for _, j in links}
     # What swings is its own second derivative: in both, a column can be either.
     seen = {k: 1.0 if k in integrals else -2.0 * (k in rates) for k in columns}
-    found = _assigned(joints, columns, POSITION, VELOCITY | INPUT, seen)
-    if not found:
-        raise _unmatched("joint", joints, columns, where)
+    found = known | _assigned(joints, columns, POSITION, VELOCITY | INPUT, seen)
+    if not any(c.name in found for c in every):
+        raise _unmatched("joint", every, columns, where)
     for c in states:
         joint = found.get(c.name.removesuffix(".velocity"))
         if joint is not None and c.name.endswith(".velocity"):
@@ -162,6 +170,22 @@ def match(
     elif missing:
         raise _unmatched("input", missing, free, where)
     return found | inputs
+
+
+def _as_given(
+    given: Mapping[str, str],
+    channels: Sequence[Channel],
+    columns: Mapping[str, Values],
+    where: str,
+) -> dict[str, Match]:
+    """Columns of channels that the user names."""
+    found = {}
+    for name, column in given.items():
+        channel = channels[index_of(name, channels, where="the columns given")]
+        if column not in columns:
+            raise missing_column(column, tuple(columns), where)
+        found[name] = _stated_unit(channel, column, "as given")
+    return found
 
 
 def _links(
@@ -318,5 +342,11 @@ def _unmatched(
     either = f", say --constant {held} if held there," if what == "input" else ""
     got = ", ".join(columns)[:160] or "no other column"
     return error(
-        "no_columns_found", where=where, got=got, what=what, names=names, either=either
+        "no_columns_found",
+        where=where,
+        got=got,
+        what=what,
+        names=names,
+        first=channels[0].name,
+        either=either,
     )

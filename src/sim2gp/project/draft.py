@@ -61,6 +61,7 @@ class Request:
     files: the recordings, alike in their columns; none is a draft without logs.
     period: s between rows, in place of a column of time.
     constant: inputs that have no column, and the number that each was held at.
+    columns: of channels whose columns are known; the others' are looked for.
     readings: whether signs, zeros and units are tried; ``seconds`` that the whole draft
         may take from ``started`` (of `time.monotonic`).
     step: gets the name of each stage that is done: three with logs, one without.
@@ -72,6 +73,7 @@ class Request:
     root: Path | None = None
     period: float | None = None
     constant: Mapping[str, float] = field(default_factory=dict)
+    columns: Mapping[str, str] = field(default_factory=dict)
     readings: bool = True
     seconds: float = 60.0
     started: float = field(default_factory=time.monotonic)
@@ -176,7 +178,8 @@ def _match_columns(
             for name, x in other.columns.items():  # to be looked at, not to be fitted
                 columns[name] = np.interp(clock, other.clock, x)
     open_ = [c for c in system.actions if c.name not in asked.constant]
-    found = match(columns, clock, system.physical_states, open_, where)
+    states, given = system.physical_states, asked.columns
+    found = match(columns, clock, states, open_, where, given)
     travel = {name: _travel(columns[m.column.column]) for name, m in found.items()}
     return named, found, travel
 
