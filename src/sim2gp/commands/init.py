@@ -80,7 +80,7 @@ def init(
 def _experiment(
     system: AbstractSystem, found: Excitation, table: Path
 ) -> dict[str, Any]:
-    """What is said of a first experiment, whose commands are written if there are any."""
+    """What is said of a first experiment; its commands are written, if it has any."""
     told = {"experiment": found.words}
     if found.commands is None or found.states is None:
         return told
