@@ -65,27 +65,28 @@ def init(
         summary = draft_summary(draft, out)
         if logs:
             return summary
-        said = f"Wrote {out}, which says what a log needs"
+        headline = f"Wrote {out}, which says what a log needs"
         if not draft.system.actions:
             task.advance("no experiment: the machine has no inputs")
-            return summary | {"headline": said}
+            return summary | {"headline": headline}
         until = asked.started + seconds
         found = safe_excitation(draft.system, key=jax.random.key(seed), until=until)
         task.advance("a first experiment")
     better = f"sim2gp design {out} (slow on a MuJoCo model)"
-    said += f"; for an experiment that is chosen for what it tells: {better}"
-    return summary | {"headline": said} | _experiment(draft.system, found, table)
+    headline += f"; for an experiment that is chosen for its information: {better}"
+    entries = _experiment(draft.system, found, table)
+    return summary | {"headline": headline} | entries
 
 
 def _experiment(
     system: AbstractSystem, found: Excitation, table: Path
 ) -> dict[str, Any]:
     """What is said of a first experiment; its commands are written, if it has any."""
-    told = {"experiment": found.words}
+    entries = {"experiment": found.words}
     if found.commands is None or found.states is None:
-        return told
+        return entries
     replace_file(table, _csv(system, found).encode(), lambda _: None)
-    return told | {"commands": str(table)}
+    return entries | {"commands": str(table)}
 
 
 def _csv(system: AbstractSystem, found: Excitation) -> str:

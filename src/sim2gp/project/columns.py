@@ -139,16 +139,17 @@ def match(
     known = _as_given(given or {}, (*states, *actions), columns, where)
     links = _links(columns, time)
     columns = {k: v for k, v in columns.items() if k not in (given or {}).values()}
-    every = [c for c in states if not c.name.endswith(".velocity")]
+    all_joints = [c for c in states if not c.name.endswith(".velocity")]
     states, actions, joints = (
-        [c for c in each if c.name not in known] for each in (states, actions, every)
+        [c for c in each if c.name not in known]
+        for each in (states, actions, all_joints)
     )
     integrals, rates = {i for i, _ in links}, {j for _, j in links}
     # What swings is its own second derivative: in both, a column can be either.
     seen = {k: 1.0 if k in integrals else -2.0 * (k in rates) for k in columns}
     found = known | _assigned(joints, columns, POSITION, VELOCITY | INPUT, seen)
-    if not any(c.name in found for c in every):
-        raise _unmatched("joint", every, columns, where)
+    if not any(c.name in found for c in all_joints):
+        raise _unmatched("joint", all_joints, columns, where)
     for c in states:
         joint = found.get(c.name.removesuffix(".velocity"))
         if joint is not None and c.name.endswith(".velocity"):

@@ -163,11 +163,11 @@ def _settle_readings(
         behind = _surer(scores, int(np.argmin(mean)))
         good = np.flatnonzero(behind <= SURE)
         departs = {i: _departs(tried[left[i]], plain) for i in good.tolist()}
-        own = min(departs, key=lambda i: (departs[i], mean[i]))
-        same = np.abs(scores - scores[own]).max(axis=1) <= _SAME
-        surer[left] = np.where(behind > SURE, behind, _surer(scores, own))
+        plainest = min(departs, key=lambda i: (departs[i], mean[i]))
+        same = np.abs(scores - scores[plainest]).max(axis=1) <= _SAME
+        surer[left] = np.where(behind > SURE, behind, _surer(scores, plainest))
         surer[left[same]] = np.inf
-        chosen = tried[left[own]]
+        chosen = tried[left[plainest]]
         found.images = images * int(same.sum())
         for name in names:
             differ = [k for k, each in enumerate(tried) if each[name] != chosen[name]]
