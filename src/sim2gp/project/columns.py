@@ -136,9 +136,10 @@ def match(
     ``given`` are not looked for. Raises `InputError` E103 where no joint finds a
     column, or not every input, and for a channel or column that is not there.
     """
-    known = _as_given(given or {}, (*states, *actions), columns, where)
+    given = given or {}
+    known = _as_given(given, (*states, *actions), columns, where)
     links = _links(columns, time)
-    columns = {k: v for k, v in columns.items() if k not in (given or {}).values()}
+    columns = {k: v for k, v in columns.items() if k not in given.values()}
     all_joints = [c for c in states if not c.name.endswith(".velocity")]
     states, actions, joints = (
         [c for c in each if c.name not in known]

@@ -152,18 +152,18 @@ def _settle_readings(
     """
     choices = itertools.product(*(asked.options[name] for name in names))
     tried = [dict(zip(names, choice, strict=True)) for choice in choices]
-    judged, plain = names if alone else (), {n: asked.options[n][0] for n in names}
+    plain = {name: asked.options[name][0] for name in names}
+    judged = names if alone else ()
     others, images = dict(found.readings), found.images
     left, scores = np.arange(len(tried)), np.zeros((len(tried), 0))
     surer = np.full(len(tried), np.inf)
-    for number in range(trial.stages):
-        more = trial.scores([others | tried[k] for k in left], judged, number)
+    for stage in range(trial.stages):
+        more = trial.scores([others | tried[k] for k in left], judged, stage)
         scores = np.concatenate([scores, more], axis=1)
         mean = scores.mean(axis=1).round(6)
         behind = _surer(scores, int(np.argmin(mean)))
-        good = np.flatnonzero(behind <= SURE)
-        departs = {i: _departs(tried[left[i]], plain) for i in good.tolist()}
-        plainest = min(departs, key=lambda i: (departs[i], mean[i]))
+        good = np.flatnonzero(behind <= SURE).tolist()
+        plainest = min(good, key=lambda i: (_departs(tried[left[i]], plain), mean[i]))
         same = np.abs(scores - scores[plainest]).max(axis=1) <= _SAME
         surer[left] = np.where(behind > SURE, behind, _surer(scores, plainest))
         surer[left[same]] = np.inf
