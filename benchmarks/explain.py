@@ -1,17 +1,15 @@
 """Does `sim2gp explain` find the missing physics that was planted?
 
-    python benchmarks/explain.py [--truths N] [--strength X] [--seconds S] [--out DIR]
-        [--refresh | --keep-old]
+    python benchmarks/explain.py [--truths N] [--strength X] [--machines M...]
+        [--workers N] [--out DIR] [--refresh | --keep-old]
 
 Two machines; on each, every effect of `planted_effects` on N hidden
 machines, nothing on 2 N, and three effects that no library holds on N each. Prints what
 was answered to what was planted and the shares of right answers, and writes
-``summary.json`` into DIR. Finished cells are kept beside DIR: after S seconds it stops,
-and goes on where it was when it is called again.
+``summary.json`` into DIR. Finished cells are kept next to DIR and not computed again.
 """
 
 import argparse
-import time
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -19,47 +17,37 @@ from typing import Any
 import planted_effects as study
 from sim2gp.planning.tasks import MACHINES
 from sim2gp.runs import Progress
-from sim2gp.runs.cells import Cells, add_options
+from sim2gp.runs.cells import add_options
+from sim2gp.runs.executors import cores
 from sim2gp.runs.plain import to_json
+from sim2gp.studies.study import run_cells
 
 ROOT = Path(__file__).resolve().parents[1]
 
 
 def main() -> None:
-    """Compute the missing cells; print and write the table once all are there."""
+    """Compute the missing cells; print and write the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--truths", type=int, default=10)
     parser.add_argument("--strength", type=float, default=1.0)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--seconds", type=float, default=float("inf"))
     parser.add_argument("--machines", nargs="+", default=list(MACHINES))
+    parser.add_argument("--workers", type=int, default=cores())
     parser.add_argument("--out", type=Path, default=ROOT / "runs" / "explain-study")
     add_options(parser)
     options = parser.parse_args()
-    started = time.perf_counter()
-    store = Cells(options.out, study.__file__, options.old)
-    found: list[dict[str, Any]] = []
-    todo = [
-        (machine, name, k)
+    rows = {
+        machine: [*study.cells(machine, options.truths, options.seed, options.strength)]
         for machine in options.machines
-        for name, k in study.cells(machine, options.truths)
-    ]
-    about = {"seed": options.seed, "strength": options.strength}
-    named = [("-".join(map(str, job)), about) for job in todo]
-    store.check(named)
-    with Progress().task("cells", len(todo)) as task:
-        for machine, name, k in todo:
-            label = f"{machine}-{name}-{k}"
-            cell = store.load(label, about)
-            if cell is None:
-                if time.perf_counter() - started > options.seconds:
-                    print(f"{len(found)} of {len(todo)} cells; call again")
-                    return
-                cell = study.cell(machine, name, k, **about)
-                store.save(label, about, cell)
-            found.append(cell)
-            task.advance(f"{label}: {study.verdict(machine, cell)}")
-    report(found, store.summary(named), options)
+    }
+    values, about = run_cells(
+        rows,
+        options.out,
+        workers=options.workers,
+        progress=Progress(),
+        old=options.old,
+    )
+    report([values[cell] for row in rows.values() for cell in row], about, options)
 
 
 def report(

@@ -8,7 +8,8 @@ sees states and inputs alone.
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -21,6 +22,7 @@ from sim2gp.identification.missing_physics.data import OneStepData
 from sim2gp.identification.missing_physics.explain import find_missing_physics
 from sim2gp.planning.coloured_noise import coloured_noise
 from sim2gp.planning.tasks import MACHINES, Task, draw_truth
+from sim2gp.runs.cell_work import AbstractCell, Values
 from sim2gp.systems import (
     AbstractPlant,
     BaseTilt,
@@ -208,47 +210,69 @@ def settings(machine: str) -> dict[str, AbstractPart | None]:
     return {NOTHING: None, **PLANTED[machine], **OUTSIDE[machine]}
 
 
-def cells(machine: str, truths: int) -> Iterator[tuple[str, int]]:
-    """Name of a setting and number of a hidden machine, for all of the study."""
+@dataclass(frozen=True)
+class SearchCell(AbstractCell):
+    """One hidden machine, and what is planted on it."""
+
+    machine: str
+    planted: str
+    index: int
+    seed: int = 0
+    strength: float = 1.0
+
+    @property
+    def name(self) -> str:
+        return f"{self.machine}-{self.planted}-{self.index}"
+
+    @property
+    def arguments(self) -> Values:
+        return {"seed": self.seed, "strength": self.strength}
+
+    @property
+    def program(self) -> tuple[Hashable, ...]:
+        return (self.machine,)
+
+    def compute(self, needed: Values | None) -> Values:
+        """The search's answer, and the right one."""
+        del needed
+        machine, name, every = self.machine, self.planted, settings(self.machine)
+        planted = every[name]
+        if planted is not None:
+            planted = scaled(planted, self.strength)
+        key = jax.random.key(self.seed)
+        for part in ([*MACHINES].index(machine), [*every].index(name), self.index):
+            key = jax.random.fold_in(key, part)
+        found = find_missing_physics(data_of(machine, planted, key))
+        refitted = found.search.refitted
+        ranked = [r.scored.candidate.name for r in refitted]
+        scored = sorted((s for s in found.search.scored if not s.alias), key=_falling)
+        inside = name in PLANTED[machine] and planted is not None
+        alarms = found.best.tests.items() if found.best else ()
+        return {
+            "machine": machine,
+            "planted": name,
+            "index": self.index,
+            "truth": planted.name if inside and planted is not None else "",
+            "answer": found.answer,
+            "effect": found.effect or "",
+            "ranked": ranked,
+            "gains": [r.gain for r in refitted],
+            "tied": [r.scored.candidate.name for r in found.search.tied],
+            "value": refitted[0].value if refitted else None,
+            "magnitude": 0.0 if planted is None else planted.magnitude,
+            "scored_first": scored[0].candidate.name,
+            "alarms": [k for k, t in alarms if t.alarm],
+        }
+
+
+def cells(
+    machine: str, truths: int, seed: int = 0, strength: float = 1.0
+) -> Iterator[SearchCell]:
+    """``truths`` hidden machines for all that is planted, more with nothing."""
     for name in settings(machine):
         count = SOUND * truths if name == NOTHING else truths
-        yield from ((name, k) for k in range(count))
-
-
-def cell(
-    machine: str, name: str, index: int, *, seed: int = 0, strength: float = 1.0
-) -> dict[str, Any]:
-    """The search's answer on one hidden machine, and the right one."""
-    every = settings(machine)
-    planted = every[name]
-    if planted is not None:
-        planted = scaled(planted, strength)
-    key = jax.random.fold_in(jax.random.key(seed), list(MACHINES).index(machine))
-    for part in (list(every).index(name), index):
-        key = jax.random.fold_in(key, part)
-    found = find_missing_physics(data_of(machine, planted, key))
-    ranked = [r.scored.candidate.name for r in found.search.refitted]
-    scored = sorted((s for s in found.search.scored if not s.alias), key=_falling)
-    inside = name in PLANTED[machine] and planted is not None
-    truth = planted.name if inside and planted is not None else ""
-    best = found.search.refitted[0] if ranked else None
-    return {
-        "machine": machine,
-        "planted": name,
-        "index": index,
-        "truth": truth,
-        "answer": found.answer,
-        "effect": found.effect or "",
-        "ranked": ranked,
-        "gains": [r.gain for r in found.search.refitted],
-        "tied": [r.scored.candidate.name for r in found.search.tied],
-        "value": None if best is None else best.value,
-        "magnitude": 0.0 if planted is None else planted.magnitude,
-        "scored_first": scored[0].candidate.name,
-        "alarms": [k for k, t in found.best.tests.items() if t.alarm]
-        if found.best
-        else [],
-    }
+        for k in range(count):
+            yield SearchCell(machine, name, k, seed, strength)
 
 
 def _falling(scored: Any) -> float:

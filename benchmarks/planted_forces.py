@@ -1,7 +1,7 @@
 """Does `sim2gp explain` draw forces as they are? Planted curves that no registry has.
 
-    python benchmarks/planted_forces.py [--truths N] [--first K] [--seconds S]
-        [--machines M...] [--shapes S...] [--out DIR] [--pictures DIR]
+    python benchmarks/planted_forces.py [--truths N] [--first K] [--machines M...]
+        [--shapes S...] [--workers N] [--out DIR] [--pictures DIR]
         [--refresh | --keep-old]
 
 Hidden machines with parameters drawn from the prior: Furuta pendulum and cart-pole in
@@ -24,10 +24,10 @@ both curves ``c`` is first chosen so that ``u + h`` has the slope one on the who
 """
 
 import argparse
-import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -44,8 +44,11 @@ from sim2gp.identification.missing_physics.data import AbstractData, WindowData
 from sim2gp.identification.missing_physics.forces import find_forces
 from sim2gp.planning.tasks import MACHINES
 from sim2gp.runs import Progress
-from sim2gp.runs.cells import Cells, add_options
+from sim2gp.runs.cell_work import AbstractCell, Values
+from sim2gp.runs.cells import add_options
+from sim2gp.runs.executors import cores
 from sim2gp.runs.plain import to_json
+from sim2gp.studies.study import run_cells
 from sim2gp.systems import UniformRodArm, with_parts
 from sim2gp.types import in_float64
 
@@ -86,18 +89,36 @@ def planted_on(
     return ShapedForce(where, size, centre, reach, shape)
 
 
-class Case(NamedTuple):
+@dataclass(frozen=True)
+class Case(AbstractCell):
+    """One hidden machine, and the force on it."""
+
     machine: str
     shape: str
     index: int
+    pictures: Path | None = field(default=None, compare=False)
 
     @property
     def name(self) -> str:
-        """Of its cell."""
-        return "-".join(map(str, self))
+        return f"{self.machine}-{self.shape}-{self.index}"
+
+    @property
+    def arguments(self) -> Values:
+        return {}
+
+    @property
+    def program(self) -> tuple[Hashable, ...]:
+        return self.machine, self.shape
+
+    def compute(self, needed: Values | None) -> Values:
+        """What was found, and how much of the truth is inside."""
+        del needed
+        return inside_band(self)
 
 
-def cases(truths: int, first: int, machines: Sequence[str]) -> list[Case]:
+def cases(
+    truths: int, first: int, machines: Sequence[str], pictures: Path | None
+) -> list[Case]:
     """``truths`` machines with a force, and two fifths as many with nothing."""
     possible = [
         (machine, shape)
@@ -107,7 +128,7 @@ def cases(truths: int, first: int, machines: Sequence[str]) -> list[Case]:
     ]
     planted = [possible[k % len(possible)] for k in range(truths)]
     sound = [(machines[k % len(machines)], NOTHING) for k in range(truths * 2 // 5)]
-    return [Case(*x, first + k) for k, x in enumerate([*planted, *sound])]
+    return [Case(*x, first + k, pictures) for k, x in enumerate([*planted, *sound])]
 
 
 def data_for(
@@ -224,12 +245,13 @@ def values_between(seen: np.ndarray) -> Float[np.ndarray, " n"]:
     return np.linspace(*np.quantile(seen, [0.025, 0.975]), POINTS)
 
 
-def cell(case: Case, pictures: Path | None = None) -> dict[str, Any]:
+def inside_band(case: Case) -> Values:
     """What was found on one hidden machine, and how much of the truth is inside."""
     data, seen, planted = data_for(case)
     found = find_forces(data, data.fit())
     names = [c.name for c in found.found]
-    result: dict[str, Any] = {**case._asdict(), "reported": names}
+    about = {"machine": case.machine, "shape": case.shape, "index": case.index}
+    result: Values = {**about, "reported": names}
     result["probability"] = {k: round(p, 4) for k, p in found.each.items()}
     if found.failure:  # a fit did not converge: nothing is said of any force
         return result | {"failure": found.failure, "named": False, "inside": 0.0}
@@ -255,8 +277,8 @@ def cell(case: Case, pictures: Path | None = None) -> dict[str, Any]:
         "two_sided": float(np.mean(np.abs(true - mean) <= 1.96 * sd)),
         "size": float(np.sqrt(np.mean(true**2))),
     }
-    if pictures is not None:
-        _draw(pictures, case, at, true, mean, half, result)
+    if case.pictures is not None:
+        _draw(case.pictures, case, at, true, mean, half, result)
     return result
 
 
@@ -311,40 +333,27 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--truths", type=int, default=100)
     parser.add_argument("--first", type=int, default=1000)
-    parser.add_argument("--seconds", type=float, default=float("inf"))
     parser.add_argument("--machines", nargs="+", default=[*MACHINES, ARM])
     parser.add_argument("--shapes", nargs="+", default=[*SHAPES, NOTHING])
+    parser.add_argument("--workers", type=int, default=cores())
     parser.add_argument("--out", type=Path, default=ROOT / "runs" / "planted_forces")
     parser.add_argument("--pictures", type=Path)
     add_options(parser)
     options = parser.parse_args()
-    started, found = time.perf_counter(), list[dict[str, Any]]()
-    every = cases(options.truths, options.first, options.machines)
+    every = cases(options.truths, options.first, options.machines, options.pictures)
     todo = [case for case in every if case.shape in options.shapes]
-    store = Cells(options.out, __file__, options.old)
-    store.check((case.name, {}) for case in todo)
-    with Progress().task("cells", len(todo)) as task:
-        for case in todo:
-            known = store.load(case.name, {})
-            if known is None:
-                if time.perf_counter() - started > options.seconds:
-                    print(f"{len(found)} of {len(todo)} cells; call again")
-                    return
-                known = store.save(case.name, {}, cell(case, options.pictures))
-            found.append(known)
-            share = f"{known['inside']:.2f}" if "inside" in known else "-"
-            told = f"{case.name}: {share} {known['reported']}"
-            print(
-                told,
-                {k: v for k, v in known.items() if k in ("error", "sd", "size")},
-                flush=True,
-            )
-            task.advance(told)
+    values, source = run_cells(
+        {"cells": todo},
+        options.out,
+        workers=options.workers,
+        progress=Progress(),
+        old=options.old,
+    )
+    found = [values[case] for case in todo]
     said = claims(found)
     print(to_json(said))
     options.out.mkdir(parents=True, exist_ok=True)
     about = {"truths": options.truths, "first": options.first}
-    source = store.summary((case.name, {}) for case in todo)
     summary = {**about, **source, "claims": said, "cells": found}
     (options.out / "summary.json").write_text(to_json(summary))
 

@@ -188,7 +188,7 @@ def test_other_shapes_of_a_force_are_part_of_its_curve() -> None:
 @pytest.mark.nightly
 def test_a_detent_is_drawn_and_nothing_is_not() -> None:
     """The study in small: a detent on a cart's rail, and a cart without one."""
-    found = study.cell(study.Case("cartpole", "notch", 4))
+    found = study.inside_band(study.Case("cartpole", "notch", 4))
     assert found["reported"] == ["x by x"]
     assert found["inside"] > 0.9
     assert found["error"] < 0.2 * found["size"]
@@ -210,7 +210,7 @@ def test_fits_without_a_force_need_their_evidence_alone(
         return replace(fit, convergence=replace(fit.convergence, **how))
 
     monkeypatch.setattr(forces, "estimate_groups", ends)
-    found = study.cell(study.Case("cartpole", "notch", 4))
+    found = study.inside_band(study.Case("cartpole", "notch", 4))
     assert found["reported"] == ["x by x"]
 
 
@@ -220,6 +220,6 @@ def test_fits_without_a_force_need_their_evidence_alone(
 )
 def test_a_force_on_an_arm_is_within_its_band(shape: str, index: int) -> None:
     """In windows of a log: a weak cable, and friction of another shape than ours."""
-    found = study.cell(study.Case(study.ARM, shape, index))
+    found = study.inside_band(study.Case(study.ARM, shape, index))
     assert found["named"]
     assert found["inside"] > 0.9
