@@ -78,7 +78,7 @@ def shares_wrong_in_the_middle(z: np.ndarray) -> np.ndarray:
 
 def verdicts(z: np.ndarray, log: np.ndarray) -> list[str]:
     about, _ = calibrate_forecasts(
-        judged(z, log), NAMES, recorded(log.max() + 1), HORIZON
+        judged(z, log), NAMES, recorded(log.max() + 1), HORIZON, 4.0
     )
     return [entry["verdict"] for entry in about["channels"].values()]
 
@@ -127,7 +127,7 @@ def test_bands_right_at_90_and_wrong_at_50_are_flagged(blocks: int, logs: bool) 
         z, log = forecast(rng, blocks, logs=logs)
         bent = shares_wrong_in_the_middle(z)
         about, _ = calibrate_forecasts(
-            judged(bent, log), NAMES, recorded(blocks), HORIZON
+            judged(bent, log), NAMES, recorded(blocks), HORIZON, 4.0
         )
         entries = about["channels"].values()
         assert "too narrow" in {entry["verdict"] for entry in entries}
@@ -147,7 +147,7 @@ def test_the_words_name_levels_direction_and_factor() -> None:
     """Oracle: errors of once, 1.5 times and half the spread that is stated."""
     z = np.stack([f * quantiles(2000) for f in (1.0, 1.5, 0.5)], axis=1)
     names = "right", "narrow", "wide"
-    about, arrays = calibrate_forecasts(judged(z), names, recorded(1), HORIZON)
+    about, arrays = calibrate_forecasts(judged(z), names, recorded(1), HORIZON, 4.0)
     share = arrays["calibration/share/right"]
     np.testing.assert_allclose(share, np.asarray(LEVELS), atol=1e-3)
     right, narrow, wide = about["channels"].values()
@@ -165,13 +165,14 @@ def test_the_words_name_levels_direction_and_factor() -> None:
     assert "bands hold too few measurements (the" in about["text"]
     assert "should be about 1.5 times as wide" in about["text"]
     assert "could be about 0.5 times as wide" in about["text"]
+    assert "All bands are 2 times as wide as the errors of the logs" in about["text"]
 
 
 def test_bands_may_be_too_narrow_and_too_wide() -> None:
     """Two spreads in turn: too few in the middle, too many at the ends, or so."""
     z = 0.25 * quantiles(4000)
     z[::2] *= 12.0
-    about, _ = calibrate_forecasts(judged(z[:, None]), ["q"], recorded(1), HORIZON)
+    about, _ = calibrate_forecasts(judged(z[:, None]), ["q"], recorded(1), HORIZON, 4.0)
     entry = about["channels"]["q"]
     assert entry["verdict"] == "wrong shape"
     low, high = entry["ranges"]
@@ -183,7 +184,9 @@ def test_bands_may_be_too_narrow_and_too_wide() -> None:
 def test_picture_and_words_agree() -> None:
     z, log = forecast(np.random.default_rng(4), 8, logs=False)
     z[:, 1] = shares_wrong_in_the_middle(z[:, 1])
-    about, arrays = calibrate_forecasts(judged(z, log), NAMES, recorded(1), HORIZON)
+    about, arrays = calibrate_forecasts(
+        judged(z, log), NAMES, recorded(1), HORIZON, 4.0
+    )
     for name in NAMES:
         share, low, high = (
             arrays[f"calibration/{kind}/{name}"] for kind in ("share", "low", "high")
@@ -194,7 +197,7 @@ def test_picture_and_words_agree() -> None:
 
 def test_fewer_than_eight_blocks_accuse_nobody() -> None:
     z = np.stack([np.full(70, 0.01), np.full(70, 9.0)], axis=1)
-    about, arrays = calibrate_forecasts(judged(z), NAMES, recorded(1), HORIZON)
+    about, arrays = calibrate_forecasts(judged(z), NAMES, recorded(1), HORIZON, 4.0)
     assert about["independent"] == 7
     assert verdicts(z, np.zeros(70, int)) == ["too few to say"] * 2
     assert "q1 and q2: too few to say" in about["text"]
@@ -207,7 +210,7 @@ def test_a_channel_is_judged_by_its_own_blocks() -> None:
     z = np.stack([quantiles(200), quantiles(200), np.full(200, np.nan)], axis=1)
     z[40:, 1] = np.nan
     names = "whole", "short", "none"
-    about, arrays = calibrate_forecasts(judged(z), names, recorded(1), HORIZON)
+    about, arrays = calibrate_forecasts(judged(z), names, recorded(1), HORIZON, 4.0)
     assert about["windows"] == 200
     assert list(about["channels"]) == ["whole", "short"]
     assert about["channels"]["short"]["verdict"] == "too few to say"

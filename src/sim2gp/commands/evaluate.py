@@ -90,7 +90,9 @@ def _forecast_logs(
     names = channels(system, grid.windows)
     whole = score_forecasts(rows, grid, result, fit.band, linear)
     summary, arrays = forecast_scores(whole, names, tested, horizon)
-    summary["calibration"], shares = calibrate_forecasts(whole, names, tested, horizon)
+    summary["calibration"], shares = calibrate_forecasts(
+        whole, names, tested, horizon, fit.band.inflation
+    )
     picture = forecast_traces(result, fit.band, grid)
     arrays |= shares | trace_arrays(picture, grid, tested, names)
     notes = note_lines(tested, shared_rows(train or (), tested))

@@ -21,6 +21,7 @@ from sim2gp.data.logs import Log, Note, note_lines, shared_rows
 from sim2gp.data.windows import Windows
 from sim2gp.errors import error
 from sim2gp.identification.forecasts.calibration import calibrate_forecasts
+from sim2gp.identification.forecasts.forecast import new_log_inflation
 from sim2gp.identification.forecasts.forecast_machine import forces_table
 from sim2gp.identification.forecasts.prediction import (
     ScoredForecasts,
@@ -81,8 +82,9 @@ class LeaveOneOut(AbstractFolds[Evaluation]):
         names = channels(project.system, self.cut.windows)
         whole = join_folds(parts)
         summary, arrays = forecast_scores(whole, names, logs, self.horizon)
-        found = calibrate_forecasts(whole, names, logs, self.horizon)
-        summary["calibration"], shares = found
+        summary["calibration"], shares = calibrate_forecasts(
+            whole, names, logs, self.horizon, new_log_inflation(len(self.files) - 1)
+        )
         for fold in folds:
             arrays |= fold["traced"]
         names_of = {log.source: log.name for log in logs}

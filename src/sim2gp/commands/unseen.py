@@ -71,7 +71,7 @@ def forecast_unseen(
     names = channels(project.system, windows)
     summary, arrays = forecast_scores(found.judged, names, logs, horizon)
     summary["calibration"], shares = calibrate_forecasts(
-        found.judged, names, logs, horizon
+        found.judged, names, logs, horizon, found.band.inflation
     )
     del summary["tables"]
     picture = forecast_traces(found.forecast, found.band, found.tested)

@@ -57,9 +57,15 @@ class Blocks(NamedTuple):
 
 
 def calibrate_forecasts(
-    found: ScoredForecasts, names: Sequence[str], logs: Sequence[Log], horizon: float
+    found: ScoredForecasts,
+    names: Sequence[str],
+    logs: Sequence[Log],
+    horizon: float,
+    inflation: float,
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Summary entry and arrays ``calibration/...`` of forecasts at the horizon.
+
+    ``inflation``: of the variance of the forecasts' bands, for a new log (`Band`).
 
     ``calibration/low/NAME`` to ``high`` is the simultaneous band of a channel: of
     calibrated forecasts, 95 in 100 keep to it at all levels and in all channels. With
@@ -93,7 +99,12 @@ def calibrate_forecasts(
         "blocks": blocks.words,
         "channels": channels,
         "text": describe_calibration(
-            channels, levels, half[measured], blocks.words, FEWEST
+            channels,
+            levels,
+            half[measured],
+            blocks.words,
+            FEWEST,
+            math.sqrt(inflation),
         ),
     }, arrays
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from sim2gp.identification.words import join_names
+from sim2gp.identification.words import digits, join_names
 
 NARROW, WIDE, BOTH = "too narrow", "too wide", "wrong shape"
 PASSED, UNKNOWN = "not contradicted", "too few to say"
@@ -83,8 +83,13 @@ def describe_calibration(
     half: Float[np.ndarray, "c L"],
     blocks: str,
     fewest: int,
+    widened: float,
 ) -> str:
-    """All channels in words; ``half`` as in `calibration_verdict`, by row."""
+    """All channels in words; ``half`` as in `calibration_verdict`, by row.
+
+    ``widened``: how many times the bands' width is that of the errors of the logs that
+    they were learned from.
+    """
     by: dict[str, list[int]] = {}
     for c, entry in enumerate(channels.values()):
         kind = entry["verdict"]
@@ -106,6 +111,12 @@ def describe_calibration(
         )
     elif "failed" in by:
         texts.append(f"Judged by {blocks}.")
+    if any(entry["verdict"] == WIDE for entry in channels.values()):
+        texts.append(
+            f"All bands are {digits(widened, 2)} times as wide as the errors of the "
+            "logs that were fitted: a new log may differ from them, by more than few "
+            "logs can tell."
+        )
     if UNKNOWN in by:
         counts = [channels[names[c]]["blocks"] for c in by[UNKNOWN]]
         texts.append(
