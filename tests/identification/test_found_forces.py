@@ -11,11 +11,16 @@ import scipy.stats
 
 import planted_forces as study
 from sim2gp.data.one_step import OneStepLikelihood
+from sim2gp.data.split_log import cut
 from sim2gp.data.transitions import Transitions
 from sim2gp.errors import NotFinite, error
 from sim2gp.identification.missing_physics import forces
 from sim2gp.identification.missing_physics.curves import Curve
-from sim2gp.identification.missing_physics.data import FREE, OneStepData
+from sim2gp.identification.missing_physics.data import (
+    FREE,
+    OneStepData,
+    WindowData,
+)
 from sim2gp.identification.missing_physics.forces import (
     EXCLUDED,
     SHARE,
@@ -223,3 +228,22 @@ def test_a_force_on_an_arm_is_within_its_band(shape: str, index: int) -> None:
     found = study.inside_band(study.Case(study.ARM, shape, index))
     assert found["named"]
     assert found["inside"] > 0.9
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("robust", [True, False])
+def test_pushes_hide_no_force_where_the_fit_is_robust(robust: bool) -> None:
+    """A detent on an arm, and errors of four of fifty windows that are as large."""
+    log, _ = study.arm_log_of(study.Case(study.ARM, "notch", 5))
+    q1 = log.channels["q1"].copy()
+    for row in (105, 345, 585, 825):
+        q1[row : row + 10] += 0.5 * np.sin(np.pi * np.arange(10) / 9.0)
+    pushed = replace(log, channels=log.channels | {"q1": q1})
+
+    def windows(machine: Any) -> Any:
+        return cut([pushed], machine, window=study.WINDOW)[0]
+
+    one = np.zeros(50, int)
+    data = WindowData(UniformRodArm(), windows, np.arange(50) // 5, one, robust=robust)
+    found = find_forces(data, data.fit())
+    assert [c.name for c in found.found] == ["q1 by q1"] * robust

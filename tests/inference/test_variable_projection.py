@@ -11,6 +11,7 @@ from jaxtyping import Array
 
 from sim2gp.inference.arrowhead import Noise
 from sim2gp.inference.estimate import estimate
+from sim2gp.inference.groups import Start, estimate_groups
 from sim2gp.inference.least_squares import factor
 from sim2gp.inference.levenberg_marquardt import evaluate, relaxed
 from sim2gp.inference.likelihood import AbstractLikelihood
@@ -203,3 +204,41 @@ def test_no_shape_is_searched_where_a_fit_is_as_good():
     z, _, less = projected(likelihood, about, true.at[1:].set(0.0))
     assert float(z[2]) not in (0.0, float(true[2]))
     assert bool(less)
+
+
+class WavesInWindows(Waves):
+    """The same in eight windows of ten rows each."""
+
+    def first_noise(self):
+        return Noise(jnp.std(self.y)[None], jnp.ones(8))
+
+    def blocks(self, tt, e, scale):
+        J = jax.jacfwd(self.residual)(tt) @ scale
+        rows = J.reshape(8, 10, -1), self.residual(tt).reshape(8, 10)
+        return jax.vmap(factor)(*rows)[:, None]
+
+
+def test_a_window_that_does_not_fit_counts_less():
+    """Oracle: the fit of the rows without it."""
+    one = waves()
+    y = one.y.at[30:40].add(3.0)  # the fourth window was pushed
+    pushed = WavesInWindows(jnp.full((8, 1), 10.0), one.floor, y)
+    start = Start(at_rate(RATE), jnp.full(1, NOISE), jnp.ones(1), jnp.ones((), bool))
+    without = np.delete(np.arange(T.size), np.arange(30, 40))
+
+    def weights(found):
+        return np.asarray(TABLE.constrain(found.posterior.mean))[1:]
+
+    def squares(p):
+        rate, *w = p
+        fitted = w[0] * np.sin(rate * T) + w[1] * np.cos(rate * T)
+        return (fitted - np.asarray(one.y))[without]
+
+    oracle = scipy.optimize.least_squares(squares, [RATE, *WEIGHTS]).x[1:]
+    robust = estimate_groups(pushed, prior(), start, 4.0)
+    plain = estimate_groups(pushed, prior(), start)
+    others = np.delete(np.asarray(robust.noise.weights), 3)
+    assert float(robust.noise.weights[3]) < 0.15 * others.min()
+    assert np.all(np.asarray(plain.noise.weights) == 1.0)
+    far, near = (np.max(np.abs(weights(x) - oracle)) for x in (plain, robust))
+    assert near < 0.01 < 0.3 < far

@@ -23,6 +23,7 @@ from sim2gp.inference.likelihood import AbstractLikelihood
 from sim2gp.inference.prior import ParameterPrior
 from sim2gp.inference.relevance import OFF
 from sim2gp.inference.variable_projection import SAME, Projected, projected
+from sim2gp.types import Scalar
 
 BROAD = 3.0  # scale of every group in a first descent
 ROWS = 64  # that judge starts
@@ -47,9 +48,12 @@ def estimate_groups(
     likelihood: AbstractLikelihood,
     prior: ParameterPrior,
     last: Start,
+    freedom: float | Scalar = jnp.inf,
 ) -> Estimate:
     """From the last fit; where that no longer explains the data, the fit of highest
     evidence from all groups off, and from projected parameters.
+
+    ``freedom``: as in `estimate`.
 
     What did not converge is reported by `Convergence.check`.
     """
@@ -64,7 +68,8 @@ def estimate_groups(
     def descend(start: Start) -> Estimate:
         noise = Noise(start.noise, first.weights)
         about = prior.scaled(start.scales)
-        return estimate(likelihood, about, starts=start.z[None], noise=noise)
+        how: dict[str, Any] = {"noise": noise, "freedom": freedom}
+        return estimate(likelihood, about, starts=start.z[None], **how)
 
     def skip(start: Start) -> Estimate:
         shapes = jax.eval_shape(descend, start)

@@ -12,7 +12,7 @@ alone, whose noise has in it what is missing.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -134,7 +134,7 @@ def _fitted(
     first = likelihood.first_noise().sd
 
     def fit(last: Start, near: float = 0.0) -> _Fit:
-        found = estimate_groups(likelihood, prior, last)
+        found = estimate_groups(likelihood, prior, last, data.freedom)
         found.convergence.check(table.names, "the data", near)
         return _Fit(found, np.asarray(prior.scales_in(found.prior)))
 
@@ -165,7 +165,8 @@ def _fitted(
     most = _largest(best.found, prior.scaled(jnp.asarray(best.scales)), alike)
     best = replace(best, scales=_of_free_size(best.scales, forces))
     wide = prior.scaled(jnp.asarray(best.scales))
-    free = _Linear.of(data, likelihood, _with_free_sizes(likelihood, best.found, wide))
+    any_size = _with_free_sizes(likelihood, best.found, wide, data.freedom)
+    free = _Linear.of(data, likelihood, any_size)
     curves: list[Curve] = []
     for own in dict.fromkeys((f.where, f.of) for f in forces):
         mine = np.asarray([(f.where, f.of) == own for f in forces])
@@ -269,7 +270,10 @@ class _Fit:
 
 @eqx.filter_jit
 def _with_free_sizes(
-    likelihood: AbstractLikelihood, best: Estimate, prior: ParameterPrior
+    likelihood: AbstractLikelihood,
+    best: Estimate,
+    prior: ParameterPrior,
+    freedom: float,
 ) -> Estimate:
     """The fit where functions that are on may be of any size.
 
@@ -280,4 +284,5 @@ def _with_free_sizes(
     wide = prior.as_gaussian()
     start = wide.whitened(best.posterior.mean)[None]
     about = ParameterPrior(wide, prior.table.without_groups())
-    return estimate(likelihood, about, starts=start, noise=best.noise, until=NEAR)
+    how: dict[str, Any] = {"noise": best.noise, "freedom": freedom, "until": NEAR}
+    return estimate(likelihood, about, starts=start, **how)
