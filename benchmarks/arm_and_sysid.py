@@ -7,7 +7,7 @@ For each seed the arm's dampings, armatures, dry frictions and four masses are d
 within a factor of about two of its file, a log is recorded by C MuJoCo (200 Hz,
 encoders of 1e-3 rad), and both identify these 22 constants from it, each as a whole
 command on one core. This program learns one delay of all drives as well, mujoco.sysid
-is told it; ``told`` is this program where it is told it, too. Windows are as long as
+is given it; ``given`` is this program where it is given it, too. Windows are as long as
 `init` has them. Needs `mujoco[sysid]`. Cold: without anything compiled before.
 """
 
@@ -120,8 +120,8 @@ def write(
     window = window or window_of(seconds)
     project = servo_arm.project_text(["log.csv"], constants=OPEN, window=window)
     (folder / "arm.toml").write_text(project)
-    told = project.replace("{low = 0.0, high = 0.03}\ntie = true", f"{delay}")
-    (folder / "told.toml").write_text(told)
+    given = project.replace("{low = 0.0, high = 0.03}\ntie = true", f"{delay}")
+    (folder / "given.toml").write_text(given)
 
 
 def cell(seconds: float, seed: int, delay: float, *, cold: bool) -> dict[str, Any]:
@@ -132,10 +132,10 @@ def cell(seconds: float, seed: int, delay: float, *, cold: bool) -> dict[str, An
         out: dict[str, Any] = {"seconds": seconds, "seed": seed, "cold": cold}
         if not cold and seed == 0:  # what is compiled is kept from here on
             _ours(folder, "arm", seed, cache)
-            _ours(folder, "told", seed, cache)
+            _ours(folder, "given", seed, cache)
         out["ours"] = _ours(folder, "arm", seed, cache)
         if not cold:
-            out["told"] = _ours(folder, "told", seed, cache)
+            out["given"] = _ours(folder, "given", seed, cache)
         sysid = [str(Path(__file__)), "--sysid", str(folder), "--delay", str(delay)]
         out["sysid"] = timed(folder, sysid, one_core=True)
         theirs = json.loads((folder / "sysid.json").read_text())
@@ -188,7 +188,7 @@ def table(rows: list[dict[str, Any]]) -> str:
     ]
     who = {
         "ours": "sim2gp, delay learned",
-        "told": "sim2gp, delay given",
+        "given": "sim2gp, delay given",
         "sysid": "mujoco.sysid, delay given",
     }
     for seconds in dict.fromkeys(row["seconds"] for row in rows):

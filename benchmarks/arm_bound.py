@@ -5,7 +5,7 @@
 The information of the same logs at the true constants (the Cramer-Rao bound), with
 encoders of 1e-3 rad, unknown starts and this program's priors. A constant whose error
 is normal with that sd is off by .67 of it in half of all cases; the table has the
-median of that over the 22 constants, then over seeds, beside the errors that
+median of that over the 22 constants, then over seeds, next to the errors that
 `arm_and_sysid.py` has measured. Windows of 1 s have a start each, the whole log has
 one. Writes `arm_bound.json` and prints a table.
 """
@@ -38,7 +38,7 @@ DELAY = 0.01  # s
 
 @in_float64
 def errors(seconds: float, seed: int, window: float) -> dict[str, float]:
-    """The median error to be expected, where the delay is learned and where told."""
+    """The median error to be expected, where the delay is learned and where given."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         write(folder, seconds, seed, DELAY)
@@ -65,7 +65,7 @@ def errors(seconds: float, seed: int, window: float) -> dict[str, float]:
         sd = np.linalg.norm(root, axis=1) * scale[kept]
         return HALF * float(np.median(sd[[kept.index(k) for k in others]]))
 
-    return {"learned": median(list(range(len(theta)))), "told": median(others)}
+    return {"learned": median(list(range(len(theta)))), "given": median(others)}
 
 
 class _Known:
@@ -82,7 +82,7 @@ def table(rows: list[dict[str, Any]]) -> str:
         mine = [r for r in rows if (r["seconds"], r["window"]) == (seconds, window)]
         cut_ = "the whole log" if window == seconds else f"{window:g} s"
         middle = (
-            statistics.median(r[name] for r in mine) for name in ("learned", "told")
+            statistics.median(r[name] for r in mine) for name in ("learned", "given")
         )
         cells = " | ".join(f"{x:.3f}" for x in middle)
         lines.append(f"| {seconds:.0f} s | {cut_} | {cells} |")

@@ -271,10 +271,10 @@ class ControlCell(Cell):
     """A cell whose condition may be one of `OUTSIDE`, and its method a control."""
 
     @property
-    def lacking(self) -> AbstractPart:
+    def missing(self) -> AbstractPart:
         if self.condition in OUTSIDE:
             return OUTSIDE[self.condition]
-        return super().lacking
+        return super().missing
 
 
 def _on(make: Any, system: Any, _: AbstractPart, options: Mapping[str, Any]) -> Any:

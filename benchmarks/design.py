@@ -1,4 +1,4 @@
-"""Designed experiments beside what one would run otherwise, on arms with friction.
+"""Designed experiments, and what one would run otherwise, on arms with friction.
 
     python benchmarks/design.py [--truths N] [--recordings N] [--seconds S]
         [--workers N] [--out DIR] [--refresh | --keep-old]
@@ -62,7 +62,7 @@ RATES = {"torque1": 40.0, "torque2": 40.0}
 #: CAD: relative sd of masses and lengths, and of friction, which no drawing knows.
 GEOMETRY, FRICTION = 0.15, 0.5
 METHODS = ("random", "multisine", "design", "design free")
-#: The project's goals: error beside random input's and the multisine's; calibration.
+#: The project's goals: error over random input's and the multisine's; calibration.
 OF_RANDOM, OF_MULTISINE, CALIBRATED = 0.5, 0.9, (0.8, 1.25)
 
 
@@ -84,7 +84,7 @@ class Job(NamedTuple):
 
 
 def arm() -> TwoLink:
-    """Nine constants as a drawing knows them; link 2 was weighed."""
+    """Nine constants as a drawing knows them; link 2 was put on a scale."""
     table = TwoLink().parameters
     nominal = table.nominal()
     changes: dict[str, Any] = {"m2": nominal["m2"]}
@@ -228,7 +228,7 @@ def motion_error(belief: Gaussian, seed: int) -> float:
     """Of angles (rad) in five seconds that were held out, at the belief's mean.
 
     Each second is predicted from where the arm is when it begins. From a single start
-    the later seconds would hang on its last digits, whatever was learned.
+    the later seconds would hang on its last digits, for any estimate.
     """
     experiment, limits = setting(HELD * PERIOD)
     signal = MultisineCommands(PERIOD, HELD)

@@ -60,8 +60,8 @@ def report(
         answer = study.verdict(cell["machine"], cell)
         confusion.setdefault(row, Counter())[answer] += 1
     for row, answers in confusion.items():
-        told = ", ".join(f"{n} {a}" for a, n in Counter(answers).most_common())
-        print(f"{row:24s} {told}")
+        counts = ", ".join(f"{n} {a}" for a, n in Counter(answers).most_common())
+        print(f"{row:24s} {counts}")
     claims = study.claims(found)
     for name, claim in claims.items():
         word = "holds" if claim["holds"] else "FAILS"

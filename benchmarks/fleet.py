@@ -6,7 +6,7 @@
 Hidden two-link arms (`interval_arms.py`), three seconds of each. In virtual units a
 kind is drawn from N(0, 1), where the prior's sd is 1.5; dampings of its arms differ by
 sd of .3 and .6, masses not at all (an interval of a spread is above zero: its upper end
-is told). Coverage of nominal 95 % (with its Clopper-Pearson
+is reported). Coverage of nominal 95 % (with its Clopper-Pearson
 interval) of the kind, of each arm, of an arm without logs, and of the spreads; widths
 of an arm's interval over that of its own fit alone. A cell is a fleet.
 """
@@ -26,7 +26,7 @@ from interval_arms import (
     NAMES,
     NOISE,
     Recordings,
-    flown,
+    motion_of,
     multisine,
     physical,
 )
@@ -97,7 +97,7 @@ def holds(known: Gaussian, truth: np.ndarray) -> list[bool]:
 def recorded(virtual: np.ndarray, rng: np.random.Generator) -> Recordings:
     """Three seconds of each arm, under torques of its own."""
     torque = multisine(rng, SECONDS, len(virtual))
-    angles = flown(physical(virtual), torque, CONDITIONS["white"])[..., :2]
+    angles = motion_of(physical(virtual), torque, CONDITIONS["white"])[..., :2]
     noise = NOISE * rng.standard_normal(angles.shape)
     return Recordings(virtual, torque, angles + noise)
 

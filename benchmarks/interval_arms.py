@@ -98,7 +98,7 @@ def recordings(condition: Condition, sets: int, chunk: int) -> Recordings:
     if condition.mujoco:
         states = moved(values, torque, condition, PERIOD)
     else:
-        states = flown(values, torque, condition)
+        states = motion_of(values, torque, condition)
     white = rng.standard_normal((len(torque), sets, 2))
     noise = coloured(white, condition.rho)
     return Recordings(truth, torque, states[..., :2] + NOISE * noise)
@@ -130,7 +130,9 @@ def coloured(white: np.ndarray, rho: float) -> np.ndarray:
     return out
 
 
-def flown(values: np.ndarray, torque: np.ndarray, condition: Condition) -> np.ndarray:
+def motion_of(
+    values: np.ndarray, torque: np.ndarray, condition: Condition
+) -> np.ndarray:
     """States (T, S, 4) from rest under held torques, by RK4."""
     x, h, out = np.zeros((len(values), 4)), PERIOD / SUBSTEPS, []
     for u in torque:

@@ -1,4 +1,4 @@
-"""What `sim2gp.identification.intervals.scatter` was chosen from, and the oracle beside
+"""What `sim2gp.identification.intervals.scatter` was chosen from, and an oracle
 it.
 
 Each gives centre and sd in prior sd of the virtual constants, from the linearisation of
@@ -127,7 +127,7 @@ def mixture(x: Linear) -> Found:
 
 
 def oracle(x: Linear, rho: float, noise: float) -> Found:
-    """The same windows, weighed by the true covariance of AR(1) noise of sd ``noise``.
+    """The same windows, weighted by the true covariance of AR(1) noise of sd ``noise``.
 
     One Gauss-Newton step from the MAP, start states unknown as in the fit.
     """

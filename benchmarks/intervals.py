@@ -4,14 +4,14 @@
         [--refresh | --keep-old]
 
 Ten seconds of a hidden two-link arm (`interval_arms.py`) are fitted with the likelihood
-of `sim2gp identify`; masses and dampings are unknown. Beside the plain intervals
+of `sim2gp identify`; masses and dampings are unknown. Next to the plain intervals
 (Laplace) and the library's stand those without the effects that the simulator may lack
 (the windows' scatter alone), what they were chosen from (`interval_candidates.py`), and
 an oracle that knows what is wrong: the noise's true covariance, or a simulator with the
 missing term. `--also longer` adds the library's on windows of 1 s instead of .2 s, and
 what comes of those where the misfit tests of both fits are silent, as `sim2gp identify
 --longer` advises; `--also sysid` those of mujoco.sysid (`interval_sysid.py`, extra
-`bench`), which takes all ten seconds in one piece and is told their start. Coverage
+`bench`), which takes all ten seconds in one piece and is given their start. Coverage
 with its 95 % interval (Clopper-Pearson), the mean interval score (Gneiting and Raftery
 2007; lower is better) over the oracle's, and the median width over the plain one's.
 Finished cells are not computed again.
@@ -71,7 +71,7 @@ ALSO = {
     "advised": "sim2gp, longer where silent",  # of "corrected" and "longer"
     "sysid": "mujoco.sysid",
 }
-FLOWN = ("longer", "sysid")  # of these, the ones with cells
+ALSO = ("longer", "sysid")  # of these, the ones with cells
 #: Entry of a cell: of which sets the misfit tests speak, in windows of a length.
 SPEAK = {WINDOW: "speak", LONGER: "speak_longer"}
 #: Of a cell, too: the probability that something is missing.
@@ -270,8 +270,8 @@ def lines(summary: dict[str, Any]) -> list[str]:
 def _goal(condition: str, mine: dict[str, Any]) -> str:
     """Masses only where physics is missing: a damping must make up for friction."""
     low, high = ASKED.get(condition, ASKED_ELSE)
-    lacking = CONDITIONS[condition].friction or CONDITIONS[condition].cogging
-    asked = [c for c in NAMES if c[0] == "m" or not lacking]
+    unmodelled = CONDITIONS[condition].friction or CONDITIONS[condition].cogging
+    asked = [c for c in NAMES if c[0] == "m" or not unmodelled]
     inside = all(low <= mine[c]["coverage"] <= high for c in asked)
     worst = max(mine[c]["score"] for c in asked)
     return (
@@ -286,7 +286,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sets", type=int, default=200)
     parser.add_argument("--workers", type=int, default=cores())
-    parser.add_argument("--also", nargs="+", choices=FLOWN, default=[])
+    parser.add_argument("--also", nargs="+", choices=ALSO, default=[])
     parser.add_argument("--out", type=Path, default=Path("results/intervals"))
     add_options(parser)
     options = parser.parse_args()
@@ -295,11 +295,11 @@ def main() -> None:
     cells.check(
         (job.name, job.arguments)
         for name in CONDITIONS
-        for also in ("", *FLOWN)
+        for also in ("", *ALSO)
         for job in (Job(name, k, options.out, also) for k in range(chunks))
     )
     for name in CONDITIONS:
-        for also in ("", *FLOWN):
+        for also in ("", *ALSO):
             jobs = [Job(name, k, options.out, also) for k in range(chunks)]
             done = {j: cells.load(j.name, j.arguments) for j in jobs}
             missing = [j for j in jobs if done[j] is None]

@@ -7,7 +7,7 @@ Recordings of 20 s at 100 Hz of one two-link arm, each under its own torques
 without a held-out fit. Each size is a process of its own that finds nothing compiled.
 Memory is the largest that it had, where glibc gives back what is free (`GIVE_BACK`).
 Of ``--compare`` rows the posterior is also computed with all windows at once, and the
-largest difference told: of means in sd, of sd as a share.
+largest difference reported: of means in sd, of sd as a share.
 """
 
 import argparse
@@ -27,7 +27,7 @@ from interval_arms import (
     NOISE,
     PERIOD,
     Recordings,
-    flown,
+    motion_of,
     multisine,
     physical,
 )
@@ -47,7 +47,7 @@ def logs_of(rows: int) -> tuple[np.ndarray, list[Log]]:
         count = min(AT_ONCE, rows // EACH - len(found))
         values = np.repeat(truth[None], count, axis=0)
         torque = multisine(rng, EACH * PERIOD, count)
-        angles = flown(physical(values), torque, CONDITIONS["white"])[..., :2]
+        angles = motion_of(physical(values), torque, CONDITIONS["white"])[..., :2]
         angles = angles + NOISE * rng.standard_normal(angles.shape)
         some = Recordings(values, torque, angles)
         found += [_own(some.log(s), len(found) + s) for s in range(count)]

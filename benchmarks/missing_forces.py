@@ -7,9 +7,9 @@
 Each setting is an effect of the mismatch map with its strength ("spring strong"),
 ``nominal`` or ``mismatch`` of figure 2, or physics that no force of one variable is;
 learners are those of the studies, and the controls (`controls.py`). A first episode in
-which the pole stays up for the last second has solved the task, whatever the time until
-then has cost. Cells are stored next to ``--out`` and not computed again; on a GPU those
-of a learner are one program.
+which the pole stays up for the last second has solved the task, however long that took.
+Cells are stored next to ``--out`` and not computed again; on a GPU those of a learner
+are one program.
 """
 
 import argparse

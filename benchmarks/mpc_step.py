@@ -29,7 +29,7 @@ from sim2gp.systems import Furuta, free_parts
 
 SIMULATOR, LINEAR = "plain simulator", "SIM2GP"
 PLANNER = MPC(update=ICEM(samples=128, iterations=4), horizon=30)
-#: The project's goals: neural draws, and linearised draws beside the simulator.
+#: The project's goals: neural draws, and linearised draws over the simulator.
 MILLISECONDS, TIMES = 25.0, 3.0
 
 
@@ -42,7 +42,7 @@ def random_data(task: Task) -> Transitions:
 
 
 def worlds(task: Task) -> dict[str, World]:
-    """A draw of each fitted model as a world, beside the simulator itself."""
+    """A draw of each fitted model as a world, and the simulator itself."""
     sim, data, key = Sim2GP(Furuta()), random_data(task), jax.random.key(1)
     beliefs = {}
     for name, learner in MODELS.items():

@@ -6,7 +6,7 @@ For a cart-pole, and for a puck that slides on a floor: batches of steps of 10 m
 float32, as a planner asks for, and steps with their Jacobians in two constants, state
 and input in float64, as a fit does. Each engine counts by its median of five turns, in
 processor seconds, so that other work on the machine does not count. What compiling
-costs stands beside it: C MuJoCo's is that of the callback alone.
+costs is next to it: C MuJoCo's is that of the callback alone.
 """
 
 import argparse

@@ -6,8 +6,8 @@ A linearisation is a simulation of 10 s at 200 Hz in windows of 1 s and its deri
 in every constant and start: one step of a fit. The models: acrobot and cart-pole of
 dm_control, a six-axis arm, and Unitree's Go1 and G1 with their bases fixed (package
 `mjlab`, looked for where it is installed, or in FOLDER). What mjlab adds in its own
-code stands here for it: servos, armatures, friction, and no contacts of the legs with
-the trunk. Beside it what central differences of the steps would take, estimated from a
+code is in its place here: servos, armatures, friction, and no contacts of the legs with
+the trunk. Next to it what central differences of the steps would take, estimated from a
 twentieth of them.
 """
 

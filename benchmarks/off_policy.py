@@ -1,4 +1,4 @@
-"""SAC in worlds made of the truth: how good, how soon, and beside SBX's SAC.
+"""SAC in worlds made of the truth: how good, how soon, and next to SBX's SAC.
 
     pip install 'sim2gp[bench]'
     python benchmarks/off_policy.py [--seeds N] [--out DIR]
@@ -87,7 +87,9 @@ def _step(world: World, s: jax.Array, u: jax.Array) -> Any:
 
 
 @eqx.filter_jit
-def flown(task: Task, act: Callable[[jax.Array], jax.Array], key: jax.Array) -> Any:
+def episode_return(
+    task: Task, act: Callable[[jax.Array], jax.Array], key: jax.Array
+) -> Any:
     """The median return of a policy, a pytree, on the machine."""
 
     def one(key: jax.Array) -> jax.Array:
@@ -123,7 +125,7 @@ def ours(task: Task, oracle: float, seed: int) -> list[tuple[float, float]]:
         learner = OURS.prepare(learner, world, nothing, key=again)
         jax.block_until_ready(learner.updates)
         seconds = time.perf_counter() - started - away
-        share = float(flown(task, learner.policy, key)) / oracle
+        share = float(episode_return(task, learner.policy, key)) / oracle
         away = time.perf_counter() - started - seconds
         looks.append((seconds, share))
     return looks
@@ -144,7 +146,7 @@ def theirs(task: Task, oracle: float, seed: int, most: float) -> Any:
         model.learn(CHUNK, reset_num_timesteps=not looks)
         seconds = time.perf_counter() - started - away
         policy = eqx.Partial(act, model.policy.actor_state)
-        share = float(flown(task, policy, key)) / oracle
+        share = float(episode_return(task, policy, key)) / oracle
         away = time.perf_counter() - started - seconds
         looks.append((seconds, share))
     return looks
@@ -220,7 +222,7 @@ def reached(looks: list[tuple[float, float]]) -> float:
 
 
 def lines(found: dict[str, Any]) -> list[str]:
-    """The figures, and the goals beside them."""
+    """The figures, and the goals."""
     out = ["steps with as many updates, per second (goal: 1.5 times SBX's in one)"]
     for width, each in found["speed"].items():
         mine = each["ours"]

@@ -162,7 +162,7 @@ def _lines(medians: dict[tuple[str, str, str], np.ndarray]) -> list[str]:
 
 
 def _goals(medians: dict[tuple[str, str, str], np.ndarray]) -> list[str]:
-    """RES-FS beside the best model of each column."""
+    """RES-FS and the best model of each column."""
     behind, covered = [], []
     for machine, condition in {(m, c): None for m, c, _ in medians}:
         mine = medians[machine, condition, "RES-FS"]

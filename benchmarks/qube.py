@@ -3,7 +3,7 @@
     python benchmarks/qube.py [DATA] [--horizon S] [--run DIR]
 
 DATA is the folder with ``qube``. Prints the error of `sim2gp evaluate
-examples/qube.toml` beside a plain seven-number least-squares fit (the tests' oracle,
+examples/qube.toml` and a plain seven-number least-squares fit (the tests' oracle,
 which shares no code with the package), the held state and a linear regression.
 """
 

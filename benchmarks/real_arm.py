@@ -1,11 +1,11 @@
-"""The real arm, one log left out at a time: sim2gp beside what else one could use.
+"""The real arm, one log left out at a time: sim2gp and what else one could use.
 
     python benchmarks/real_arm.py [DATA] [--horizon S] [--run DIR]
 
 DATA is the folder with ``double_pendulum/excitation``. Prints, per log and joint, the
 error of `sim2gp evaluate examples/double_pendulum.toml`, of a plain nine-number
 least-squares fit and of the published models, the ratios, and whether the project's
-own goals hold. The fit and the protocol beside are the tests' oracles, which share no
+own goals hold. That fit and its protocol are the tests' oracles, which share no
 code with the package; the package's errors are pooled by the package.
 """
 

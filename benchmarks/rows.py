@@ -5,7 +5,7 @@
 DATA is the folder with ``double_pendulum``. The six recordings are copied under other
 names for the twelve. Both are fitted warm (compiled before) in turn, and each counts by
 its fastest of three; the ratio of the fit alone is the goal, that of the whole command
-stands beside it.
+is given with it.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""A session that designs its own experiments and stops, beside a tuned multisine.
+"""A session that designs its own experiments and stops, and a tuned multisine.
 
     python benchmarks/session.py [--truths N] [--rounds N] [--workers N] [--out DIR]
         [--refresh | --keep-old]
@@ -75,8 +75,13 @@ class Job(NamedTuple):
     @property
     def arguments(self) -> dict[str, Any]:
         """What its cell rests on."""
-        told = {"rounds": self.rounds, "noise": NOISE, "limits": LIMITS, "rates": RATES}
-        return told | {"starts": STARTS, "recordings": RECORDINGS, "times": TIMES}
+        settings = {
+            "rounds": self.rounds,
+            "noise": NOISE,
+            "limits": LIMITS,
+            "rates": RATES,
+        }
+        return settings | {"starts": STARTS, "recordings": RECORDINGS, "times": TIMES}
 
     @property
     def cells(self) -> Cells:
@@ -90,7 +95,7 @@ def session(seed: int, rounds: int) -> tuple[dict[str, Any], list[np.ndarray]]:
     signal = FreeCommands(PERIOD, experiment.steps)
     belief: Gaussian = arm().parameters.prior()
     logs: list[Log] = []
-    flown: list[np.ndarray] = []
+    commands: list[np.ndarray] = []
     errors: list[float] = []
     said, stopped = "", False
     while not stopped and len(logs) < rounds:
@@ -103,10 +108,10 @@ def session(seed: int, rounds: int) -> tuple[dict[str, Any], list[np.ndarray]]:
         stopped = not worth
         if worth:
             logs.append(recorded(seed, len(logs), found.commands)[0])
-            flown.append(found.commands)
+            commands.append(found.commands)
             belief = fitted(logs, seed)
             errors.append(motion_error(belief, seed))
-    return {"errors": errors, "stopped": stopped, "said": said}, flown
+    return {"errors": errors, "stopped": stopped, "said": said}, commands
 
 
 @in_float64
@@ -132,16 +137,16 @@ def judged(seed: int, commands: list[np.ndarray], first: int) -> list[float]:
 
 
 def work(job: Job) -> dict[str, Any]:
-    """Both on one arm; from the disk if they were flown."""
+    """Both on one arm; from the disk if they were run."""
     cells = job.cells
     U = stored(cells, MULTISINE, tuned)
     found = cells.load(job.name, job.arguments)
     if found is None:
-        said, flown = session(job.seed, job.rounds)
-        np.savez(cells.folder / f"{job.name}.npz", *flown)
-        n = len(flown)
+        said, commands = session(job.seed, job.rounds)
+        np.savez(cells.folder / f"{job.name}.npz", *commands)
+        n = len(commands)
         values = {
-            "session": judged(job.seed, flown, 0),
+            "session": judged(job.seed, commands, 0),
             "as_many": judged(job.seed, n * [U], 100),
             "more": judged(job.seed, TIMES * n * [U], 100),
         }

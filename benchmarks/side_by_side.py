@@ -31,7 +31,7 @@ from interval_arms import (
     NOISE,
     SECONDS,
     Recordings,
-    flown,
+    motion_of,
     multisine,
     physical,
 )
@@ -234,13 +234,13 @@ def arm_recordings(seed: int) -> tuple[Recordings, np.ndarray]:
     rng = np.random.default_rng(seed)
     virtual = rng.standard_normal((1, len(NAMES)))
     torque = multisine(rng, SECONDS, 1)
-    angles = flown(physical(virtual), torque, CONDITIONS["white"])[..., :2]
+    angles = motion_of(physical(virtual), torque, CONDITIONS["white"])[..., :2]
     noise = NOISE * rng.standard_normal(angles.shape)
     return Recordings(virtual, torque, angles + noise), angles
 
 
 def arm_windows(data: Recordings, *, at_rest: bool) -> Windows:
-    """All ten seconds as one window; mujoco.sysid is told that it begins at rest."""
+    """All ten seconds as one window; mujoco.sysid is given that it begins at rest."""
     system = UniformRodArm()
     known = {channel.name: REST for channel in system.states} if at_rest else None
     windows, _ = cut([data.log(0)], system, window=SECONDS, start_sd=known)
@@ -254,7 +254,7 @@ def arm_windows(data: Recordings, *, at_rest: bool) -> Windows:
 def arm_errors() -> dict[str, float]:
     """Root mean square error of the motion that each fit predicts; median of arms, rad.
 
-    ``start_unknown`` is this library where it is not told that the arm begins at rest.
+    ``start_unknown`` is this library where it is not given that the arm begins at rest.
     """
     from interval_sysid import intervals
 
@@ -271,7 +271,7 @@ def arm_errors() -> dict[str, float]:
             found["theirs"] = intervals(data, 0, system.parameters)[0] * sd
         for name, virtual in found.items():
             values = physical(virtual[None])
-            motion = flown(values, data.torque, CONDITIONS["white"])[..., :2]
+            motion = motion_of(values, data.torque, CONDITIONS["white"])[..., :2]
             error = float(np.sqrt(np.mean((motion - truth) ** 2)))
             errors.setdefault(f"error_{name}", []).append(error)
     return {name: float(np.median(each)) for name, each in errors.items()}

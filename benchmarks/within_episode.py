@@ -1,9 +1,9 @@
-"""Learning within an episode beside learning between episodes, under mismatch.
+"""Learning within an episode and between episodes, under mismatch.
 
     python benchmarks/within_episode.py [--seeds N] [--episodes N] [--every STEPS]
         [--refresh | --keep-old]
 
-The Furuta with figure 2's cable spring. Each learner is flown as the paper has it (one
+The Furuta with figure 2's cable spring. Each learner is run as the paper has it (one
 world per episode) and with a belief that is conditioned, and drawn from again, every
 second. Seeds are paired: the same machine, the same noise. Finished cells are kept.
 """
@@ -68,8 +68,8 @@ def main() -> None:
         for (c, learner, every), score in table.items()
     }
     about = {name: details[name] for name in ("source", "cells_of_other_source")}
-    told = {"command": " ".join(["python", *sys.argv]), **about, "scores": plain}
-    (arguments.out / "scores.json").write_text(json.dumps(told, indent=1) + "\n")
+    summary = {"command": " ".join(["python", *sys.argv]), **about, "scores": plain}
+    (arguments.out / "scores.json").write_text(json.dumps(summary, indent=1) + "\n")
 
 
 def _lines(table: dict, every: int) -> list[str]:

@@ -107,9 +107,9 @@ print(sg.apply(found).diff)
 draws = sg.export(found, "runs/draws", draws=4)
 
 # %% [markdown]
-# ## A machine that is learned while it is flown, and the paper's figures
+# ## A machine that is learned while it runs, and the paper's figures
 # `sim2gp demo --episodes 1`, `sim2gp reproduce fig1 --quick`
 
 # %%
-flown = sg.demo(episodes=1)
+demonstration = sg.demo(episodes=1)
 figure = sg.reproduce("fig1", "runs/fig1", quick=True)

@@ -45,7 +45,7 @@ def step(
 def machines(
     count: int, N: int, *, friction: float = 0.0, delay: int = 0, seed: int = 0
 ) -> list[Rows]:
-    """So many machines, each flown for ``N`` steps."""
+    """So many machines, each run for ``N`` steps."""
     rng = np.random.default_rng([seed, N, int(10 * friction), delay])
     shape = (count, N // LENGTH)
     w, b, k = (

@@ -15,7 +15,7 @@ from sim2gp.runs import Progress
 
 
 @dataclass(frozen=True)
-class Told(AbstractResult):
+class Returned(AbstractResult):
     """A result with a summary and nothing else."""
 
 
@@ -38,12 +38,12 @@ def identify(
     longer: bool = False,
     held_out: bool = True,
     first: Callable[[Any], str] | None = None,
-) -> Told:
+) -> Returned:
     """What an identification says of its input, and no fit."""
     with progress.task("fit", 2) as task:
         task.advance("half")
         task.advance()
-    return Told(
+    return Returned(
         {
             "n_transitions": sum(len(log) - 1 for log in logs),
             "parameters": {

@@ -7,7 +7,7 @@ the site. A fence ```` ```python nightly ```` loses what the tests say to themse
 does that of a part of a project file, which names the system that completes it); a
 link that leaves docs/ takes its target along, since a site is one folder; and what
 README calls the tree is the reference. That has a page for each package of sim2gp, and
-one for the modules beside them, so that a new module is in it without being entered.
+one for the modules next to them, so that a new module is in it without being entered.
 
 Notebooks of examples/ become pages, with a file for Jupyter and Colab next to each.
 """
@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "src" / "sim2gp"
 #: Pages of the root that are pages of the site.
 TOP = {"CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
-#: Modules that stand beside the packages share a page.
+#: Modules next to the packages share a page.
 CORE = "core"
 DEFINITIONS = (ast.ClassDef, ast.FunctionDef)
 
@@ -140,7 +140,7 @@ def _target(link: str, page: Path, out: Path) -> str:
 
 
 def modules() -> dict[str, list[str]]:
-    """Every module of sim2gp by the page that it stands on, itself first."""
+    """Every module of sim2gp by its page, itself first."""
     pages: dict[str, list[str]] = {CORE: []}
     for file in sorted(PACKAGE.rglob("*.py")):
         parts = file.relative_to(PACKAGE).with_suffix("").parts
@@ -204,7 +204,7 @@ def _page(page: str, found: list[str]) -> str:
     lines = [f"# {page}", "", heading(page, found), "", "| module | |", "|---|---|"]
     lines += [f"| [`{m}`](#{m}) | {first_sentence(m, m)} |" for m in found]
     for module in found:
-        # What a package imports is told where it is defined.
+        # What a package imports is described where it is defined.
         own = [
             node.name
             for node in tree(module).body

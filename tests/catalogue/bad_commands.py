@@ -206,15 +206,15 @@ def sampler(folder: Path) -> object:
 # Results of Python
 
 
-def told(folder: Path, project: bool) -> stub_commands.Told:
+def found(folder: Path, project: bool) -> stub_commands.Returned:
     path = folder / "project.toml"
     path.write_text(PROJECT)
     known = load_project(path) if project else None
-    return stub_commands.Told({"command": "identify"}, project=known)
+    return stub_commands.Returned({"command": "identify"}, project=known)
 
 
 def changed_since(folder: Path) -> None:
-    result = told(folder, True)
+    result = found(folder, True)
     (folder / "project.toml").write_text(f"{PROJECT}# more\n")
     project_file(result)
 
@@ -223,7 +223,7 @@ def evaluated(folder: Path) -> None:
     """An identification without logs to forecast."""
     from sim2gp.commands.identification import Identification
 
-    project = told(folder, True).project
+    project = found(folder, True).project
     sg.evaluate(Identification({"command": "identify"}, {}, {}, project, None))
 
 
@@ -374,7 +374,7 @@ COMMANDS: tuple[Case, ...] = (
     case(
         132,
         "results of Python",
-        made("no_project_to_add_to", lambda folder: project_file(told(folder, False))),
+        made("no_project_to_add_to", lambda folder: project_file(found(folder, False))),
         made("project_changed_since_run", changed_since, "project.toml"),
         made("no_logs_to_evaluate", evaluated),
         made("empty_list_of_logs", no_logs),

@@ -291,7 +291,7 @@ FORMATS: tuple[Case, ...] = (
         raw("not_what_its_name_says", b"time,q,dq,u\n", "b'time'"),
         raw("not_what_its_name_says", b"PAR1" + bytes(40), "parquet"),
         raw("file_incomplete_or_damaged", whole()[:900]),
-        recording("column_stands_twice", "a.npz", one_name_twice, "column q"),
+        recording("repeated_column", "a.npz", one_name_twice, "column q"),
         recording("unknown_archive_compression", "a.npz", unknown_method, "method 99"),
         Input("file_changed_while_read", ("a.npz",), growing),
         Input("file_too_large", ("project.toml",), limited),
@@ -340,7 +340,7 @@ FORMATS: tuple[Case, ...] = (
             lambda pa: pa.array([[1.0, 2.0]] + [[1.0]] * 119),
             names=("q[0]", "dq", "u"),
         ),
-        recording("column_stands_twice", "a.parquet", q_twice, "column q"),
+        recording("repeated_column", "a.parquet", q_twice, "column q"),
     ),
     case(
         104,

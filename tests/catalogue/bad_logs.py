@@ -90,7 +90,7 @@ FIRST: tuple[Case, ...] = (
     case(
         6,
         "duplicate column names",
-        log(text(header="t,pos,vel,pos,cmd"), "column_stands_twice", "columns 2 and 4"),
+        log(text(header="t,pos,vel,pos,cmd"), "repeated_column", "columns 2 and 4"),
     ),
     case(
         7,

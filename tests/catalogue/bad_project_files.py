@@ -153,7 +153,7 @@ PROJECT_FILES: tuple[Case, ...] = (
         file(
             "missing_key", BASE.replace('system = "two_link"', ""), "missing key system"
         ),
-        file("key_stands_twice", with_lines('gravity = "9.81"'), "twice", "line 5"),
+        file("repeated_key", with_lines('gravity = "9.81"'), "twice", "line 5"),
         file("E160", BASE.replace("9.81", '"9.81"'), "line 4", "number"),
         file("E160", with_lines("locked = [true]"), "line 4", "locked"),
         file("E141", BASE.replace("high = 0.02", "high = inf"), "line 22", "finite"),

@@ -52,11 +52,11 @@ def refused(
     met: list[Sim2GPError] = []
     printed = cli._print_error
 
-    def told(error: Sim2GPError, code: int, debug: bool) -> int:
+    def answer(error: Sim2GPError, code: int, debug: bool) -> int:
         met.append(error)
         return printed(error, code, debug)
 
-    patch.setattr(cli, "_print_error", told)
+    patch.setattr(cli, "_print_error", answer)
     before = contents(Path.cwd())
     assert main(words) == 2
     said = capsys.readouterr()

@@ -74,7 +74,7 @@ def test_each_error_is_provoked_or_listed() -> None:
     assert set(catalogue()) - provoked == set(NOT_PROVOKED)
 
 
-def test_no_key_stands_twice() -> None:
+def test_no_key_is_repeated() -> None:
     files = [f for f in CODES.parent.glob("*.toml") if f != CODES]
     keys = [k for f in files for k in tomllib.loads(f.read_text(encoding="utf-8"))]
     assert len(keys) == len(set(keys))

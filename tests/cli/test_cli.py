@@ -37,7 +37,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def demo(action: Callable[[Progress], Any]) -> Callable[..., stub_commands.Told]:
+def demo(action: Callable[[Progress], Any]) -> Callable[..., stub_commands.Returned]:
     """A demo that does something and returns the summary above."""
 
     def run(
@@ -50,17 +50,17 @@ def demo(action: Callable[[Progress], Any]) -> Callable[..., stub_commands.Told]
         mismatch: bool,
         progress: Progress,
         sink: Any,
-    ) -> stub_commands.Told:
+    ) -> stub_commands.Returned:
         assert (truth, mismatch) == ("prior", False)
         sink.scalars(0, {"seed": seed})
         action(progress)
         asked = {"seed": seed, "seeds": seeds, "machine": machine}
-        return stub_commands.Told(SUMMARY | asked | {"episodes": episodes})
+        return stub_commands.Returned(SUMMARY | asked | {"episodes": episodes})
 
     return run
 
 
-def raising(error: BaseException) -> Callable[..., stub_commands.Told]:
+def raising(error: BaseException) -> Callable[..., stub_commands.Returned]:
     def action(progress: Progress) -> None:
         raise error
 
@@ -141,8 +141,8 @@ def test_exit_codes(
 def test_failed_claims_are_not_a_success(
     here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def selftest(*, seed: int, progress: Progress) -> stub_commands.Told:
-        return stub_commands.Told({"passed": seed == 1})
+    def selftest(*, seed: int, progress: Progress) -> stub_commands.Returned:
+        return stub_commands.Returned({"passed": seed == 1})
 
     stub_commands.install(monkeypatch, selftest=selftest)
     assert main(["selftest", "--seed", "1", "--quiet"]) == 0

@@ -166,17 +166,17 @@ def test_the_command_line_hands_on(
 
     added: list[Path] = []
 
-    class Missing(stub_commands.Told):
+    class Missing(stub_commands.Returned):
         def add_to(self, file: Path) -> Any:
             added.append(file)
             return self
 
-    def told(found: Any, *, workers: int, progress: Progress) -> Any:
+    def output(found: Any, *, workers: int, progress: Progress) -> Any:
         assert found.training_logs()
         assert workers == 2
         return Missing({"answer": "missing", "path": str(found.path)})
 
-    monkeypatch.setattr("sim2gp.commands.explain.explain", told)
+    monkeypatch.setattr("sim2gp.commands.explain.explain", output)
     text = (run / "project.toml").read_text()
     (run.parent / "machine.toml").write_text(text)  # as it was identified
     assert main(["explain", str(run), "--add", "--workers", "2", "--json"]) == 0

@@ -58,14 +58,14 @@ def figures(summary: Mapping[str, Any]) -> dict[str, Any]:
     return json.loads(json.dumps(kept))
 
 
-def told(words: str) -> dict[str, Any]:
-    """A command's summary, as it stands in its run."""
-    assert main([*words.split(), "--quiet", "--out", "told"]) == 0
-    return json.loads(Path("told", "summary.json").read_text())
+def answer(words: str) -> dict[str, Any]:
+    """A command's summary, as its run has it."""
+    assert main([*words.split(), "--quiet", "--out", "answer"]) == 0
+    return json.loads(Path("answer", "summary.json").read_text())
 
 
 def test_identify_is_that_of_the_terminal(found: Any) -> None:
-    assert figures(told("identify pendulum.toml --quick")) == figures(found.to_dict())
+    assert figures(answer("identify pendulum.toml --quick")) == figures(found.to_dict())
     damping = found.parameters["joint/hinge/damping"]
     low, high = damping.interval
     assert low < 0.02 < high
@@ -216,11 +216,11 @@ def test_the_notebook_says_what_the_terminal_says(
         ("explain runs/pendulum", "missing"),
         ("compare pendulum.toml --horizon 0.2", "comparison"),
         ("design runs/pendulum --limit motor=-1:1 --seconds 2", "experiment"),
-        ("demo --episodes 1", "flown"),
+        ("demo --episodes 1", "demonstration"),
         ("reproduce fig1 --quick", "figure"),
     ):
-        assert figures(told(words)) == figures(names[name].to_dict()), words
-    assert main("export runs/pendulum --draws 4 --quiet --out told".split()) == 0
-    stored = json.loads(Path("told", "summary.json").read_text())
+        assert figures(answer(words)) == figures(names[name].to_dict()), words
+    assert main("export runs/pendulum --draws 4 --quiet --out answer".split()) == 0
+    stored = json.loads(Path("answer", "summary.json").read_text())
     assert stored == json.loads(json.dumps(names["draws"]))
     assert Path("next.csv").read_text() == names["experiment"].files["trajectory.csv"]

@@ -265,15 +265,15 @@ def test_a_weighed_sum_is_known_before_the_logs(
     known = f"[[weighed]]\nof = {json.dumps(both)}\nvalue = 0.9\nsd = 0.001\n"
     path.write_text(PROJECT.replace("[[logs]]", f"{known}[[logs]]", 1))
     identified(path, tmp_path / "run")
-    plain, told = (load_run(x).summary for x in (run, tmp_path / "run"))
+    plain, answer = (load_run(x).summary for x in (run, tmp_path / "run"))
     for name in both:
-        now, before = told["parameters"][name], plain["parameters"][name]
+        now, before = answer["parameters"][name], plain["parameters"][name]
         assert abs(now["mean"] - before["mean"]) < 3.0 * before["sd"]
         assert now["sd"] < before["sd"]
         assert now["prior_sd"] < 0.95 * before["prior_sd"]
-    total = sum(told["parameters"][name]["mean"] for name in both)
+    total = sum(answer["parameters"][name]["mean"] for name in both)
     assert total == pytest.approx(0.9, abs=0.003)
     damping = NAMES[0]
-    prior = [x["parameters"][damping]["prior_sd"] for x in (plain, told)]
+    prior = [x["parameters"][damping]["prior_sd"] for x in (plain, answer)]
     assert prior[0] == pytest.approx(prior[1])
-    assert not told["misfit"]["alarm"]
+    assert not answer["misfit"]["alarm"]

@@ -1,4 +1,4 @@
-"""Longer windows: told where they are worth it, refused where physics is missing."""
+"""Longer windows: advised where they are worth it, refused where physics is missing."""
 
 import dataclasses
 from pathlib import Path
@@ -87,9 +87,9 @@ def test_physics_too_slow_for_short_ones_refuses_long_ones(
 ) -> None:
     found = asked(tmp_path, recording(drift=0.02))
     assert "physics that is missing" in found.refused
-    told = found.as_dict(WINDOW)
-    assert (told["ratio"], told["advised"]) == ({}, False)
-    assert "no way to know more" in told["text"]
+    answer = found.as_dict(WINDOW)
+    assert (answer["ratio"], answer["advised"]) == ({}, False)
+    assert "no way to know more" in answer["text"]
 
 
 @pytest.mark.nightly

@@ -72,10 +72,10 @@ def test_worth_is_that_of_the_definition() -> None:
     A = d.information(experiment, jnp.asarray(z), U, states)
     scale = d.posterior_scale(experiment.belief, A)
     goal = d.DOptimal()
-    nats, told = by_samples.worth_at(experiment, goal, z, np.asarray(U))
+    nats, answer = by_samples.worth_at(experiment, goal, z, np.asarray(U))
     expected = goal.nats(experiment.belief.scale, scale)
     assert nats == pytest.approx(float(expected), rel=1e-6)
-    np.testing.assert_allclose(told @ told.T, scale @ scale.T, rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(answer @ answer.T, scale @ scale.T, rtol=1e-5, atol=1e-9)
     ahead = by_samples.sensitivity_at(experiment, U, 12)
     expected = sensitivity_at(experiment, U, 12)
     size = float(jnp.abs(expected).max())
@@ -113,7 +113,7 @@ def test_the_search_keeps_its_limits_and_beats_random_motions(
     assert best.violations <= search.ALLOWED
     assert (np.abs(best.commands) <= 3.0).all()
     assert best.checked == 60
-    # The states that are told are those of its own commands, and within the limits.
+    # The states that are returned are those of its own commands, and within the limits.
     states = d.trajectory(
         experiment, experiment.plausible.mean, jnp.asarray(best.commands)
     )

@@ -55,11 +55,11 @@ def test_a_search_on_longer_periods_sees_the_same() -> None:
     assert (coarse.period, coarse.steps, coarse.window) == (0.01, 100, 10)
     box, nowhere = limits(fine.system), jnp.zeros((1, 3))
     C = 0.1 * jax.random.normal(jax.random.key(1), (signal.coefficients, 1))
-    told = [
+    answer = [
         float(by_gradients._worth(e, d.DOptimal(), nowhere, s.commands(C, box))[0])
         for e, s in ((fine, d.MultisineCommands(0.002, 500)), (coarse, signal))
     ]
-    assert told[1] == pytest.approx(told[0], abs=0.1)
+    assert answer[1] == pytest.approx(answer[0], abs=0.1)
     short = dataclasses.replace(fine, steps=3, window=3)
     kept, _ = by_gradients._coarser(short, d.MultisineCommands(0.002, 3))
     assert (kept.period, kept.steps, kept.window) == (0.002, 3, 3)
@@ -143,11 +143,11 @@ def test_a_designed_experiment_beats_random_ones(found) -> None:
         scale = d.posterior_scale(e.belief, d.information(e, nowhere, U, states))
         return d.DOptimal().nats(e.belief.scale, scale), excess(box, states)
 
-    told = [random(c) for c in draws]
-    nats = [float(n) for n, beyond in told if float(beyond) <= 0.0]
+    answer = [random(c) for c in draws]
+    nats = [float(n) for n, beyond in answer if float(beyond) <= 0.0]
     assert nats
     assert best.nats > max(nats) + 0.3
-    # The scale that is told is that of its own commands.
+    # The scale that is returned is that of its own commands.
     U = jnp.asarray(best.commands)
     states = eqx.filter_jit(d.trajectory)(e, e.belief.mean, U)
     A = np.asarray(eqx.filter_jit(d.information)(e, nowhere, U, states))

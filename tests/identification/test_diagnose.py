@@ -149,8 +149,10 @@ def test_a_direction_is_flat_below_one():
         first = study(*belief)["directions"][0]
         assert first["flat"] == (l < 1.0)
         assert first["information"] == pytest.approx(0.5 * math.log1p(l))
-        told = "a : b = 1 kg : 0.75 kg" if l < 1 else "0.8 a + 0.6 b (each in prior sd)"
-        assert first["combination"] == told
+        answer = (
+            "a : b = 1 kg : 0.75 kg" if l < 1 else "0.8 a + 0.6 b (each in prior sd)"
+        )
+        assert first["combination"] == answer
 
 
 def test_small_null_share_is_never_identified():
@@ -172,8 +174,8 @@ def test_two_trade_offs_do_not_name_each_other():
     partners = {n: e.get("partners") for n, e in out["parameters"].items()}
     assert partners == {"a": ["b"], "b": ["a"], "c": ["d"], "d": ["c"], "e": None}
     assert out["parameters"]["e"]["verdict"] == "dead"
-    told = [d["combination"] for d in out["directions"] if d["flat"]]
-    assert told == ["e", "a : b = 1 kg : -1 kg", "c : d = 1 kg : 0.5 kg"]
+    answer = [d["combination"] for d in out["directions"] if d["flat"]]
+    assert answer == ["e", "a : b = 1 kg : -1 kg", "c : d = 1 kg : 0.5 kg"]
     assert out["directions"][0]["text"] == "e has no effect on these data."
 
 
@@ -286,11 +288,11 @@ def test_signed_parameters_move_in_their_units():
     )
     out = study(*believe(Parameters(free), [[1e3, -1e3]]))
     (open_,) = (d for d in out["directions"] if d["flat"])
-    told = (
+    answer = (
         "Raise mass by 1 %, raise offset by 0.000667 rad",
         "Raise offset by 0.001 rad, raise mass by 1.5 %",
     )
-    assert open_["text"].removesuffix(": the data stay the same.") in told
+    assert open_["text"].removesuffix(": the data stay the same.") in answer
 
 
 def test_units_of_products_cancel():

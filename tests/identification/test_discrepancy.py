@@ -144,7 +144,7 @@ def test_a_centre_that_is_overshot_is_found(gain: float) -> None:
     assert np.max(np.abs(at - centre) / sd) < 0.1
 
 
-def told(model: Linear, y: np.ndarray, allowed: bool) -> CorrectedFit:
+def answer(model: Linear, y: np.ndarray, allowed: bool) -> CorrectedFit:
     """The intervals of a fit of the constants alone; effects stand at nothing."""
     H = model.H[:OWN, :OWN]
     z = np.zeros(ALL)
@@ -165,7 +165,7 @@ def covered(lacks: float, rho: float, allowed: bool) -> tuple[float, float, floa
     model = Linear(sensitivities(rng))
     for _ in range(150):
         z = rng.standard_normal(ALL) * np.where(EFFECTS, lacks, 1.0)
-        found = told(model, model.J @ z + ar1(rng, rho), allowed)
+        found = answer(model, model.J @ z + ar1(rng, rho), allowed)
         lies = Plain(found.posterior)
         spread, error = lies.sd[:OWN], lies.mean[:OWN] - z[:OWN]
         inside.append(np.abs(error) < 1.96 * spread)
@@ -240,7 +240,7 @@ def test_it_does_not_matter_where_a_linear_machine_is_linearised() -> None:
     rng = np.random.default_rng(2)
     model = Linear(sensitivities(rng))
     y = model.J @ rng.standard_normal(ALL) + ar1(rng, 0.5)
-    found = told(model, y, allowed=True)
+    found = answer(model, y, allowed=True)
     z = rng.standard_normal(ALL)
     scores = np.einsum("wlp,wl->wp", model.J, model.J @ z - y)
     there = gaussian(z, np.eye(ALL))

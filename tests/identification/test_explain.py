@@ -44,14 +44,14 @@ def some(*names: str) -> list[sy.Candidate]:
 FEW = some("theta.spring", "theta.viscous")
 
 
-def flown(planted: Any, seed: int = 5) -> OneStepData:
+def rollout(planted: Any, seed: int = 5) -> OneStepData:
     return study.data_of("furuta", planted, jax.random.key(seed))
 
 
 @pytest.mark.nightly
 def test_an_effect_is_found() -> None:
     """The study in small, on machines with constants of their own."""
-    spring = find_missing_physics(flown(sy.Spring("theta", 4.5e-3), 6), FEW)
+    spring = find_missing_physics(rollout(sy.Spring("theta", 4.5e-3), 6), FEW)
     assert (spring.answer, spring.effect) == ("missing", "theta.spring")
     best = spring.search.refitted[0]
     assert abs(best.value - 4.5e-3) < 4.0 * best.sd
@@ -69,16 +69,18 @@ def test_an_effect_is_found() -> None:
 @pytest.mark.nightly
 def test_nothing_and_none_of_these() -> None:
     """The other two answers."""
-    nothing = find_missing_physics(flown(None), FEW)
+    nothing = find_missing_physics(rollout(None), FEW)
     assert nothing.answer == "nothing missing"
     assert nothing.effect is None
     assert "Nothing is missing" in missing_physics_headline(nothing)
 
-    other = find_missing_physics(flown(sy.Spring("theta", -1e-3), 7), FEW)
+    other = find_missing_physics(rollout(sy.Spring("theta", -1e-3), 7), FEW)
     assert other.answer == "none of these"  # it would fit, but no cable pushes
     assert candidate_rows(other)[0]["verdict"] == "impossible sign"
 
-    outside = find_missing_physics(flown(study.OUTSIDE["furuta"]["saturation"], 8), FEW)
+    outside = find_missing_physics(
+        rollout(study.OUTSIDE["furuta"]["saturation"], 8), FEW
+    )
     assert outside.answer == "none of these"
     assert outside.effect is None
     assert missing_physics_headline(outside).startswith("None of these")
@@ -87,7 +89,7 @@ def test_nothing_and_none_of_these() -> None:
 @pytest.mark.nightly  # `test_explain_run` finds what a score ranks first
 def test_a_score_is_the_evidence_of_a_weak_effect() -> None:
     """Close to nothing one linearisation is as good as a fit; far away it ranks."""
-    data = flown(sy.Spring("theta", 1e-4), 6)
+    data = rollout(sy.Spring("theta", 1e-4), 6)
     found = search_candidates(data, FEW)
     scored = {s.candidate.name: s for s in found.scored}
     (refit,) = found.refitted
@@ -101,7 +103,7 @@ def test_a_score_is_the_evidence_of_a_weak_effect() -> None:
 
 @pytest.mark.nightly
 def test_a_dead_zone_is_found_though_its_slope_at_nothing_is_not() -> None:
-    data = flown(sy.DeadZone("voltage", 0.9), 9)
+    data = rollout(sy.DeadZone("voltage", 0.9), 9)
     bare = data.fit()
     (one,) = score_candidates(data, bare, some("voltage.dead_zone"))
     assert one.gain > 50.0
@@ -193,7 +195,7 @@ def test_who_is_best_and_who_is_tied() -> None:
 def test_a_fit_that_fails_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     from sim2gp.errors import NotConverged
 
-    data = flown(sy.Spring("theta", 4.5e-3), 6)
+    data = rollout(sy.Spring("theta", 4.5e-3), 6)
 
     def refused(*args: Any) -> None:
         raise NotConverged("E201", "no")

@@ -125,8 +125,10 @@ def test_unidentified_truth_is_said(case, count):
         for name in flat:
             assert out["parameters"][name]["verdict"] != "identified"
             assert any(name in d["combination"].split() for d in open_)
-        told = {n for d in open_ for n in table.names if n in d["combination"].split()}
-        assert told == flat
+        answer = {
+            n for d in open_ for n in table.names if n in d["combination"].split()
+        }
+        assert answer == flat
         found = {b["text"]: b for b in out["base_parameters"]}
         assert len(found) == count_of_base
         assert all(b["verdict"] == "identified" for b in found.values())

@@ -240,7 +240,7 @@ def test_what_is_not_a_number_is_refused() -> None:
 
 
 def test_a_corrected_posterior_changes_spreads_and_not_the_structure() -> None:
-    """Wider and elsewhere: what is flat is told as before, what is left is not."""
+    """Wider and elsewhere: what is flat is reported as before, what is left is not."""
     table = named("a b c", low=-10.0)
     visible = np.array([[1.0, 3.0, 0.0], [0.0, 0.0, 1.0]]) * 20.0
     belief = believe(table, visible, [2.0, 5.0, 0.0])
@@ -323,13 +323,13 @@ def test_a_linear_machines_centre_is_where_the_gaussian_says(
     pulls = pulls_of_windows(likelihood, belief, of)
     at = np.asarray(belief.posterior.mean)
     dz = np.array([0.8, -1.1])
-    told = dz @ pulls.scores.sum(axis=0)
-    told += 0.5 * np.sum((pulls.factors @ dz) ** 2)
+    answer = dz @ pulls.scores.sum(axis=0)
+    answer += 0.5 * np.sum((pulls.factors @ dz) ** 2)
     with jax.enable_x64(True):
         there, here = (
             cost_of(likelihood, belief, jnp.asarray(x)) for x in (at + dz, at)
         )
-    assert there - here == pytest.approx(told, rel=1e-6)
+    assert there - here == pytest.approx(answer, rel=1e-6)
     ours = corrected_windows(at_zero(likelihood, belief, of))
     plain = correct_posterior(belief.prior, belief.posterior, pulls)
     np.testing.assert_allclose(ours.posterior.mean, plain.posterior.mean, atol=1e-12)

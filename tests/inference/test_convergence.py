@@ -1,4 +1,4 @@
-"""How far from its MAP a fit may end, and who is told."""
+"""How far from its MAP a fit may end, and what is reported."""
 
 import jax.numpy as jnp
 import pytest

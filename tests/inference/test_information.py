@@ -55,8 +55,8 @@ def test_what_was_done_leaves_less_to_learn(shape):
     after, gains = eqx.filter_jit(Seen.after), eqx.filter_jit(increments)
     for t in reversed(range(T)):
         if t in (0, T // 2):  # what was not done yet
-            told = float(jnp.sum(gains(*seen.left(shared[: t + 1], own[: t + 1]))))
-            assert told == pytest.approx(nats(A) - nats(A[t + 1 :]), abs=1e-11)
+            answer = float(jnp.sum(gains(*seen.left(shared[: t + 1], own[: t + 1]))))
+            assert answer == pytest.approx(nats(A) - nats(A[t + 1 :]), abs=1e-11)
         total += float(gains(*seen.left(shared[t : t + 1], own[t : t + 1]))[0])
         seen = after(seen, shared[t], own[t])
     assert total == pytest.approx(nats(A), rel=1e-12)
@@ -68,11 +68,11 @@ def test_a_second_look_without_noise_tells_nothing_more():
     many = [
         jnp.repeat(300.0 * x, 30, axis=0).astype(jnp.float32) for x in (shared, own)
     ]
-    told = np.asarray(increments(*many))
-    assert np.all(told >= 0.0)
-    assert told[0] > 10.0
+    answer = np.asarray(increments(*many))
+    assert np.all(answer >= 0.0)
+    assert answer[0] > 10.0
     # The k-th look at one direction tells log sqrt(k / (k - 1)) of each output.
-    assert np.sum(told[1:]) == pytest.approx(np.log(30.0), rel=0.02)
+    assert np.sum(answer[1:]) == pytest.approx(np.log(30.0), rel=0.02)
 
 
 @pytest.mark.nightly

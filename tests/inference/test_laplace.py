@@ -206,7 +206,7 @@ def test_one_dead_parameter_keeps_its_prior():
 
 
 def test_a_descent_that_stands_near_its_map_is_an_answer():
-    """A cusp, where no gradient vanishes: its distance from the MAP is told."""
+    """A cusp, where no gradient vanishes: its distance from the MAP is reported."""
     fit = minimise(lambda z: 100.0 * jnp.abs(z - 0.3) ** 0.6, jnp.ones(1))
     assert float(fit.ended.gradient) > GRADIENT_TOLERANCE
     assert 0.0 < float(fit.ended.newton_step_sd) <= NEAR

@@ -74,11 +74,11 @@ def test_vmapped_seeds_are_looped_seeds() -> None:
 
 
 def test_rows_chain_and_rewards_are_the_tasks() -> None:
-    task, flown = mass_task(), fly_mass()
-    s, a, s2 = flown.transitions()
+    task, rollout = mass_task(), fly_mass()
+    s, a, s2 = rollout.transitions()
     np.testing.assert_array_equal(s[1:], s2[:-1])
     rewards = jax.vmap(task.reward)(jnp.asarray(s), jnp.asarray(a), jnp.asarray(s2))
-    np.testing.assert_allclose(rewards, flown.reward, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(rewards, rollout.reward, rtol=1e-5, atol=1e-6)
     residual = s2 - np.asarray(jax.vmap(task.dynamics)(jnp.asarray(s), jnp.asarray(a)))
     assert np.all(np.abs(residual) < 5 * np.asarray(task.noise))
     assert np.all(residual.std(axis=0) > 0.4 * np.asarray(task.noise))
@@ -86,8 +86,8 @@ def test_rows_chain_and_rewards_are_the_tasks() -> None:
 
 def test_transitions_with_history_are_newest_first() -> None:
     S, A = np.arange(10.0).reshape(5, 2), np.arange(1.0, 9.0).reshape(4, 2)
-    flown = Trajectory(S, A, np.zeros(4), np.zeros(4, bool))
-    s, a, s2 = flown.transitions(history=2)
+    rollout = Trajectory(S, A, np.zeros(4), np.zeros(4, bool))
+    s, a, s2 = rollout.transitions(history=2)
     np.testing.assert_array_equal(a, A)
     np.testing.assert_array_equal(s[0, 2:], [0, 0, 0, 0])
     np.testing.assert_array_equal(s[1, 2:], [1, 2, 0, 0])
@@ -127,16 +127,16 @@ def test_a_planner_sees_the_past_actions_that_its_world_carries() -> None:
     assert task.history == 2
     world, planner = oracle_world(task), Scripted(single(9.0))
     state = start(task, planner, world)
-    flown, _ = episode(task, planner, state, world, key=KEY)
-    assert not np.any(flown.failed)  # the seen state predicts the next seen state
-    assert np.max(np.abs(flown.action)) == 5.0  # what was done, not what was asked
-    assert flown.state.shape == (251, 4)
+    rollout, _ = episode(task, planner, state, world, key=KEY)
+    assert not np.any(rollout.failed)  # the seen state predicts the next seen state
+    assert np.max(np.abs(rollout.action)) == 5.0  # what was done, not what was asked
+    assert rollout.state.shape == (251, 4)
     # A world without the delay sees the same machine, and mispredicts it.
     bare = tasks.furuta_swingup()
     blind = world_of(task, bare.dynamics, MarkovObjective(task.reward))
     with pytest.warns(Sim2GPWarning, match="W203"):
         other, _ = episode(task, planner, start(task, planner, blind), blind, key=KEY)
-    np.testing.assert_allclose(other.state, flown.state, atol=1e-4)
+    np.testing.assert_allclose(other.state, rollout.state, atol=1e-4)
 
 
 # ------------------------------------------------------------------- faults
@@ -165,6 +165,6 @@ def test_a_draw_that_predicts_nothing_is_said() -> None:
     task = mass_task()
     world = world_of(task, Mass(single(jnp.nan)[0]), MarkovObjective(task.reward))
     with pytest.warns(Sim2GPWarning, match="W203 20 of 20 plans"):
-        flown, _ = episode(task, SMALL, start(task, SMALL, world), world, key=KEY)
-    assert np.all(flown.failed)
-    assert np.isfinite(np.asarray(flown.state)).all()
+        rollout, _ = episode(task, SMALL, start(task, SMALL, world), world, key=KEY)
+    assert np.all(rollout.failed)
+    assert np.isfinite(np.asarray(rollout.state)).all()

@@ -154,7 +154,7 @@ class Counted(AbstractObjective):
 
 
 class Witness(AbstractPlanner):
-    """Remembers what its world told it at each step."""
+    """Remembers what its world gave it at each step."""
 
     def init(self, world: World, *, key: Array) -> Array:
         return jnp.full(40, -1.0)
@@ -180,7 +180,7 @@ def test_an_episode_keeps_what_its_objective_has_seen() -> None:
     np.testing.assert_array_equal(seen[-20:], np.arange(20.0))
     # In a new world, whose belief has seen the first part, counting starts anew.
     _, seen = episode(
-        task, planner, start, world, key=KEY, part=15, world_at=lambda flown: world
+        task, planner, start, world, key=KEY, part=15, world_at=lambda motion: world
     )
     np.testing.assert_array_equal(seen[-20:], [*range(15), *range(5)])
 
@@ -201,7 +201,7 @@ def test_exploring_stays_within_limits() -> None:
     free, held = (
         loops.psal(t, GainModel(), SMALL, episodes=2, key=KEY) for t in (task, narrow)
     )
-    # The first episode is flown on a draw from the prior, which knows no gain.
+    # The first episode is run on a draw from the prior, which knows no gain.
     assert np.abs(free.state[1, :, 0]).max() > 0.5
     assert np.abs(held.state[1, :, 0]).max() < 0.3
 
@@ -240,11 +240,11 @@ def test_a_signal_is_played_to_its_end_within_the_box(signal: AbstractPlanner) -
     assert tape.signal.shape == (20, 1)
     assert np.abs(tape.signal).max() <= 1.0
     assert np.abs(tape.signal).max() > 0.3
-    flown, after = episode(task, signal, tape, world, key=KEY)
+    motion, after = episode(task, signal, tape, world, key=KEY)
     np.testing.assert_allclose(
-        flown.action, from_unit(tape.signal, task.actions), atol=1e-6
+        motion.action, from_unit(tape.signal, task.actions), atol=1e-6
     )
-    assert not flown.failed.any()
+    assert not motion.failed.any()
     assert int(after.position) == 20
     other = signal.prepare(tape, world, None, key=jax.random.key(9))
     assert np.abs(other.signal - tape.signal).max() > 0.1

@@ -76,11 +76,11 @@ def test_it_acts_on_what_data_can_settle(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_the_last_episode_need_not_be_learned_from() -> None:
-    learned, flown = run(), run(final_fit=False)
+    learned, rollout = run(), run(final_fit=False)
     assert fits[3:] == [(20, 60), (40, 60)]
-    np.testing.assert_array_equal(flown.returns, learned.returns)
-    np.testing.assert_array_equal(flown.parameter_mean[3], flown.parameter_mean[2])
-    assert flown.data.count == 60
+    np.testing.assert_array_equal(rollout.returns, learned.returns)
+    np.testing.assert_array_equal(rollout.parameter_mean[3], rollout.parameter_mean[2])
+    assert rollout.data.count == 60
 
 
 def test_the_closed_form_posterior_is_what_the_loop_reports() -> None:
@@ -141,8 +141,8 @@ def test_within_an_episode_the_belief_is_the_posterior_of_its_rows_so_far() -> N
     seen: list[tuple[int, GainBelief]] = []
     task, model = mass_task(), GainModel()
     empty = Transitions.empty(40, 2, 1)
-    flown = fly_mass()
-    rows = jax.tree.map(np.asarray, flown)
+    rollout = fly_mass()
+    rows = jax.tree.map(np.asarray, rollout)
     one = empty.extend(*rows.transitions())
     for data, before in ((empty, model.init(KEY)), (one, None)):
         start_of = (
@@ -237,6 +237,6 @@ def test_truths_are_redrawn_until_the_oracle_swings_up(
     masses = {float(task.truth["arm_mass"]) for task in asked}
     assert len(masses) == 3
     asked.clear()
-    told = "E204 no truth that MPC can swing up: got 2 draws .* 1 of them not finite"
-    with pytest.raises(Sim2GPError, match=told):
+    answer = "E204 no truth that MPC can swing up: got 2 draws .* 1 of them not finite"
+    with pytest.raises(Sim2GPError, match=answer):
         references.accept_truth(*arguments, key=KEY, attempts=2)

@@ -172,8 +172,8 @@ def test_an_odd_log_becomes_a_project(tmp_path: Path, capsys) -> None:
     out = tmp_path / "pendulum.toml"
     words = [tmp_path / "pendulum.xml", tmp_path / "run.csv", "--out", out, "--json"]
     assert main(["init", *map(str, words)]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["columns"]["hinge"]["sign"] == -1
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["columns"]["hinge"]["sign"] == -1
     project = load_project(out)
     stated = project.spec.logs[0]
     assert stated.files == ["run.csv"]
@@ -194,9 +194,9 @@ def test_a_doubt_that_more_windows_settle_is_none(tmp_path: Path) -> None:
     pytest.importorskip("mujoco", reason="the extra `mujoco` is absent")
     folder = example(tmp_path / "arm").parent
     logs = [folder / name for name in ("first.csv", "second.csv")]
-    told = init(folder / "arm.xml", logs, out=folder / "mine.toml")
-    assert told["warnings"] == []
-    for column in told["columns"].values():
+    answer = init(folder / "arm.xml", logs, out=folder / "mine.toml")
+    assert answer["warnings"] == []
+    for column in answer["columns"].values():
         assert (column["sign"], column["offset"]) == (1, 0.0)
         assert "the model predicts the log best so" in column["why"]
 
@@ -218,7 +218,7 @@ def test_a_coarse_model_is_stepped_as_it_is() -> None:
 def test_what_a_log_needs_to_be_read_is_said_in_the_draft(
     tmp_path: Path, capsys
 ) -> None:
-    """A stamp that stands twice, a value that is none: the key, and where."""
+    """A stamp that appears twice, a value that is none: the key, and where."""
     (tmp_path / "pendulum.xml").write_text(MODEL)
     odd_log(tmp_path / "run.csv")
     lines = (tmp_path / "run.csv").read_text().splitlines()
@@ -229,9 +229,9 @@ def test_what_a_log_needs_to_be_read_is_said_in_the_draft(
     out = tmp_path / "pendulum.toml"
     words = [tmp_path / "pendulum.xml", tmp_path / "run.csv", "--out", out]
     assert main(["init", *map(str, words), "--no-readings"]) == 0
-    told = capsys.readouterr().err
-    assert "the file has keep_first = true: duplicate time stamp in" in told
-    assert "the file has drop_nonfinite = true: value that is not finite in" in told
+    answer = capsys.readouterr().err
+    assert "the file has keep_first = true: duplicate time stamp in" in answer
+    assert "the file has drop_nonfinite = true: value that is not finite in" in answer
     text = out.read_text()
     assert "keep_first = true  # duplicate time stamp in" in text
     assert "drop_nonfinite = true  # value that is not finite in" in text

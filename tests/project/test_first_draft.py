@@ -53,21 +53,21 @@ def two_links(folder: Path, seconds: float = 4.0) -> None:
 def test_signs_and_units_of_a_servo_arm(tmp_path: Path, capsys: Any) -> None:
     two_links(tmp_path)
     begun = time.monotonic()
-    told, text = drafted(tmp_path, capsys=capsys)
+    answer, text = drafted(tmp_path, capsys=capsys)
     assert time.monotonic() - begun < 60.0
-    found = {n: (c["sign"], c["unit"]) for n, c in told["columns"].items()}
+    found = {n: (c["sign"], c["unit"]) for n, c in answer["columns"].items()}
     assert found == {
         "joint1": (-1, "deg"),
         "joint2": (-1, ""),
         "servo1": (-1, ""),
         "servo2": (1, "deg"),
     }
-    assert not told["warnings"]
+    assert not answer["warnings"]
     project = load_project(tmp_path / "arm.toml")
     assert 1.99 < project.spec.likelihood.window <= 2.0
     names = project.system.parameters.names
-    assert told["open_parameters"] == 8
-    assert "held_parameters" not in told
+    assert answer["open_parameters"] == 8
+    assert "held_parameters" not in answer
     assert "body/link1/mass" in names
     assert not [name for name in names if name.endswith(("/kp", "/kv"))]
     assert "the gains of the servos" in text
@@ -96,9 +96,9 @@ def test_a_model_without_motors_is_fitted_to_its_swinging(
         mujoco.mj_step(truth, data)
     header = "time,hinge"
     np.savetxt(tmp_path / "run.csv", rows, delimiter=",", header=header, comments="")
-    told, text = drafted(tmp_path, capsys=capsys)
+    answer, text = drafted(tmp_path, capsys=capsys)
     assert "actuators" not in text
-    assert told["open_parameters"] == 1  # its mass is no other parameter
+    assert answer["open_parameters"] == 1  # its mass is no other parameter
     project = load_project(tmp_path / "arm.toml")
     found = sg.identify(project, held_out=False, progress=sg.Progress(quiet=True))
     low, high = found.parameters["joint/hinge/damping"].interval
@@ -125,15 +125,15 @@ def test_what_was_not_tried_is_named(
     tmp_path: Path, capsys: Any, option: tuple[str, ...]
 ) -> None:
     two_links(tmp_path)
-    told, text = drafted(tmp_path, *option, capsys=capsys)
+    answer, text = drafted(tmp_path, *option, capsys=capsys)
     reason = "the 0.01 s were over" if len(option) == 2 else "--no-readings"
     late = len(option) == 2  # then what to open is not known, either
     assert text.count(f"not tried: {reason}") == 4 + late
-    assert "held_parameters" not in told
-    assert told["warnings"] == [
+    assert "held_parameters" not in answer
+    assert answer["warnings"] == [
         "W160 not tried how to read joint1, joint2, servo1, servo2"
     ]
-    assert told["columns"]["joint2"]["sign"] == 1
+    assert answer["columns"]["joint2"]["sign"] == 1
 
 
 def test_without_logs_the_columns_and_an_experiment(
@@ -142,12 +142,12 @@ def test_without_logs_the_columns_and_an_experiment(
     (tmp_path / "arm.xml").write_text(model_text(links=LINKS[1:3]))
     out, model = tmp_path / "arm.toml", str(tmp_path / "arm.xml")
     assert main(["init", model, "--out", str(out), "--json", "--quiet"]) == 0
-    told = json.loads(capsys.readouterr().out)
+    answer = json.loads(capsys.readouterr().out)
     assert load_project(out).system.actions[1].name == "servo2"
     text = out.read_text()
     for line in ("time in s", "joint1 in rad, measured", "servo2 in rad, as commanded"):
         assert f"#   {line}" in text
-    rows = np.genfromtxt(told["commands"], delimiter=",", names=True)
+    rows = np.genfromtxt(answer["commands"], delimiter=",", names=True)
     assert rows.dtype.names[:3] == ("time", "servo1", "servo2")
     for name, reach in (("servo1", 1.5), ("servo2", 1.8)):
         assert 0.05 < np.ptp(rows[name]) <= 0.8 * reach
@@ -163,9 +163,9 @@ def test_no_experiment_where_none_is_safe(tmp_path: Path, capsys: Any) -> None:
     (tmp_path / "arm.xml").write_text(text.replace(servo, motor))
     out, model = tmp_path / "arm.toml", str(tmp_path / "arm.xml")
     assert main(["init", model, "--out", str(out), "--json", "--quiet"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["experiment"].startswith("no experiment: ")
-    assert "joint1 comes to an end of its range" in told["experiment"]
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["experiment"].startswith("no experiment: ")
+    assert "joint1 comes to an end of its range" in answer["experiment"]
     assert sorted(p.name for p in tmp_path.iterdir()) == ["arm.toml", "arm.xml"]
 
 
@@ -250,9 +250,9 @@ def test_random_readings_are_found_again(
             truth[name] = (sign, zero, unit)
     how = {"limited": limited, "seconds": 8.0, "seed": seed, "read": truth}
     arm_and_log(tmp_path, links, **how)
-    told, text = drafted(tmp_path, capsys=capsys)
+    answer, text = drafted(tmp_path, capsys=capsys)
     for k in range(1, n + 1):
-        pair = told["columns"][f"joint{k}"], told["columns"][f"servo{k}"]
+        pair = answer["columns"][f"joint{k}"], answer["columns"][f"servo{k}"]
         turned = [c["sign"] * truth[c["column"]][0] for c in pair]
         assert turned[0] == turned[1]
         doubts = "ways to read these columns", "the log hardly tells this from"

@@ -129,8 +129,8 @@ def measured(page: Path, width: int) -> dict[str, Any]:
     dom = chromium(outside, width + 200, "--dump-dom").decode("utf-8")
     found = re.search(r'id="measured">(.*?)</script>', dom, re.DOTALL)
     assert found, dom[-2000:]
-    told: dict[str, Any] = json.loads(html.unescape(found[1]))
-    return told
+    answer: dict[str, Any] = json.loads(html.unescape(found[1]))
+    return answer
 
 
 def picture(page: Path, width: int, *options: str) -> np.ndarray:
@@ -172,21 +172,21 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def test_a_report_is_readable_and_whole(
     pages: dict[str, Path], name: str, width: int
 ) -> None:
-    told = measured(pages[name], width)
-    assert told["inner"] == width
-    assert told["wrong"] == []
-    assert told["wide"] == []
-    assert told["scroll"] <= width
-    assert told["loaded"] == []
-    assert told["title"].startswith("sim2gp")
-    assert told["smallest"] >= 13.0  # pixels
-    assert told["narrow"] > 0.0
+    answer = measured(pages[name], width)
+    assert answer["inner"] == width
+    assert answer["wrong"] == []
+    assert answer["wide"] == []
+    assert answer["scroll"] <= width
+    assert answer["loaded"] == []
+    assert answer["title"].startswith("sim2gp")
+    assert answer["smallest"] >= 13.0  # pixels
+    assert answer["narrow"] > 0.0
     text = pages[name].read_text(encoding="utf-8")
-    assert told["sections"] == re.findall('<section id="(.*?)"', text)
+    assert answer["sections"] == re.findall('<section id="(.*?)"', text)
     if name == "empty":
-        assert told["film"] == {}
+        assert answer["film"] == {}
         return
-    film = told["film"]
+    film = answer["film"]
     assert film["moves"]
     assert film["controls"]
     assert film["canvas"] is film["look"] is (name == "rendered")

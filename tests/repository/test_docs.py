@@ -118,20 +118,20 @@ def spoken_codes() -> set[str]:
 
 
 def test_every_code_is_told_once_and_none_that_is_not_spoken() -> None:
-    told = [
+    answer = [
         row[0].strip("`")
         for row in rows((DOCS / "codes.md").read_text(encoding="utf-8"))
         if CODE.fullmatch(row[0].strip("`"))
     ]
-    assert len(told) == len(set(told))
-    assert set(told) == spoken_codes()
+    assert len(answer) == len(set(answer))
+    assert set(answer) == spoken_codes()
 
 
 def test_every_exit_code_is_told() -> None:
-    told = {int(row[0]) for row in rows(section("codes.md", "Exit codes"))[2:]}
+    answer = {int(row[0]) for row in rows(section("codes.md", "Exit codes"))[2:]}
     signals = {128 + signal.SIGINT, 128 + signal.SIGTERM}
     codes = "OK BUG INPUT DISK OWNED".split()
-    assert told == {getattr(cli, name) for name in codes} | signals
+    assert answer == {getattr(cli, name) for name in codes} | signals
 
 
 def test_the_example_of_an_error_is_what_is_printed() -> None:
@@ -140,8 +140,8 @@ def test_the_example_of_an_error_is_what_is_printed() -> None:
 
 
 def test_every_command_is_told() -> None:
-    told = re.findall(r"`sim2gp (\w+)", section("choose.md", "Which command"))
-    assert sorted(told) == sorted([*COMMANDS, "COMMAND"])
+    answer = re.findall(r"`sim2gp (\w+)", section("choose.md", "Which command"))
+    assert sorted(answer) == sorted([*COMMANDS, "COMMAND"])
 
 
 def test_every_option_that_pages_give_a_command_is_there() -> None:
@@ -186,9 +186,11 @@ def test_every_module_and_public_name_stands_in_the_reference() -> None:
 
     files = {p.relative_to(PACKAGE).as_posix() for p in PACKAGE.rglob("*.py")}
     pages = STAGE.reference()
-    told = re.findall(r"^::: (\S+)$", "\n".join(pages.values()), re.MULTILINE)
-    assert len(told) == len(set(told)) == len(files - {"__init__.py", "__main__.py"})
-    assert {STAGE.file_of(name).relative_to(PACKAGE).as_posix() for name in told} <= (
+    answer = re.findall(r"^::: (\S+)$", "\n".join(pages.values()), re.MULTILINE)
+    assert (
+        len(answer) == len(set(answer)) == len(files - {"__init__.py", "__main__.py"})
+    )
+    assert {STAGE.file_of(name).relative_to(PACKAGE).as_posix() for name in answer} <= (
         files
     )
     names = re.findall(r"`sg\.(\w+)`\]\((\S+)\.md#([\w.]+)\) \| \S", pages["index"])
@@ -316,8 +318,8 @@ def test_the_architecture_is_that_of_the_tree() -> None:
     for line in re.findall(r"^- (`.*\(\d+ lines\))$", text.replace("\n  ", " "), re.M):
         files = re.findall(r"`([\w/]+\.py)`", line)
         found = sum(len((PACKAGE / f).read_text().splitlines()) for f in files)
-        told = int(re.findall(r"\((\d+) lines\)", line)[0])
-        assert abs(found - told) <= 0.1 * found, line
+        answer = int(re.findall(r"\((\d+) lines\)", line)[0])
+        assert abs(found - answer) <= 0.1 * found, line
 
 
 # ----------------------------------------------------------------- measured tables

@@ -43,8 +43,8 @@ class Played(AbstractPlanner):
         return jnp.asarray(False)
 
 
-def flown(env: Any, shares: np.ndarray) -> tuple[np.ndarray, list[Any]]:
-    """Observations of one episode, its start first, and what each step told."""
+def rollout(env: Any, shares: np.ndarray) -> tuple[np.ndarray, list[Any]]:
+    """Observations of one episode, its start first, and what each step returned."""
     seen, steps = [env.reset()[0]], []
     for u in shares:
         steps.append(env.step(u))
@@ -79,7 +79,7 @@ def test_an_episode_is_the_flights_to_the_last_bit(
     """The second of a seed: constants, start, noise, delay, effect, reward, clock."""
     key = jax.random.key(SEED)
     env.reset(seed=SEED)
-    found, steps = flown(env, shares)
+    found, steps = rollout(env, shares)
     truth = draw_truth(Furuta(), key_for(key, 0, Purpose.TRUTH))
     task = furuta_swingup(truth, env.unwrapped.made.effects)
     assert eqx.tree_equal(task, env.unwrapped.task)
@@ -101,21 +101,21 @@ def test_an_episode_is_the_flights_to_the_last_bit(
 
 
 def test_the_terms_make_the_reward(env: Any, shares: np.ndarray) -> None:
-    _, reward, _, _, info = flown(env, shares[:3])[1][-1]
+    _, reward, _, _, info = rollout(env, shares[:3])[1][-1]
     assert reward == pytest.approx(np.exp(sum(info["reward_terms"].values())), rel=1e-6)
     cart = gymnasium.make("sim2gp/CartPole-v0")
-    _, reward, _, _, info = flown(cart, shares[:3])[1][-1]
+    _, reward, _, _, info = rollout(cart, shares[:3])[1][-1]
     assert reward == pytest.approx(sum(info["reward_terms"].values()), rel=1e-6)
 
 
 def test_a_seed_says_everything(env: Any, shares: np.ndarray) -> None:
     """Same bits for the same seed; episodes of one seed share their machine."""
     env.reset(seed=SEED)
-    first, machine = flown(env, shares[:5])[0], env.unwrapped.task
+    first, machine = rollout(env, shares[:5])[0], env.unwrapped.task
     again = gymnasium.make("sim2gp/Furuta-v0", truth="prior", **WRONG)
     again.reset(seed=SEED)
-    np.testing.assert_array_equal(flown(again, shares[:5])[0], first)
-    assert not np.array_equal(flown(env, shares[:5])[0], first)
+    np.testing.assert_array_equal(rollout(again, shares[:5])[0], first)
+    assert not np.array_equal(rollout(env, shares[:5])[0], first)
     assert env.unwrapped.task is machine
     env.reset(seed=SEED + 1)
     assert not eqx.tree_equal(env.unwrapped.task, machine)
@@ -197,7 +197,7 @@ def test_one_program_steps_every_machine_of_a_kind(
     )
     for each in (env, other):
         each.reset(seed=2)
-        flown(each, shares[:3])
+        rollout(each, shares[:3])
     assert before > 0
     assert step_task._cached._cache_size() == before
 

@@ -143,10 +143,10 @@ def test_an_episode_is_told_in_units(tmp_path: Path) -> None:
     system = CartPole()
     belief = Sim2GP(system).init(jax.random.key(0))
     reward, failed = jnp.asarray([1.0, 2.5]), jnp.asarray([True, False])
-    flown = SimpleNamespace(reward=reward, failed=failed)
+    rollout = SimpleNamespace(reward=reward, failed=failed)
     sink = Kept()
-    each_episode(sink, "a")(SimpleNamespace(index=3, trajectory=flown, belief=belief))
-    each_episode(sink)(SimpleNamespace(index=4, trajectory=flown, belief=None))
+    each_episode(sink, "a")(SimpleNamespace(index=3, trajectory=rollout, belief=belief))
+    each_episode(sink)(SimpleNamespace(index=4, trajectory=rollout, belief=None))
     constants = {
         f"a/constants/{p.name}": pytest.approx(p.constrain(p.mean), rel=1e-12)
         for p in system.parameters.free
@@ -159,14 +159,14 @@ def test_an_episode_is_told_in_units(tmp_path: Path) -> None:
 
 def test_the_demo_tells_its_bar_and_the_sink() -> None:
     sink, said = Kept(), []
-    flown = Trajectory(
+    rollout = Trajectory(
         np.zeros((2, 4), "f4"),
         np.zeros((1, 1), "f4"),
         np.full(1, 3.5),
         np.ones(1, bool),
     )
     belief = PointEstimate(Sim2GP(CartPole())).init(jax.random.key(0))
-    _episode_listener(said.append, sink, 7, "prior mean")(Episode(2, flown, belief))
+    _episode_listener(said.append, sink, 7, "prior mean")(Episode(2, rollout, belief))
     assert said == ["prior mean, episode 2: return 4"]
     name = "seed 7/prior mean"
     assert sink.seen == [(2, {f"{name}/return": 3.5, f"{name}/failed_plans": 1.0})]

@@ -121,10 +121,10 @@ def test_policies_are_trained_where_no_episode_changes_anything(method, monkeypa
     small = SAC(hidden=(8,), num_envs=4, steps=5, updates=1)
     monkeypatch.setitem(learners.PLANNERS, "sac", small)
     cell = Cell("cartpole", "mismatch", method, 0, 2, planning="sac")
-    flown = swingup.learner_cell(cell, 0)
-    assert flown["failure"] is None
-    assert len(flown["returns"]) == 2
-    assert np.isfinite(flown["returns"]).all()
+    rollout = swingup.learner_cell(cell, 0)
+    assert rollout["failure"] is None
+    assert len(rollout["returns"]) == 2
+    assert np.isfinite(rollout["returns"]).all()
 
 
 def test_a_finished_cell_is_not_flown_again(tmp_path: Path, monkeypatch):
@@ -141,8 +141,8 @@ def test_a_finished_cell_is_not_flown_again(tmp_path: Path, monkeypatch):
     monkeypatch.setattr(swingup, "learner_cell", lambda cell, redrawn: {"returns": []})
     monkeypatch.setattr(swingup, "oracle_cell", lambda cell: ORACLE)
     more = dataclasses.replace(cell, episodes=4)
-    flown = run_cell(more, tmp_path / "fig2")
-    assert flown == {"returns": [], "device": "cpu"}
+    rollout = run_cell(more, tmp_path / "fig2")
+    assert rollout == {"returns": [], "device": "cpu"}
     for other in (MPC(horizon=7), MPC(lengths=(0.5, 1.0))):
         monkeypatch.setitem(learners.PLANNERS, "mpc", other)
         with pytest.raises(InputError, match=r"E186 .* 1 with other arguments"):
@@ -194,12 +194,12 @@ def test_a_quick_look_has_a_planner_and_cells_of_its_own(monkeypatch):
 @pytest.mark.parametrize("number", ["2", "4"])
 def test_the_figure_goes_on_where_it_was(number, tmp_path: Path, monkeypatch):
     """Interrupted after seven cells, the second run computes only what is missing."""
-    flown: list[str] = []
+    rollout: list[str] = []
 
     def learner(cell: Cell, redrawn: int):
-        if len(flown) == 7:
+        if len(rollout) == 7:
             raise KeyboardInterrupt
-        flown.append(cell.name)
+        rollout.append(cell.name)
         assert redrawn == 1
         returns = [60.0 + 10.0 * e + cell.seed for e in range(cell.episodes)]
         return {"returns": returns, "failure": None, "seconds": 1.0}
@@ -214,10 +214,10 @@ def test_the_figure_goes_on_where_it_was(number, tmp_path: Path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         draw()
     assert not (tmp_path / "run").exists()
-    first = list(flown)
-    flown.append("go on")
+    first = list(rollout)
+    rollout.append("go on")
     summary = draw()
-    again = flown[len(first) + 1 :]
+    again = rollout[len(first) + 1 :]
     assert not set(first) & set(again)
     methods = figure2.FIGURES[f"fig{number}"][-1]
     assert len(first) + len(again) == 2 * len(CONDITIONS) * len(methods) * len(MACHINES)

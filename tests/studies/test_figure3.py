@@ -77,7 +77,7 @@ def test_claims_see_what_was_planted():
     slow = claims("FS", 1.5)
     assert not slow["furuta_exploring_halves_the_data"]["holds"]
     assert slow["furuta_FS_predicts_best_under_mismatch"]["holds"]
-    # What was flown for random input is no explorer's: it cannot win the claim.
+    # What was run for random input is no explorer's: it cannot win the claim.
     other = claims("RES-FS, random", 4.0)
     assert other["furuta_RES_FS_predicts_best_under_mismatch"]["holds"]
 
@@ -163,7 +163,7 @@ def test_a_finished_cell_is_not_flown_again(tmp_path: Path, monkeypatch):
     lost = {"rmse": [], "failure": "E203", "early": []}
     saved = cells.save(more.name, more.arguments, lost)
     assert run_cell(more, tmp_path / "exploring") == saved
-    # Random input is flown by no planner, whichever it is.
+    # Random input needs no planner, whichever it is.
     random = dataclasses.replace(cell, method="SIM2GP, random")
     assert random.arguments["planner"]["type"] == "RandomInput"
 
@@ -173,10 +173,10 @@ def test_a_finished_cell_is_not_flown_again(tmp_path: Path, monkeypatch):
 )
 @pytest.mark.nightly
 def test_the_figure_is_written_whole(figure: str, tmp_path: Path, monkeypatch):
-    flown: list[str] = []
+    rollout: list[str] = []
 
     def learner(cell: Cell, oracle):
-        flown.append(cell.name)
+        rollout.append(cell.name)
         columns = {q: [1.0 / e for e in range(1, 4)] for q in exploring.QUANTITIES}
         looks = [{"transitions": 25.0, "rmse": 3.0}]
         early = looks if METHODS[cell.method].model == "SIM2GP" else []
@@ -190,11 +190,11 @@ def test_the_figure_is_written_whole(figure: str, tmp_path: Path, monkeypatch):
         return study.run(tmp_path / name, workers=1, progress=Progress(quiet=True))
 
     summary = draw(figure)
-    count = len(flown)
+    count = len(rollout)
     assert count == 2 * len(MACHINES) * len(CONDITIONS) * len(METHODS)
     other = {"fig3": "fig5", "fig5": "fig3"}[figure]
     draw(other)
-    assert len(flown) == count  # one study, two pictures
+    assert len(rollout) == count  # one study, two pictures
     stored = json.loads((tmp_path / figure / "summary.json").read_text())
     assert stored["claims"].keys() == summary["claims"].keys()
     assert stored["figure3"]["shown"] == figure3.FIGURES[figure]
@@ -207,5 +207,5 @@ def test_the_figure_is_written_whole(figure: str, tmp_path: Path, monkeypatch):
     quick = draw(figure, None, quick=True)
     shown = quick["figure3"]["methods"]
     assert set(METHODS) - set(shown) == set(figure3.NOT_QUICK)
-    assert len(flown) - count == len(MACHINES) * len(CONDITIONS) * len(shown)
+    assert len(rollout) - count == len(MACHINES) * len(CONDITIONS) * len(shown)
     assert [row[0] for row in quick["tables"][0]["rows"]] == shown

@@ -254,10 +254,10 @@ def test_a_fault_amid_an_episode_is_one_line_too() -> None:
     """Of a draw that is planned in, or trained in; what is not ours passes."""
     task = furuta_swingup()
     world, model = oracle_world(task), Sim2GP(Furuta())
-    ours = Broken("A traceback:\n  a line\nInputError: E173 told.")
-    with pytest.raises(InputError, match=r"^E173 told\.$"):
+    ours = Broken("A traceback:\n  a line\nInputError: E173 answer.")
+    with pytest.raises(InputError, match=r"^E173 answer\.$"):
         episode(task, ours, (), world, key=KEY)
-    with pytest.raises(InputError, match=r"^E173 told\.$"):
+    with pytest.raises(InputError, match=r"^E173 answer\.$"):
         psrl(task, model, ours, episodes=1, key=KEY)
     with pytest.raises(RuntimeError, match="InputError: nothing"):
         episode(task, Broken("InputError: nothing"), (), world, key=KEY)

@@ -171,7 +171,7 @@ def test_an_untouched_part_is_named_where_it_is(tmp_path: Path) -> None:
 
 
 def test_what_was_written_is_compared(tmp_path: Path) -> None:
-    """With the model that it makes: another number, of a constant or not, is told."""
+    """With the model that it makes: another number is reported, whatever it is of."""
     file = arm(tmp_path)
     edited = file.edited({"body/upper/mass": 0.9})
     for field, index, name in (

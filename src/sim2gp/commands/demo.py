@@ -113,8 +113,8 @@ def demo(
             oracle = accepted.oracle.oracle_return
             task.advance(f"seed {s}: oracle {oracle:.0f}")
             sink.scalars(0, {f"seed {s}/oracle/return": oracle})
-            told = partial(_episode_listener, task.advance, sink, s)
-            histories = _race(accepted.task, learners, episodes, key, told)
+            listener = partial(_episode_listener, task.advance, sink, s)
+            histories = _race(accepted.task, learners, episodes, key, listener)
             runs.append(SeedRun(accepted, hanging_return(accepted.task), histories))
     summary, arrays = _demo_summary(system, machine, runs, seed, episodes)
     forces = _forces(next(iter(runs[0].histories.values())))
@@ -144,12 +144,12 @@ def _race(
     learners: dict[str, AbstractModel],
     episodes: int,
     key: Key,
-    told: Callable[[str], Callable[[Episode], None]],
+    listener: Callable[[str], Callable[[Episode], None]],
 ) -> dict[str, History]:
     """Every learner on the same machine, under the same noise."""
     return {
         name: psrl(
-            task, learner, MPC(), episodes=episodes, key=key, on_episode=told(name)
+            task, learner, MPC(), episodes=episodes, key=key, on_episode=listener(name)
         )
         for name, learner in learners.items()
     }
@@ -249,7 +249,7 @@ def _animation(task: Task, machine: str, scores: np.ndarray) -> dict[str, Any]:
         "system": machine,
         "dt": task.dt,
         "params": {k: float(v) for k, v in task.truth.items()},
-        "title": "the machine, flown by the learned model",
+        "title": "the machine, controlled by the learned model",
         "marks": [
             {"time": e * task.seconds, "text": f"episode {e + 1}, score {s:.2f}"}
             for e, s in enumerate(scores)

@@ -65,31 +65,31 @@ def experiment_verdict(
     corrected sd.
     """
     names = asked.about or tuple(expected)
-    told = [n for n in names if expected[n]["of_before"] <= 1.0 - NARROWER]
-    if not told:
+    narrowed = [n for n in names if expected[n]["of_before"] <= 1.0 - NARROWER]
+    if not narrowed:
         return False, (
             "Not worth running: within these limits nothing narrows "
             f"{join_names(names)} by more than {100.0 * NARROWER:.0f} %."
         )
     share, wide = (
-        {n: 100.0 * expected[n][sd] / abs(expected[n]["mean"]) for n in told}
+        {n: 100.0 * expected[n][sd] / abs(expected[n]["mean"]) for n in narrowed}
         for sd in ("sd", "corrected_sd")
     )
-    poor = [n for n in told if share[n] > asked.within]
-    untold = [n for n in names if n not in told]
-    rest = f" It says next to nothing about {join_names(untold)}." if untold else ""
-    wider = [n for n in told if wide[n] > max(asked.within, share[n])]
+    poor = [n for n in narrowed if share[n] > asked.within]
+    others = [n for n in names if n not in narrowed]
+    rest = f" It says next to nothing about {join_names(others)}." if others else ""
+    wider = [n for n in narrowed if wide[n] > max(asked.within, share[n])]
     if not poor and wider:
         worst = max(wider, key=lambda n: wide[n])
         return False, (
-            f"Not worth running: the logs alone determine {join_names(told)} within "
-            f"{asked.within:g} % already; the model's errors keep {worst} at "
+            f"Not worth running: the logs alone determine {join_names(narrowed)} "
+            f"within {asked.within:g} % already; the model's errors keep {worst} at "
             f"{digits(wide[worst], 2)} %, which more data do not reduce.{rest}"
         )
     if not poor:
         return False, (
-            f"Not worth running: {join_names(told)} known within {asked.within:g} % "
-            f"already.{rest}"
+            f"Not worth running: {join_names(narrowed)} known within "
+            f"{asked.within:g} % already.{rest}"
         )
     worst = max(poor, key=lambda n: share[n])
     now, after = (

@@ -67,14 +67,14 @@ def increments(
     if not p:
         return gains
 
-    def tell(M: Array, row: Array) -> tuple[Array, Array]:
+    def condition(M: Array, row: Array) -> tuple[Array, Array]:
         h = M.T @ row
         root = jnp.sqrt(1.0 + h @ h)
         return M - jnp.outer(M @ h, h / (root * (root + 1.0))), jnp.log(root)
 
     flat = jnp.swapaxes(rows, 0, 1).reshape(T * d, p)
-    _, told = jax.lax.scan(tell, jnp.eye(p, dtype=shared.dtype), flat)
-    return gains + jnp.sum(told.reshape(T, d), axis=1)
+    _, each = jax.lax.scan(condition, jnp.eye(p, dtype=shared.dtype), flat)
+    return gains + jnp.sum(each.reshape(T, d), axis=1)
 
 
 def _integrated_out(

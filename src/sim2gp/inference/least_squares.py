@@ -6,8 +6,8 @@ posterior is a sum of squares,
     L(z) = 1/2 ||r(z)||^2 + 1/2 ||z||^2,          J = dr/dz.
 
 All that a descent, the posterior, and the evidence need of the data is the triangular
-factor ``R`` of ``[J r]`` (`factor`): it has no more than ``p + 1`` rows, whatever the
-data have, it stacks (streaming, windows, prior), and
+factor ``R`` of ``[J r]`` (`factor`): it has at most ``p + 1`` rows, however
+many the data have, it stacks (streaming, windows, prior), and
 
     [J r; I z] = Q [R c; 0 rho],     Sigma_z = R^-1 R^-T,     ||r||^2 = ||c||^2 + rho^2.
 

@@ -81,7 +81,7 @@ class AutoBelief(AbstractBelief):
         return self._draw(b.point() for b in self.beliefs)
 
     def _draw(self, draws: Iterable[Dynamics]) -> "AutoDraw":
-        """In 32 bits, as planning is, whatever the belief counts in."""
+        """In 32 bits, as planning is, for a belief of any precision."""
         return AutoDraw(tuple(draws), self.index.astype(jnp.int32))
 
     def sensitivity(self, s: State, a: Action) -> Sensitivity:

@@ -233,35 +233,35 @@ def episode(
     """
     part = task.horizon if part is None else part
     moment, start = begin(task, planner_state, world, key=key)
-    flown: Trajectory | None = None
+    past: Trajectory | None = None
     for first in range(0, task.horizon, part):
-        if flown is not None and world_at is not None:
-            world = world_at(flown)
+        if past is not None and world_at is not None:
+            world = world_at(past)
             # The steps so far are in the new world's belief.
             memory = world.objective.init()
             moment = eqx.tree_at(lambda m: m.memory, moment, memory)
         steps = jnp.arange(first, min(first + part, task.horizon))
         moment, rows = _fly_steps(task, planner, moment, world, steps, key=key)
-        flown = extended(flown, start, rows)
-        check_finite(flown, task.name)
-    assert flown is not None
-    blind = int(np.sum(flown.failed))
+        past = extended(past, start, rows)
+        check_finite(past, task.name)
+    assert past is not None
+    blind = int(np.sum(past.failed))
     if blind:
         warn(
             "W203",
             f"{blind} of {task.horizon} plans had no valid rollout: the drawn dynamics "
             "diverge there, and the last plan was kept",
         )
-    return flown, moment.planner
+    return past, moment.planner
 
 
-def extended(flown: Trajectory | None, start: Array, rows: Any) -> Trajectory:
+def extended(past: Trajectory | None, start: Array, rows: Any) -> Trajectory:
     """A trajectory and the steps after it; the first ones follow the ``start``."""
     states, *rest = (np.asarray(x) for x in rows)
-    if flown is None:
+    if past is None:
         return Trajectory(np.concatenate([np.asarray(start)[None], states]), *rest)
     more = Trajectory(states, *rest)
-    return jax.tree.map(lambda *x: np.concatenate(x), flown, more)
+    return jax.tree.map(lambda *x: np.concatenate(x), past, more)
 
 
 def check_finite(trajectory: Trajectory, where: str) -> None:

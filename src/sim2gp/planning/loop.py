@@ -238,9 +238,9 @@ def within(
     """
     seen = 0
 
-    def world_at(flown: Trajectory) -> World:
+    def world_at(past: Trajectory) -> World:
         nonlocal belief, seen
-        S, A, S2 = flown.transitions(history)
+        S, A, S2 = past.transitions(history)
         if data.count == 0:
             belief = model.fit(belief, data.extend(S, A, S2), key=key)
         else:
@@ -386,12 +386,12 @@ def _history(
     data: Transitions,
     planner: Any,
 ) -> History:
-    flown = jax.tree.map(lambda *leaves: np.stack(leaves), *trajectories)
+    whole = jax.tree.map(lambda *leaves: np.stack(leaves), *trajectories)
     return History(
-        flown.state,
-        flown.action,
-        flown.reward,
-        flown.failed,
+        whole.state,
+        whole.action,
+        whole.reward,
+        whole.failed,
         np.stack([mean for mean, _ in summaries]),
         np.stack([sd for _, sd in summaries]),
         belief,

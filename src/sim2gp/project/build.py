@@ -183,13 +183,13 @@ def _check_complete(
 ) -> None:
     """Every input is known, and something is measured."""
     where = source.where("logs", i, "columns")
-    lacking = [name for name in inputs if name not in named]
+    missing = [name for name in inputs if name not in named]
     if not set(named) & set(states):
-        lacking = lacking or states
-    elif not lacking:
+        missing = missing or states
+    elif not missing:
         return
     got = ", ".join(named) or "no columns"
-    raise error("no_column_for_channel", where=where, got=got, channel=lacking[0])
+    raise error("no_column_for_channel", where=where, got=got, channel=missing[0])
 
 
 def _check_clock(group: LogSpec, source: ProjectSource, i: int) -> None:

@@ -324,13 +324,13 @@ def _as_read(
 
 
 def _reading_text(reading: Reading) -> str:
-    """`as it stands`, or what is done to a column."""
+    """`as recorded`, or what is done to a column."""
     words = [f"in {reading.unit}"] if reading.unit else []
     if reading.sign < 0:
         words.append("turned round")
     if reading.offset:
         words.append("zero half a turn away")
-    return " and ".join(words) or "as it stands"
+    return " and ".join(words) or "as recorded"
 
 
 def _differing_words(options: Sequence[Reading]) -> str:

@@ -58,7 +58,7 @@ def draft_text(c: Contents) -> str:
     folder, file = c.out.parent, is_model(c.model)
     named = _relative_path(Path(c.model), folder) if file else c.model
     rows = [
-        "# A draft by sim2gp init: every guess has its reason beside it. Read them.",
+        "# A draft by sim2gp init: every guess has its reason next to it. Read them.",
         f"system = {quote(named)}",
         "",
     ]

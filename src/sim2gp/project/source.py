@@ -148,7 +148,7 @@ def _syntax(name: str, text: str, message: str) -> InputError:
         return error(
             "duplicate_parameter", where=where, got=got, fix=fix_for_repeated(row)
         )
-    return error("key_stands_twice", where=where, got=got, fix=fix_for_repeated(row))
+    return error("repeated_key", where=where, got=got, fix=fix_for_repeated(row))
 
 
 def _table_at(text: str, line: int) -> str:

@@ -17,8 +17,8 @@ def figure2(arrays: Mapping[str, np.ndarray], summary: Mapping[str, Any]) -> "Fi
 
     def best(machine: str, condition: str, method: str) -> np.ndarray:
         score = np.asarray(arrays[f"figure2/{machine}/{condition}/{method}"])
-        flown = np.where(np.isfinite(score), score, -np.inf)
-        return np.maximum(np.maximum.accumulate(flown, axis=1), 0.0)
+        found = np.where(np.isfinite(score), score, -np.inf)
+        return np.maximum(np.maximum.accumulate(found, axis=1), 0.0)
 
     def finish(ax: "Axes") -> None:
         ax.axhline(0.95, color="#59636e", lw=0.6, ls=(0, (1, 2)))

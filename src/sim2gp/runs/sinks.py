@@ -151,18 +151,18 @@ def opened(
     each time it is run; ``wandb`` writes to ``OUT.wandb``, and sends it where the
     variable ``WANDB_MODE`` says ``online``. None is nowhere. Raises E135 and E190.
     """
-    beside = out.with_name(f"{out.name}.{kind}")
+    target = out.with_name(f"{out.name}.{kind}")
     sink: Sink
     if kind is None:
         sink = Nowhere()
     elif kind == "jsonl":
-        sink = JSONLines(beside)
+        sink = JSONLines(target)
     elif kind == "tensorboard":
         stamp = time.strftime("%Y%m%d-%H%M%S", time.gmtime())
-        sink = TensorBoard(beside / stamp)
+        sink = TensorBoard(target / stamp)
     else:
         mode = os.environ.get("WANDB_MODE", "offline")
-        sink = WandB(beside, name=out.name, config=config, mode=mode)
+        sink = WandB(target, name=out.name, config=config, mode=mode)
     try:
         yield sink
     finally:
@@ -181,9 +181,9 @@ def each_episode(sink: Sink, name: str = "") -> Callable[[Any], None]:
     )
 
     def write(episode: Any) -> None:
-        flown, belief = episode.trajectory, episode.belief
-        found = {"return": float(flown.reward.sum())}
-        found["failed_plans"] = float(flown.failed.sum())
+        episode_rows, belief = episode.trajectory, episode.belief
+        found = {"return": float(episode_rows.reward.sum())}
+        found["failed_plans"] = float(episode_rows.failed.sum())
         table = getattr(getattr(belief, "system", None), "parameters", ())
         if table:
             table = table.ungrouped()

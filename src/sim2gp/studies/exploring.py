@@ -100,7 +100,7 @@ class Cell(AbstractCell):
     quick: bool = False
 
     @property
-    def lacking(self) -> AbstractPart:
+    def missing(self) -> AbstractPart:
         """The physics that the condition is about."""
         return missing(self.machine, self.condition)
 

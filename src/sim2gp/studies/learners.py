@@ -138,7 +138,7 @@ class HiddenMachine(Protocol):
     @property
     def condition(self) -> str: ...
     @property
-    def lacking(self) -> AbstractPart: ...
+    def missing(self) -> AbstractPart: ...
     @property
     def seed(self) -> int: ...
     @property
@@ -159,8 +159,8 @@ def effects_of(cell: HiddenMachine) -> tuple[AbstractPart, ...]:
     Nominal is figure 2's effect of no magnitude: both conditions are one program.
     """
     if cell.condition == "nominal":
-        return (replace(cell.lacking, magnitude=0.0),)
-    return (cell.lacking,)
+        return (replace(cell.missing, magnitude=0.0),)
+    return (cell.missing,)
 
 
 def task_and_model(
@@ -173,4 +173,4 @@ def task_and_model(
     task = preset(record, effects_of(cell))
     options: dict[str, Any] = {"reach": reach_of(task, system)}
     options |= QUICK_TRAINING if cell.quick else {}
-    return task, METHODS[method](system, cell.lacking, options)
+    return task, METHODS[method](system, cell.missing, options)

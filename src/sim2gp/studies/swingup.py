@@ -63,7 +63,7 @@ class Cell(AbstractCell):
     planning: str = "mpc"
 
     @property
-    def lacking(self) -> AbstractPart:
+    def missing(self) -> AbstractPart:
         """The physics that the condition is about."""
         return missing(self.machine, self.condition)
 
@@ -159,11 +159,11 @@ def oracle_cell(cell: HiddenMachine) -> Values:
 def oracle_cells(cells: Sequence[HiddenMachine]) -> list[Values]:
     """`oracle_cell` of each, on one machine."""
     make, preset = MACHINES[cells[0].machine]
-    lacking = [effects_of(cell) for cell in cells]
+    missing = [effects_of(cell) for cell in cells]
     planner = planner_of(cells[0].quick)
     assert isinstance(planner, MPC)
     found = accept_together(
-        [partial(preset, effects=effects) for effects in lacking],
+        [partial(preset, effects=effects) for effects in missing],
         make(),
         planner,
         keys=[jax.random.key(cell.seed) for cell in cells],

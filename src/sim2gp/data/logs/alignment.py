@@ -60,10 +60,10 @@ def alignment_notes(
     rows = f"{abs(lag)} row" + ("s" if abs(lag) > 1 else "")
     side = "early" if lag > 0 else "late"
     text = (
-        f"{', '.join(moved)} in {log.source}: {rows} {side} beside the motion "
+        f"{', '.join(moved)} in {log.source}: {rows} {side} against the motion "
         f"({1e3 * abs(lag) * log.period:.3g} ms); shifted so, commands explain "
         f"{100 * there:.0f} % of what states leave open of {joint}'s acceleration, as "
-        f"they stand {100 * here:.0f} %"
+        f"recorded {100 * here:.0f} %"
     )
     hint = " (a delay of the actuator would do so, too)" if lag > 0 else ""
     return [Note("W118", text + hint)]

@@ -125,7 +125,7 @@ def distinct(names: Sequence[str], source: str) -> None:
     twice = next((n for n, count in Counter(names).items() if count > 1), None)
     if twice is not None:
         raise error(
-            "column_stands_twice",
+            "repeated_column",
             where=source,
             got=f"{names.count(twice)} of this name",
             name=twice,

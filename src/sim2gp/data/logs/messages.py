@@ -91,7 +91,7 @@ def _check_steady_fields(streams: Sequence[Stream], where: str) -> None:
                 raise error(
                     "field_comes_and_goes",
                     where=f"{where} {stream.topic}:message {stream.numbers[0]}",
-                    got=f"{name} beside other fields than before",
+                    got=f"{name} with other fields than before",
                 )
 
 

@@ -164,7 +164,7 @@ def _split_header(line: str, table: Rows) -> tuple[str, ...]:
     for i, name in enumerate(names):
         if name and first.setdefault(name, i) != i:
             raise error(
-                "column_stands_twice",
+                "repeated_column",
                 where=where,
                 got=f"columns {first[name] + 1} and {i + 1}",
                 name=name,

@@ -89,8 +89,8 @@ class ImportanceCheck:
         text = f"{head} ({k}, {self.draws:.0f} effective draws of {DRAWS})"
         if self.draws < ENOUGH:
             return f"{text}: too few to say how it differs."
-        told = describe_shifts(names, self.shift, self.ratio)
-        return f"{text}; it differs in {join_names(told)}." if told else f"{text}."
+        shifts = describe_shifts(names, self.shift, self.ratio)
+        return f"{text}; it differs in {join_names(shifts)}." if shifts else f"{text}."
 
 
 def differs(

@@ -93,9 +93,9 @@ class ChainSummary:
                 f"NUTS did not settle ({about}, {self.divergent} divergent): "
                 "it says nothing of the Gaussian."
             )
-        told = describe_shifts(names, self.shift, self.ratio)
-        if told:
-            return f"NUTS ({about}) differs from the Gaussian in {join_names(told)}."
+        shifts = describe_shifts(names, self.shift, self.ratio)
+        if shifts:
+            return f"NUTS ({about}) differs from the Gaussian in {join_names(shifts)}."
         return f"NUTS ({about}) agrees with the Gaussian in every parameter."
 
 

@@ -242,7 +242,7 @@ def _check(model: Any, derive: bool) -> None:
     if model.nplugin:
         raise _unsupported("plugins", "a model without them")
     if derive and (model.ntendon or np.any(model.actuator_gaintype == 2)):
-        raise _unsupported("tendons or muscles beside open masses", "engine='c'")
+        raise _unsupported("tendons or muscles with open masses", "engine='c'")
 
 
 def _unsupported(got: str, expected: str) -> InputError:
