@@ -14,8 +14,8 @@ import scipy.optimize
 from jaxtyping import Float
 
 from sim2gp.data.logs import Column
-from sim2gp.data.logs.arrays import missing_column
 from sim2gp.data.logs.checks import follows
+from sim2gp.data.logs.table import missing_column
 from sim2gp.data.logs.units import UNITS
 from sim2gp.errors import InputError, error
 from sim2gp.systems.base import Channel, index_of

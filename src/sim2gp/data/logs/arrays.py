@@ -16,8 +16,8 @@ from jaxtyping import Float, Shaped
 
 from sim2gp.data.logs.budget import Meter
 from sim2gp.data.logs.log import Note
-from sim2gp.data.logs.table import LogTable, Rows
-from sim2gp.errors import InputError, error, nearest
+from sim2gp.data.logs.table import LogTable, Rows, missing_column
+from sim2gp.errors import error
 
 MAX_WIDTH = 256  # columns of one array; above, it is a picture or a cloud of points
 EXACT = 2**53  # whole numbers beyond lose digits in float64
@@ -101,23 +101,6 @@ def read_columns(
     meter.place = ""
     table_rows = Rows(source, np.arange(rows), "row")
     return LogTable(table_rows, header, columns, notes=tuple(notes))
-
-
-def missing_column(
-    name: str, header: Sequence[str], source: str, is_time: bool = False
-) -> InputError:
-    """E103 for a column, with the name that was probably meant."""
-    entries = [n for n in header if n.startswith((f"{name}[", f"{name}/"))]
-    close = entries[0] if entries else nearest(name, header)
-    listed = ", ".join(header[:60])
-    fix = f"did you mean {close}" if close else "name a column of the file"
-    return error(
-        "missing_column",
-        where=source,
-        got=(listed if len(listed) <= 120 else listed[:117] + "...") or "no columns",
-        name=name,
-        fix=fix + (", or state period (in s)" if is_time else ""),
-    )
 
 
 def distinct(names: Sequence[str], source: str) -> None:

@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sim2gp.data.logs.arrays import missing_column
 from sim2gp.data.logs.budget import Meter
 from sim2gp.data.logs.chunks import check_bag, check_database, check_mcap
 from sim2gp.data.logs.definitions import full_name, parse_definition
@@ -25,7 +24,7 @@ from sim2gp.data.logs.file import (
     unchanged_size,
 )
 from sim2gp.data.logs.messages import Message, assign_times, collect_streams
-from sim2gp.data.logs.table import LogTable
+from sim2gp.data.logs.table import LogTable, missing_column
 from sim2gp.data.logs.unpack import STEP, pieces
 from sim2gp.errors import InputError, error
 

@@ -120,7 +120,7 @@ def read_table(
     places = {name: i for i, name in enumerate(header)}
     for name in wanted:
         if name not in places:
-            raise _missing_in_header(name, header, where)
+            raise missing_column(name, header, f"{where}:line 1")
     quoted = '"' in text
     meter.spend(8 * len(rows) * len(wanted))
     values = np.empty((len(rows), len(wanted)))
@@ -183,14 +183,19 @@ def _delimiter(line: str, where: str, word: str) -> InputError:
     return error("wrong_delimiter", where=where, got=f"{word} in {_shorten(line)!r}")
 
 
-def _missing_in_header(name: str, header: tuple[str, ...], where: str) -> InputError:
-    close = nearest(name, header)
+def missing_column(
+    name: str, header: Sequence[str], where: str, is_time: bool = False
+) -> InputError:
+    """E103 for a column, with the name that was probably meant."""
+    entries = [n for n in header if n.startswith((f"{name}[", f"{name}/"))]
+    close = entries[0] if entries else nearest(name, header)
+    fix = f"did you mean {close}" if close else "name a column of the file"
     return error(
         "missing_column",
-        where=f"{where}:line 1",
-        got=_shorten(", ".join(header[:60]), 120),
+        where=where,
+        got=_shorten(", ".join(header[:60]), 120) or "no columns",
         name=name,
-        fix=f"did you mean {close}" if close else "name a column of the file",
+        fix=fix + (", or state period (in s)" if is_time else ""),
     )
 
 
