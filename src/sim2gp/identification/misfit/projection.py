@@ -1,5 +1,6 @@
 """Residuals of a fit, projected on what it could not move."""
 
+from collections.abc import Callable
 from functools import cached_property
 from itertools import pairwise
 
@@ -13,6 +14,7 @@ SPARE = 5  # degrees of freedom that must be left for each one that is tested
 #: Residuals below a tenth of the noise are rounding or the prior's pull, not misfit.
 QUIET = 0.1
 FEATURE_TOLERANCE = 1e-6
+ROWS = 8192  # that are eliminated at once
 
 Columns = Float[np.ndarray, "N d _"]
 
@@ -76,10 +78,19 @@ class ProjectedResiduals:
             self.r / unit, self.J / unit, self.own / unit, self.run, self.valid
         )
 
-    def explains(self, columns: Columns) -> tuple[float, int, float]:
-        """F ratio, degrees of freedom, p value of further columns; NaN if too many."""
-        flat = self.without(columns).reshape(-1, columns.shape[2])
-        size = float(np.sqrt(np.max(np.sum(columns**2, axis=(0, 1)), initial=0.0)))
+    def explains(
+        self, count: int, column: Callable[[int], Float[np.ndarray, "N d"]]
+    ) -> tuple[float, int, float]:
+        """F ratio, degrees of freedom, p value of ``count`` further columns.
+
+        NaN if they are too many. They are made one by one: of a long log all of them,
+        and what projecting them takes, are most of an identification's memory.
+        """
+        flat, size = np.empty((self.e.size, count), order="F"), 0.0
+        for j in range(count):
+            new = column(j)
+            size = max(size, float(np.linalg.norm(new)))
+            flat[:, j] = self.without(new[..., None]).reshape(-1)
         e = self.e.reshape(-1)
         gains = _gains(flat, e, FEATURE_TOLERANCE * size)
         q = gains.size
@@ -107,10 +118,14 @@ def _gains(
 ) -> Float[np.ndarray, " q"]:
     """``U^T e``, of the left singular vectors of ``A`` with a value above ``limit``.
 
-    From the triangle of ``A``: its vectors, as long as the data, are not formed.
+    From the triangle of ``A``, of which some rows after the others are eliminated: its
+    vectors, as long as the data, are not formed.
     """
-    R = np.asarray(np.linalg.qr(np.column_stack([A, e]), mode="r"))
     c = A.shape[1]
+    R = np.zeros((0, c + 1))
+    for i in range(0, len(A), ROWS):
+        rows = np.column_stack([A[i : i + ROWS], e[i : i + ROWS]])
+        R = np.asarray(np.linalg.qr(np.concatenate([R, rows]), mode="r"))
     U, s, _ = np.linalg.svd(R[:c, :c], full_matrices=False)
     return np.asarray((U.T @ R[:c, c])[s > limit])
 
