@@ -123,9 +123,7 @@ def main() -> None:
     cells = [FleetCell(seed) for seed in range(asked.fleets)]
     store = Cells(asked.out, __file__, asked.old)
     with Progress().task("fleets", len(cells)) as task:
-        values = compute_cells(
-            cells, store, Processes(asked.workers), lambda cell: task.advance(cell.name)
-        )
+        values = compute_cells(cells, store, Processes(asked.workers), task)
     each = [values[cell] for cell in cells]
     summary: dict[str, Any] = {
         name: share([x[name] for x in each])

@@ -266,7 +266,6 @@ def test_time_left_is_at_the_same_pace() -> None:
     assert time_left(2, 4, 600.0) == "10 min left"
     assert [time_left(n, 4, 1.0) for n in (0, 4)] == ["", ""]
     assert time_left(9, 10, 1.0) == ""
-    assert time_left(1, 3, 20.0) == ""  # stages, none of which is like another
 
 
 def test_time_left_falls_while_a_part_is_under_way() -> None:
@@ -280,6 +279,18 @@ def test_time_left_falls_while_a_part_is_under_way() -> None:
         task.started -= 5.0
         task.advance("a step", 0)
     assert shown == ["30 s left", "25 s left", "20 s left"]
+
+
+def test_parts_of_an_earlier_run_and_stages_say_nothing_of_the_pace() -> None:
+    """One of the four parts that were left took 10 s."""
+    shown: list[str] = []
+    for alike in (True, False):
+        task = Task("fit", 10, lambda task, note: shown.append(task.left()), alike)
+        task.skip(6)
+        task.started -= 10.0
+        task.advance()
+        assert task.done == 7
+    assert shown == ["30 s left", ""]
 
 
 def test_a_notebook_has_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:

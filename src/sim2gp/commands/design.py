@@ -125,7 +125,7 @@ def design(
         seconds, kind, tuple(about), predict, within, limits or Limits(),
         start or {}, period, starts, configuration,
     )  # fmt: skip
-    with (progress or Progress()).task("design", 3) as task:
+    with (progress or Progress()).task("design", 3, alike=False) as task:
         project, experiment, notes = setting(source, asked)
         box = _limit_box(project, experiment, asked.limits, notes)
         key = jax.random.key(seed)

@@ -134,9 +134,7 @@ def fit_machines(
         cells: Sequence[MachineCell], label: str
     ) -> tuple[Fleet, list[Gaussian]]:
         with shown.task(label, len(cells)) as task:
-            found = compute_cells(
-                cells, None, executor, lambda cell: task.advance(cell.note)
-            )
+            found = compute_cells(cells, None, executor, task)
         each = [from_exact(found[cell]) for cell in cells]
         fits, given = (
             [_gaussian(x[name], x[f"{name}_scale"]) for x in each]

@@ -55,7 +55,7 @@ def identify(
 
         sampler()  # before the work
     project, logs = project_and_logs(machine, logs)
-    with progress.task("identify", 3) as task:
+    with progress.task("identify", 3, alike=False) as task:
         windows, places = cut_for_fit(project, logs)
         task.advance(f"{len(windows)} windows")
         key, robust = jax.random.key(seed), project.spec.likelihood.robust

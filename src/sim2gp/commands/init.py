@@ -60,7 +60,7 @@ def init(
     table = out.with_name(f"{out.stem}-experiment.csv")
     if not logs:
         check_absent(table)
-    with progress.task("init", 3 if logs else 2) as task:
+    with progress.task("init", 3 if logs else 2, alike=False) as task:
         draft = draft_project(replace(asked, step=task.advance))
         summary = draft_summary(draft, out)
         if logs:

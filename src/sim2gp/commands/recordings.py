@@ -101,9 +101,7 @@ class AbstractFolds(ABC, Generic[Made]):
         executor = executor_of(1 if alone else workers or 1)
         total = len(self.cells) + self.after
         with (progress or Progress()).task(self.title, total) as task:
-            values = compute_cells(
-                self.cells, store, executor, lambda cell: task.advance(cell.note)
-            )
+            values = compute_cells(self.cells, store, executor, task)
             return self.result(values, task)
 
 

@@ -6,7 +6,6 @@ Its values are the same in every process, and the one that asked stores them.
 
 from abc import ABC, abstractmethod
 from collections.abc import (
-    Callable,
     Hashable,
     Iterable,
     Iterator,
@@ -22,6 +21,7 @@ import jax
 from sim2gp.errors import Sim2GPError, error
 from sim2gp.runs.cells import Cells, Old
 from sim2gp.runs.executors import AbstractExecutor, Processes
+from sim2gp.runs.progress import Task
 from sim2gp.runs.sources import source_of
 
 Values = dict[str, Any]
@@ -107,28 +107,29 @@ def compute_cells(
     cells: Iterable[AbstractCell],
     store: Cells | None,
     executor: AbstractExecutor,
-    done: Callable[[AbstractCell], object] = lambda cell: None,
+    task: Task | None = None,
 ) -> dict[AbstractCell, Values]:
     """The values of all cells, and of those that have to be computed before.
 
     This process alone stores them, as they come; what is stored is not computed again.
-    ``done`` is called for each cell. Raises `InputError` E186 as `Cells.load` does,
+    ``task`` advances with each cell. Raises `InputError` E186 as `Cells.load` does,
     E209 where another process has other code.
     """
     stored = {cell: _stored(cell, store) for cell in cells}
     values = {cell: found for cell, found in stored.items() if found is not None}
-    for cell in values:
-        done(cell)
+    if task is not None:
+        task.skip(len(values))
     needed = dict.fromkeys(c.needs for c in stored if c not in values)
     first = [c for c in needed if c is not None and c not in values]
     if first:
-        values |= compute_cells(first, store, executor, done)
+        values |= compute_cells(first, store, executor, task)
     left = [cell for cell in stored if cell not in values]
     for cell, found in _computed(left, values, executor):
         if store is not None:
             found = store.save(cell.name, cell.arguments, found)
         values[cell] = found
-        done(cell)
+        if task is not None:
+            task.advance(cell.note)
     return values
 
 

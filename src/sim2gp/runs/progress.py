@@ -15,7 +15,6 @@ from typing import Any, TypeVar
 from sim2gp import cleanup
 
 T = TypeVar("T")
-FEW = 3  # parts of a job are stages of their own: none says how long the next takes
 
 
 @dataclass
@@ -25,7 +24,9 @@ class Task:
     label: str
     total: int
     show: Callable[["Task", str], None]
+    alike: bool = True  # its parts; of stages none says how long the next takes
     done: int = 0
+    stored: int = 0  # parts that an earlier run has done
     started: float = field(default_factory=time.monotonic)
     moved: float = field(default_factory=time.monotonic)  # when `done` last changed
 
@@ -35,10 +36,16 @@ class Task:
             self.done, self.moved = self.done + count, time.monotonic()
         self.show(self, note)
 
+    def skip(self, count: int) -> None:
+        """``count`` parts were done before: they say nothing of the pace."""
+        self.done, self.stored = self.done + count, self.stored + count
+
     def left(self) -> str:
-        """How long the rest takes at the pace of what is done."""
+        """How long the rest takes at the pace of what is done; nothing of stages."""
+        done, total = self.done - self.stored, self.total - self.stored
         since = time.monotonic() - self.moved
-        return time_left(self.done, self.total, self.moved - self.started, since)
+        seconds = self.moved - self.started
+        return time_left(done, total, seconds, since) if self.alike else ""
 
 
 def _silent(task: Task, note: str) -> None:
@@ -74,17 +81,17 @@ class Progress:
             print(text, file=sys.stderr, flush=True)
 
     @contextmanager
-    def task(self, label: str, total: int) -> Iterator[Task]:
+    def task(self, label: str, total: int, alike: bool = True) -> Iterator[Task]:
         """A job of ``total`` parts: a bar while the block runs, or plain lines."""
         if self.quiet:
             yield Task(label, total, _silent)
         elif "ipykernel" in sys.modules:
-            yield Task(label, total, _in_notebook(label, total))
+            yield Task(label, total, _in_notebook(label, total), alike)
         elif sys.stderr.isatty():
-            with _bar(label, total) as task:
-                yield task
+            with _bar(label, total) as show:
+                yield Task(label, total, show, alike)
         else:
-            yield Task(label, total, _lines())
+            yield Task(label, total, _lines(), alike)
 
     def track(self, items: Iterable[T], label: str) -> Iterator[T]:
         """Pass items on and show how many are done."""
@@ -98,10 +105,9 @@ class Progress:
 def time_left(done: int, total: int, seconds: float, since: float = 0.0) -> str:
     """How long the rest takes at the same pace; nothing below a second, or unknown.
 
-    ``done`` parts took so many ``seconds``; the last was done ``since`` s ago. Of a
-    `FEW` parts it is not known.
+    ``done`` parts took so many ``seconds``; the last was done ``since`` s ago.
     """
-    if not 0 < done < total or total <= FEW:
+    if not 0 < done < total:
         return ""
     left = seconds * (total - done) / done - since
     if left < 1.0:
@@ -127,7 +133,7 @@ def _in_notebook(label: str, total: int) -> Callable[[Task, str], None]:
 
 
 @contextmanager
-def _bar(label: str, total: int) -> Iterator[Task]:
+def _bar(label: str, total: int) -> Iterator[Callable[[Task, str], None]]:
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -152,4 +158,4 @@ def _bar(label: str, total: int) -> Iterator[Task]:
         def show(task: Task, note: str) -> None:
             bars.update(number, completed=task.done, note=note, left=task.left())
 
-        yield Task(label, total, show)
+        yield show

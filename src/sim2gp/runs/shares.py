@@ -51,9 +51,7 @@ def compute_share(
     mine = share.of(cells)
     store = store_of(mine or cells, out, old)
     with progress.task("cells", len(mine)) as task:
-        compute_cells(
-            mine, store, executor_of(workers), lambda cell: task.advance(cell.note)
-        )
+        compute_cells(mine, store, executor_of(workers), task)
     part = f"share {share.index} of {share.count}"
     return {
         "headline": f"Stored {part}: {len(mine)} of {len(with_needed(cells))} cells",

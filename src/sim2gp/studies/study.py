@@ -169,12 +169,7 @@ def run_cells(
     # Each process would claim most of a GPU's memory, and all share one.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     with progress.task("cells", len(every)) as task:
-        values = compute_cells(
-            every,
-            store,
-            executor_of(workers),
-            lambda cell: task.advance(cell.note),
-        )
+        values = compute_cells(every, store, executor_of(workers), task)
     named = [(cell.name, cell.arguments) for cell in every]
     return values, _about(values) | store.summary(named)
 
