@@ -25,4 +25,4 @@ def test_intervals_that_hold_are_counted() -> None:
     truths = {"a": 1.5, "b": 2.0, "c": 0.9}
     entries = {n: interval | {"truth": t} for n, t in truths.items()}
     said = _held_sentence(entries | {"noise": interval})
-    assert said.startswith(" 2 of 3 intervals of 95 % hold the true value")
+    assert said.startswith("2 of 3 intervals of 95 % hold the true value")

@@ -196,8 +196,7 @@ def _demo_summary(
         "seed": seed,
         "seeds": len(runs),
         "episodes": episodes,
-        "headline": _demo_headline(runs, leader, seconds)
-        + _held_sentence(found["parameters"]),
+        "headline": _demo_headline(runs, leader, found["parameters"]),
         "returns": {m: _squeeze(returns[m].tolist()) for m in methods},
         "oracle_return": _squeeze([r.oracle for r in runs]),
         "hang_return": _squeeze([r.hang for r in runs]),
@@ -258,11 +257,13 @@ def _animation(task: Task, machine: str, scores: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _demo_headline(runs: list[SeedRun], leader: str, seconds: float) -> str:
-    counts = [r.solved(leader) for r in runs]
+def _demo_headline(
+    runs: list[SeedRun], leader: str, parameters: Mapping[str, Mapping[str, Any]]
+) -> str:
+    counts, held = [r.solved(leader) for r in runs], _held_sentence(parameters)
     done = sorted(n for n in counts if n is not None)
     if not done:
-        return f"The learner did not reach 95 % of the score of {ORACLE}."
+        return f"The learner did not reach 95 % of the score of {ORACLE}. {held}"
     middle = done[len(done) // 2]
     machines = (
         "The machine was"
@@ -272,16 +273,16 @@ def _demo_headline(runs: list[SeedRun], leader: str, seconds: float) -> str:
     return (
         f"{machines} swung up at 95 % of the score of {ORACLE}, or better; "
         f"in episode {middle}{' (median)' if len(runs) > 1 else ''}, that is "
-        f"after {middle * seconds:g} s on the machine."
+        f"after {middle * runs[0].accepted.task.seconds:g} s on the machine. {held}"
     )
 
 
 def _held_sentence(parameters: Mapping[str, Mapping[str, Any]]) -> str:
-    """How many of the 95 % intervals have the true value in them, after a space."""
+    """How many of the 95 % intervals have the true value in them."""
     known = [x for x in parameters.values() if "truth" in x]
     held = sum(x["q025"] <= x["truth"] <= x["q975"] for x in known)
     return (
-        f" {held} of {len(known)} intervals of 95 % hold the true value; about one in "
+        f"{held} of {len(known)} intervals of 95 % hold the true value; about one in "
         "twenty should not."
     )
 
