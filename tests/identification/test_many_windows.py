@@ -119,6 +119,30 @@ def test_of_many_windows_rows_are_those_of_runs(
     np.testing.assert_allclose(*totals, rtol=1e-7, atol=1e-9)
 
 
+@pytest.mark.parametrize("groups", [1, 2, COUNT])
+def test_a_run_has_windows_of_several_parts(
+    groups: int,
+    fitted: tuple[WindowsLikelihood, Estimate],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Two windows are linearised at a time, and four or more are a run."""
+    likelihood, found = fitted
+    group = np.arange(COUNT) * groups // COUNT
+    whole = pulls.pulls_of_windows(likelihood, found, group)
+    monkeypatch.setattr(pulls, "MOST", 6)
+    each = likelihood.windows.span.shape[1] * 1 * 3
+    monkeypatch.setattr(windows_likelihood, "TOGETHER", 2 * each)
+    tt = found.posterior.mean
+    rows = pulls.rows_of(likelihood, found, tt, group)
+    assert len(rows.first) <= 2 * 6
+    if groups == 1:
+        assert rows.first.tolist() == [0, 4, 8, 12, 16, 20]
+    runs = pulls.pulls_of_rows(rows, group)
+    np.testing.assert_allclose(runs.fisher, gram(whole.factors), rtol=1e-10)
+    totals = (x.scores.sum(axis=0) for x in (runs, whole))
+    np.testing.assert_allclose(*totals, rtol=1e-7, atol=1e-9)
+
+
 def test_residuals_are_tested_on_windows_from_everywhere(
     fitted: tuple[WindowsLikelihood, Estimate], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -6,6 +6,7 @@ The windows' rows ``[J_e J_z r]`` are whitened by prior and noise, and the start
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
@@ -135,14 +136,24 @@ def rows_of(
     W, size = len(likelihood.windows), together(likelihood.system, likelihood.windows)
     most = likelihood.windows.most
     runs = max(1, min(MOST, ROOM // (fitted.prior.mean.size + 1) ** 2))
-    found, count, group = [], -(-W // runs), at_most(runs, np.asarray(group))
+    count, group = -(-W // runs), at_most(runs, np.asarray(group))
+    found: list[WindowRows] = []
+    run: list[WindowRows] = []  # where one has windows of several parts
     for own, part in likelihood.parts(size):
         known = fitted.some(np.resize(own, len(part.windows)))
         some = _some_rows(part, known, tt, most)
         factors, costs = (x[: len(own)] for x in some)
-        rows = WindowRows(factors, costs, own)
-        found.append(rows.in_runs(group[own], count))
-    return WindowRows(*(np.concatenate(x) for x in zip(*found, strict=True)))
+        run.append(WindowRows(factors, costs, own).in_runs(group[own], count))
+        if own[-1] + 1 - run[0].first[0] >= count or own[-1] + 1 == W:
+            rows = _joined(run)
+            several = len(run) > 1
+            found.append(rows.in_runs(group[rows.first], W) if several else rows)
+            run = []
+    return _joined(found)
+
+
+def _joined(parts: Sequence[WindowRows]) -> WindowRows:
+    return WindowRows(*(np.concatenate(x) for x in zip(*parts, strict=True)))
 
 
 def _some_rows(
