@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sim2gp.data import split_log
 from sim2gp.data.grid import evaluation_windows
 from sim2gp.data.logs import Log
 from sim2gp.data.split_log import cut
@@ -344,3 +345,19 @@ def test_causal_windows_stand_where_forecasts_start() -> None:
         start="causal",
     )
     np.testing.assert_array_equal(changed.start[:3], windows.start[:3])
+
+
+@pytest.mark.parametrize("most", [10**6, 500])
+def test_the_rounding_of_a_channel(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of an encoder its steps over the root of 12, whether all rows are looked at or
+    some; of values without steps a share of their spread."""
+    monkeypatch.setattr(split_log, "SORTED", most)
+    rng, quantum = np.random.default_rng(0), 2e-3
+    y = 0.05 * np.sin(np.arange(4000) / 7.0) + 1e-4 * rng.standard_normal(4000)
+    rows = {"encoder": quantum * np.round(y / quantum), "exact": y}
+    known = {name: np.ones(4000, bool) for name in rows}
+    log = Log("a", "a.csv", 1e-3 * np.arange(4000), rows, {}, known)
+    steps = split_log.resolution([log, log], "encoder")
+    assert steps == pytest.approx(quantum / np.sqrt(12.0))
+    spread = split_log.resolution([log], "exact")
+    assert spread == pytest.approx(1e-4 * np.std(y), rel=0.02)
