@@ -55,10 +55,10 @@ def swing() -> Log:
 @pytest.mark.parametrize("rows", [-7, -3, -2, -1, 3, 4, 9])
 def test_the_shift_is_found(swing: Log, rows: int) -> None:
     (note,) = alignment_notes(shifted(swing, rows), JOINT)
-    side = "late" if rows > 0 else "early"
+    side = "behind" if rows > 0 else "ahead of"
     word = "row " if abs(rows) == 1 else "rows "
     assert note.code == "W118"
-    assert f"u in a.csv: {abs(rows)} {word}{side} beside the motion" in note.text
+    assert f"u in a.csv: {abs(rows)} {word}{side} the motion" in note.text
     assert f"({10 * abs(rows)} ms)" in note.text
     assert ("delay" in note.text) == (rows < 0)
 
@@ -124,6 +124,6 @@ def test_recordings_of_real_machines(shared_data: Path, tmp_path: Path) -> None:
         assert "W118" not in [note.code for note in log.notes]
         states = project.system.physical_states
         assert alignment_notes(log, states) == []
-    for rows, words in ((-5, "5 rows early"), (12, "12 rows late")):
+    for rows, words in ((-5, "5 rows ahead of"), (12, "12 rows behind")):
         (note,) = alignment_notes(shifted(log, rows), states)
         assert words in note.text

@@ -80,7 +80,8 @@ def test_free_sizes_are_not_drawn_to_zero_with_the_mass() -> None:
     scale = np.diag(best.prior.scale)[1:2]
     assert 0.1 < float(scale[0]) < 0.5  # of twelve weights one is there
     drawn = float(best.posterior.mean[0])
-    wide = _with_free_sizes(likelihood, best, about.scaled(jnp.asarray(scale / 0.1)))
+    prior = about.scaled(jnp.asarray(scale / 0.1))
+    wide = _with_free_sizes(likelihood, best, prior, np.inf)
     mass = wide.posterior.mean[0], wide.posterior.sd()[0]
     # log mass: prior 0 +- 0.4, drawn by twelve of its variances before.
     assert drawn < -0.4
@@ -207,8 +208,10 @@ def test_fits_without_a_force_need_their_evidence_alone(
 ) -> None:
     """Each ends away from its MAP here; the fit that is drawn does not."""
 
-    def ends(likelihood: Any, prior: ParameterPrior, last: Start) -> Estimate:
-        fit = estimate_groups(likelihood, prior, last)
+    def ends(
+        likelihood: Any, prior: ParameterPrior, last: Start, freedom: float
+    ) -> Estimate:
+        fit = estimate_groups(likelihood, prior, last, freedom)
         if not bool(last.enough):  # the first
             return fit
         how = {"status": jnp.asarray(STALLED), "newton_step_sd": jnp.asarray(0.1)}

@@ -58,9 +58,9 @@ def alignment_notes(
     if taken or not sure:
         return []
     rows = f"{abs(lag)} row" + ("s" if abs(lag) > 1 else "")
-    side = "early" if lag > 0 else "late"
+    side = "ahead of" if lag > 0 else "behind"
     text = (
-        f"{', '.join(moved)} in {log.source}: {rows} {side} against the motion "
+        f"{', '.join(moved)} in {log.source}: {rows} {side} the motion "
         f"({1e3 * abs(lag) * log.period:.3g} ms); shifted so, commands explain "
         f"{100 * there:.0f} % of what states leave open of {joint}'s acceleration, as "
         f"recorded {100 * here:.0f} %"
