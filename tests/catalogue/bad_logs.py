@@ -253,8 +253,8 @@ FIRST: tuple[Case, ...] = (
     case(
         25,
         "action and state misaligned",
-        log(text(bad.late(3)), "W118", "voltage", "3 rows late"),
-        log(text(bad.late(-2)), "W118", "voltage", "2 rows early"),
+        log(text(bad.late(3)), "W118", "voltage", "3 rows behind"),
+        log(text(bad.late(-2)), "W118", "voltage", "2 rows ahead"),
         log(text(bad.late(0)), "", warnings=1),  # that the pole does not move
     ),
 )
