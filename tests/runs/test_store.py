@@ -290,7 +290,7 @@ def test_parts_of_an_earlier_run_and_stages_say_nothing_of_the_pace() -> None:
         task.started -= 10.0
         task.advance()
         assert task.done == 7
-    assert shown == ["30 s left", ""]
+    assert shown == ["", "30 s left", "", ""]
 
 
 def test_a_notebook_has_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -38,7 +38,9 @@ class Task:
 
     def skip(self, count: int) -> None:
         """``count`` parts were done before: they say nothing of the pace."""
-        self.done, self.stored = self.done + count, self.stored + count
+        if count:
+            self.done, self.stored = self.done + count, self.stored + count
+            self.show(self, "of an earlier run")
 
     def left(self) -> str:
         """How long the rest takes at the pace of what is done; nothing of stages."""

@@ -83,8 +83,8 @@ class ProjectedResiduals:
     ) -> tuple[float, int, float]:
         """F ratio, degrees of freedom, p value of ``count`` further columns.
 
-        NaN if they are too many. They are made one by one: of a long log all of them,
-        and what projecting them takes, are most of an identification's memory.
+        NaN if they are too many. They are made and projected one by one: of a long log
+        all at once, with what their projection takes, need several times the memory.
         """
         flat, size = np.empty((self.e.size, count), order="F"), 0.0
         for j in range(count):
