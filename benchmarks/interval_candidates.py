@@ -1,5 +1,5 @@
-"""What `sim2gp.identification.intervals.scatter` was chosen from, and an oracle
-it.
+"""What `sim2gp.identification.intervals.scatter` was chosen from, and an
+oracle.
 
 Each gives centre and sd in prior sd of the virtual constants, from the linearisation of
 a fit at its MAP. None of these is part of the library.

@@ -71,7 +71,7 @@ ALSO = {
     "advised": "sim2gp, longer where silent",  # of "corrected" and "longer"
     "sysid": "mujoco.sysid",
 }
-ALSO = ("longer", "sysid")  # of these, the ones with cells
+WITH_CELLS = ("longer", "sysid")  # of these, the ones with cells
 #: Entry of a cell: of which sets the misfit tests speak, in windows of a length.
 SPEAK = {WINDOW: "speak", LONGER: "speak_longer"}
 #: Of a cell, too: the probability that something is missing.
@@ -286,7 +286,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sets", type=int, default=200)
     parser.add_argument("--workers", type=int, default=cores())
-    parser.add_argument("--also", nargs="+", choices=ALSO, default=[])
+    parser.add_argument("--also", nargs="+", choices=WITH_CELLS, default=[])
     parser.add_argument("--out", type=Path, default=Path("results/intervals"))
     add_options(parser)
     options = parser.parse_args()
@@ -295,11 +295,11 @@ def main() -> None:
     cells.check(
         (job.name, job.arguments)
         for name in CONDITIONS
-        for also in ("", *ALSO)
+        for also in ("", *WITH_CELLS)
         for job in (Job(name, k, options.out, also) for k in range(chunks))
     )
     for name in CONDITIONS:
-        for also in ("", *ALSO):
+        for also in ("", *WITH_CELLS):
             jobs = [Job(name, k, options.out, also) for k in range(chunks)]
             done = {j: cells.load(j.name, j.arguments) for j in jobs}
             missing = [j for j in jobs if done[j] is None]

@@ -230,7 +230,7 @@ class SearchCell(AbstractCell):
 
     @property
     def program(self) -> tuple[Hashable, ...]:
-        return (self.machine,)
+        return self.machine, self.planted
 
     def compute(self, needed: Values | None) -> Values:
         """The search's answer, and the right one."""

@@ -277,8 +277,8 @@ def resolution(logs: Sequence[Log], name: str) -> float:
     """
     recorded = [log for log in logs if name in log.channels]
     every = max(1, sum(map(len, recorded)) // SORTED)
-    known = (log.channels[name][log.mask[name]][::every] for log in recorded)
-    y = np.concatenate([*known])
+    each = [log.channels[name][log.mask[name]][::every] for log in recorded]
+    y = np.concatenate(each)
     if not len(y):
         return 1.0
     steps = np.diff(np.unique(y))

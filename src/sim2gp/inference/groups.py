@@ -68,8 +68,9 @@ def estimate_groups(
     def descend(start: Start) -> Estimate:
         noise = Noise(start.noise, first.weights)
         about = prior.scaled(start.scales)
-        how: dict[str, Any] = {"noise": noise, "freedom": freedom}
-        return estimate(likelihood, about, starts=start.z[None], **how)
+        return estimate(
+            likelihood, about, starts=start.z[None], noise=noise, freedom=freedom
+        )
 
     def skip(start: Start) -> Estimate:
         shapes = jax.eval_shape(descend, start)

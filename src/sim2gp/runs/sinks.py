@@ -181,9 +181,9 @@ def each_episode(sink: Sink, name: str = "") -> Callable[[Any], None]:
     )
 
     def write(episode: Any) -> None:
-        episode_rows, belief = episode.trajectory, episode.belief
-        found = {"return": float(episode_rows.reward.sum())}
-        found["failed_plans"] = float(episode_rows.failed.sum())
+        trajectory, belief = episode.trajectory, episode.belief
+        found = {"return": float(trajectory.reward.sum())}
+        found["failed_plans"] = float(trajectory.failed.sum())
         table = getattr(getattr(belief, "system", None), "parameters", ())
         if table:
             table = table.ungrouped()

@@ -159,11 +159,11 @@ def oracle_cell(cell: HiddenMachine) -> Values:
 def oracle_cells(cells: Sequence[HiddenMachine]) -> list[Values]:
     """`oracle_cell` of each, on one machine."""
     make, preset = MACHINES[cells[0].machine]
-    missing = [effects_of(cell) for cell in cells]
+    every = [effects_of(cell) for cell in cells]
     planner = planner_of(cells[0].quick)
     assert isinstance(planner, MPC)
     found = accept_together(
-        [partial(preset, effects=effects) for effects in missing],
+        [partial(preset, effects=effects) for effects in every],
         make(),
         planner,
         keys=[jax.random.key(cell.seed) for cell in cells],

@@ -12,7 +12,7 @@ alone, whose noise has in it what is missing.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -284,5 +284,11 @@ def _with_free_sizes(
     wide = prior.as_gaussian()
     start = wide.whitened(best.posterior.mean)[None]
     about = ParameterPrior(wide, prior.table.without_groups())
-    how: dict[str, Any] = {"noise": best.noise, "freedom": freedom, "until": NEAR}
-    return estimate(likelihood, about, starts=start, **how)
+    return estimate(
+        likelihood,
+        about,
+        starts=start,
+        noise=best.noise,
+        freedom=freedom,
+        until=NEAR,
+    )
