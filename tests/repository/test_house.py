@@ -189,6 +189,20 @@ def test_innocent_code_passes(source: str) -> None:
     assert violations(source) == []
 
 
+@pytest.mark.parametrize("path", [p for p in RUNNABLE if p.parent.name == "benchmarks"])
+def test_a_benchmark_gives_each_name_one_value(path: Path) -> None:
+    """No type checker reads these: the second value would silently be the only one."""
+    found = Counter(
+        name.id
+        for node in ast.parse(path.read_text()).body
+        if isinstance(node, ast.Assign)
+        for target in node.targets
+        for name in ast.walk(target)
+        if isinstance(name, ast.Name)
+    )
+    assert [name for name, count in found.items() if count > 1] == []
+
+
 def test_files_and_functions_stay_small() -> None:
     long = []
     for path in RUNNABLE + TESTS:
