@@ -1,14 +1,15 @@
 """This library and others, timed in turns on one core: a table of ratios.
 
-    pip install 'sim2gp[bench]' torch pytorch_mppi gpytorch
+    pip install 'sim2gp[bench]' torch pytorch_mppi gpytorch flax evosax interpax
     taskset -c 0 python benchmarks/side_by_side.py [--out FILE]
 
 `sim2gp bench`, and jobs that need a peer: a plan of pytorch_mppi (the same cart-pole,
-period and reward), SBX's updates of SAC (the same networks and batches), GPyTorch's
-predictions (an exact Gaussian process of as many transitions), and mujoco.sysid on a
-two-link arm (ten seconds in one window: time, and the error of the motion it predicts)
-and on the six-axis arm of `arm_and_sysid.py` (whole commands). A job whose peer is not
-installed says so.
+period and reward), one of hydrax (its own cart-pole, in MJX), SBX's updates of SAC (the
+same networks and batches), GPyTorch's predictions (an exact Gaussian process of as many
+transitions), and mujoco.sysid on a two-link arm (ten seconds in one window: time, and
+the error of the motion it predicts) and on the six-axis arm of `arm_and_sysid.py`
+(whole commands). A job whose peer is not installed says so. On the package index hydrax
+is another project: put the sources of the planner on PYTHONPATH.
 """
 
 import argparse
@@ -131,6 +132,25 @@ def torch_cart_pole(task: Task) -> Callable[[Any, Any], Any]:
         return s
 
     return step
+
+
+def hydrax() -> Pair:
+    """A plan of 128 sequences of 100 steps, here and of hydrax in MJX."""
+    from mujoco import mjx
+
+    cache = jax.config.jax_compilation_cache_dir
+    from hydrax.algs import MPPI
+    from hydrax.tasks.cart_pole import CartPole as OfHydrax
+
+    jax.config.update("jax_compilation_cache_dir", cache)  # hydrax sets its own
+    samples, steps = 128, 100
+    mine, of_hydrax = cartpole_swingup(), OfHydrax()
+    horizon = {"plan_horizon": steps * of_hydrax.dt, "num_knots": steps}
+    theirs = MPPI(of_hydrax, samples, noise_level=0.3, temperature=0.1, **horizon)
+    start, params = mjx.make_data(of_hydrax.model), theirs.init_params()
+    improve = jax.jit(theirs.optimize)
+    ours = plan(oracle_world(mine), mine, samples=samples, horizon=steps)
+    return Pair(ours, lambda: jax.block_until_ready(improve(start, params)[0].mean))
 
 
 def sac(envs: int) -> Callable[[], Pair]:
@@ -279,6 +299,7 @@ def arm_errors() -> dict[str, float]:
 
 PEERS = (
     Job("MPPI plan 1,024 x 50, cart-pole", "pytorch_mppi", 0.1, mppi),
+    Job("MPPI plan 128 x 100, cart-pole", "hydrax in MJX", 1.0 / 14.0, hydrax),
     Job("SAC, 1 episode: 1,280 updates", "SBX", 0.25, sac(1)),
     Job("SAC, 64 episodes: 1,280 updates", "SBX", 1.0, sac(64)),
     Job("1,000 predictions from 250 transitions", "GPyTorch", 1.0 / 80.0, predictions),

@@ -4,9 +4,13 @@ A command that fits and then forecasts would compile first the one, then the oth
 leave a core idle through both. Only the compiler runs in the thread (XLA works without
 the interpreter's lock); nothing is executed there, for programs that run side by side
 have deadlocked on few cores.
+
+What a compiler has freed, glibc keeps: `give_back_freed` returns it to the system.
 """
 
+import ctypes
 import functools
+import sys
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, Generic, ParamSpec, TypeVar
@@ -53,6 +57,16 @@ class compile_async(Generic[P, R]):
             if found is not None:
                 return found.result()(*args, **kwargs)
         return self._jitted(*args, **kwargs)
+
+
+def give_back_freed() -> None:
+    """Return freed memory to the system, where the C library keeps it (glibc).
+
+    After a fit is compiled that is hundreds of MiB; it takes some tens of milliseconds.
+    """
+    if sys.platform == "linux":  # musl has no such function
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", lambda keep: 0)
+        trim(0)
 
 
 def _signature(tree: Any) -> Any:

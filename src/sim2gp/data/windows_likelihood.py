@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from sim2gp.compilation import compile_async
+from sim2gp.compilation import compile_async, give_back_freed
 from sim2gp.data.cuts import Cuts
 from sim2gp.data.window_slopes import HostRun, about
 from sim2gp.data.windows import AT_A_TIME, Windows, evenly_spread
@@ -208,6 +208,7 @@ class CutsLikelihood:
 
         All parts share a program.
         """
+        give_back_freed()
         size = size or max(1, AT_A_TIME // self.windows.length)
         most = int(self.counts.max(initial=0.0))
         for own, windows in self.windows.in_parts(size):
