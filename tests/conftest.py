@@ -128,3 +128,17 @@ def shared_data() -> Path:
             "the folder that holds double_pendulum/ and qube/)"
         )
     return folder
+
+
+@pytest.fixture
+def compilations() -> Iterator[list[str]]:
+    """Grows by one entry for each program that XLA compiles."""
+    seen: list[str] = []
+
+    def listen(event: str, duration: float, **about: object) -> None:
+        if event == "/jax/core/compile/backend_compile_duration":
+            seen.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    yield seen
+    jax.monitoring.unregister_event_duration_listener(listen)

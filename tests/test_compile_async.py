@@ -3,11 +3,12 @@
 import threading
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim2gp.compilation import compile_async
+from sim2gp.compilation import compile_async, options
 from sim2gp.types import in_float64
 
 
@@ -79,3 +80,38 @@ def test_what_compilation_raises_reaches_the_caller() -> None:
 
 def test_the_function_keeps_its_name() -> None:
     assert Traced().power.__doc__ == "x to the n."  # type: ignore[attr-defined]
+
+
+@in_float64
+def test_within_another_program_it_is_a_part_of_it() -> None:
+    """JAX takes options for whole programs only; constants do not say where one is."""
+    traced = Traced()
+
+    @jax.jit
+    def whole(x: Any) -> Any:
+        return traced.power(x, 3) + traced.power(jnp.ones(2), 3)
+
+    np.testing.assert_array_equal(whole(jnp.arange(2.0)), [1.0, 2.0])
+    at = jnp.arange(2.0)
+    np.testing.assert_array_equal(jax.vmap(lambda x: traced.power(x, 3))(at), at**3)
+    assert float(jax.grad(lambda x: traced.power(x, 3))(2.0)) == 12.0
+
+
+def test_an_xla_without_these_options_compiles_as_it_does(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    jit = jax.jit
+
+    def older(f: Any, compiler_options: dict[str, bool] | None = None) -> Any:
+        unknown = {
+            f"{name}_of_later": x for name, x in (compiler_options or {}).items()
+        }
+        return jit(f, compiler_options=unknown)
+
+    assert options()
+    options.cache_clear()
+    monkeypatch.setattr(jax, "jit", older)
+    assert options() == {}
+    monkeypatch.undo()
+    options.cache_clear()
+    assert float(Traced().power(jnp.full(7, 2.0), 2)[0]) == 4.0

@@ -17,6 +17,7 @@ from typing import Any, Generic, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
+import numpy as np
 
 from sim2gp.types import in_float64
 
@@ -30,13 +31,20 @@ class compile_async(Generic[P, R]):
     """A jitted function of arrays and static values that can be compiled in advance.
 
     Called with what was announced by `compile_for`, it waits for that compilation and
-    uses it; called with anything else, it is `equinox.filter_jit`.
+    uses it; called with anything else, it is `equinox.filter_jit`. Programs have the
+    `options` of XLA, which it takes for whole programs only.
     """
 
     def __init__(self, function: Callable[P, R]):
         functools.update_wrapper(self, function)
-        self._jitted: Any = eqx.filter_jit(function)
+        self._function = function
+        self._within: Any = eqx.filter_jit(function)  # another program
         self._announced: dict[Any, Future[Callable[P, R]]] = {}
+
+    @functools.cached_property
+    def _jitted(self) -> Any:
+        jit: Any = eqx.filter_jit  # its types do not say what it hands on to JAX
+        return jit(self._function, compiler_options=options())
 
     @in_float64
     def compile_for(self, *args: P.args, **kwargs: P.kwargs) -> None:
@@ -56,7 +64,30 @@ class compile_async(Generic[P, R]):
             found = self._announced.get(_signature((args, kwargs)))
             if found is not None:
                 return found.result()(*args, **kwargs)
-        return self._jitted(*args, **kwargs)
+        jitted = self._within if _is_traced(args, kwargs) else self._jitted
+        return jitted(*args, **kwargs)
+
+
+@functools.cache
+def options() -> dict[str, bool]:
+    """XLA's options for the large programs of fits, where it knows them.
+
+    Its newer fusion of loops on CPUs takes longer to compile them, by half or more, and
+    they run longer, too (docs/decisions.md).
+    """
+    found = {"xla_cpu_use_fusion_emitters": False}
+    try:
+        jax.jit(lambda: 0, compiler_options=found).lower().compile()
+    except jax.errors.JaxRuntimeError:
+        return {}
+    return found
+
+
+def _is_traced(*given: Any) -> bool:
+    """Whether what is called with this is part of a program, or differentiated."""
+    also = jax.lax.iota(np.int32, 1)  # in a program even a constant is traced
+    leaves = jax.tree.leaves((given, also))
+    return any(isinstance(x, jax.core.Tracer) for x in leaves)
 
 
 def give_back_freed() -> None:

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 
@@ -11,6 +12,7 @@ from sim2gp.cli import main
 from sim2gp.commands import longer
 from sim2gp.commands.evaluate import evaluate
 from sim2gp.commands.identification import restore_identification
+from sim2gp.commands.identify import identify
 from sim2gp.commands.longer import Longer
 from sim2gp.data.logs import Log
 from sim2gp.errors import InputError
@@ -103,6 +105,14 @@ def test_identify_finds_the_constants(run: Path) -> None:
     assert len(misfit["noise"]) == 2
     assert set(summary["noise"]) == {"theta", "alpha"}
     assert summary["project"] == {"file": "machine.toml", "folder": ".."}
+
+
+def test_few_programs_are_compiled(folder: Path, compilations: list[str]) -> None:
+    """What is small is NumPy's: a program of one operation compiles for 20 ms."""
+    project = load_project(project_in(folder))
+    jax.clear_caches()
+    identify(project, progress=QUIET, held_out=False)
+    assert 4 < len(compilations) <= 30
 
 
 def test_identify_checks_laplace_against_the_exact_posterior(run: Path) -> None:

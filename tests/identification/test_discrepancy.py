@@ -137,7 +137,7 @@ def test_a_centre_that_is_overshot_is_found(gain: float) -> None:
     while not settled:
         rounds += 1
         mean = centre + gain * (at - centre)
-        posterior = Gaussian(jnp.asarray(mean), jnp.diag(jnp.asarray(sd)))
+        posterior = Gaussian(mean, np.diag(sd))
         to, settled = _next(posterior, before, at)
         before, at = at, to
         assert rounds < 5

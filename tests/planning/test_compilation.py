@@ -1,7 +1,6 @@
 """One compilation per run: after the second episode nothing is compiled any more."""
 
 import dataclasses
-from collections.abc import Iterator
 
 import jax
 import pytest
@@ -11,22 +10,6 @@ from sim2gp.planning import ICEM, MPC
 from sim2gp.planning.loop import Episode, psrl
 from sim2gp.planning.tasks import Task, furuta_swingup
 from sim2gp.systems import Furuta
-
-COMPILED = "/jax/core/compile/backend_compile_duration"
-
-
-@pytest.fixture
-def compilations() -> Iterator[list[str]]:
-    """Grows by one entry for each program that XLA compiles."""
-    seen: list[str] = []
-
-    def listen(event: str, duration: float, **about: object) -> None:
-        if event == COMPILED:
-            seen.append(event)
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    yield seen
-    jax.monitoring.unregister_event_duration_listener(listen)
 
 
 def counts_after(

@@ -70,8 +70,8 @@ def fit_windows(
         first = drawn_starts(zeros((1, p)), starts, key)
         e, noise = np.zeros(windows.start.shape), likelihood.first_noise()
     else:
-        z = prior.whitened(warm_start.posterior.mean)
-        first = jnp.full((starts, p), jnp.nan).at[0].set(z)
+        first = np.full((starts, p), np.nan)
+        first[0] = prior.on_host().whitened(np.asarray(warm_start.posterior.mean))
         e, noise = warm_start.nuisances, warm_start.noise
     begin = first, e, noise, freedom
     # By way of NumPy: JAX compiles again for numbers whose type it calls weak.

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from sim2gp.compilation import compile_async
 from sim2gp.inference.arrowhead import Noise, eliminate
 from sim2gp.inference.convergence import NEAR, Convergence, converged
 from sim2gp.inference.descent import Learning, Scales, multi_start
@@ -64,8 +65,10 @@ class Estimate(eqx.Module):
 
     def some(self, which: Int[np.ndarray, " w"]) -> "Estimate":
         """What it says of some of its windows, by number."""
-        noise = dataclasses.replace(self.noise, weights=self.noise.weights[which])
-        own = {"nuisances": self.nuisances[which], "scores": self.scores[which]}
+        each = self.noise.weights, self.nuisances, self.scores
+        weights, e, scores = (np.asarray(x)[which] for x in each)
+        noise = dataclasses.replace(self.noise, weights=weights)
+        own = {"nuisances": e, "scores": scores}
         return dataclasses.replace(self, noise=noise, **own)
 
     @in_float64
@@ -199,7 +202,7 @@ def _evidence(
     return found.log_joint() + log_normaliser(noise, counts) - xp.sum(xp.log(each))
 
 
-@eqx.filter_jit
+@compile_async
 def _estimate(
     likelihood: AbstractLikelihood,
     prior: AbstractPrior,

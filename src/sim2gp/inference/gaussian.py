@@ -32,8 +32,13 @@ class Gaussian(eqx.Module):
 
     def whitened(self, x: Float[AnyArray, " n"]) -> Float[AnyArray, " n"]:
         """The standard normal coordinates of a point; ``scale`` must be square."""
-        found: AnyArray = library(x).linalg.solve(self.scale, x - self.mean)
+        xp = library(x, self.mean, self.scale)
+        found: AnyArray = xp.linalg.solve(self.scale, x - self.mean)
         return found
+
+    def on_host(self) -> "Gaussian":
+        """The same in NumPy, which compiles nothing for sizes that are new."""
+        return Gaussian(np.asarray(self.mean), np.asarray(self.scale))
 
     def sample(self, key: Key) -> Float[Array, " n"]:
         """One draw."""
@@ -57,8 +62,10 @@ class Gaussian(eqx.Module):
 
         Both scales are square, and this one has no covariance with these places.
         """
-        scale = self.scale.at[np.ix_(at, at)].set(other.scale)
-        return Gaussian(self.mean.at[at].set(other.mean), scale)
+        mean, scale = np.array(self.mean), np.array(self.scale)
+        mean[at], scale[np.ix_(at, at)] = other.mean, other.scale
+        found: Gaussian = jax.device_put(Gaussian(mean, scale))
+        return found
 
     def covariance(self) -> Float[Array, "n n"]:
         """``scale scale^T``, exactly symmetric."""
@@ -70,7 +77,7 @@ class Gaussian(eqx.Module):
         xp = library(self.scale)
         return xp.sqrt(xp.sum(self.scale**2, axis=1))
 
-    def triangular(self) -> Float[Array, "n n"]:
+    def triangular(self) -> Float[AnyArray, "n n"]:
         """The lower-triangular scale with non-negative diagonal (by QR, not Cholesky).
 
         Raises ValueError when the scale has fewer columns than rows: the covariance is
@@ -151,7 +158,7 @@ def _no_covariance(where: str, got: str, expected: str) -> InputError:
     return error("not_a_covariance", where=where, got=got, expected=expected)
 
 
-def lower_factor(scale: Float[Array, "n k"]) -> Float[Array, "n n"]:
+def lower_factor(scale: Float[AnyArray, "n k"]) -> Float[AnyArray, "n n"]:
     """Lower-triangular L with ``L L^T = scale scale^T`` and non-negative diagonal."""
     return triangular(scale.T).T
 

@@ -10,12 +10,12 @@ near. Where passes rest, the estimate is that of all data at once.
 from collections.abc import Iterator
 from typing import NamedTuple, Protocol, runtime_checkable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from sim2gp.compilation import compile_async
 from sim2gp.inference.arrowhead import Blocks, Elimination, Noise, eliminate
 from sim2gp.inference.estimate import Estimate, about_point
 from sim2gp.inference.laplace import Laplace, expected_noise
@@ -127,7 +127,7 @@ def _for_all(some: _OfWindows, count: int) -> _OfWindows:
     return _OfWindows(*(np.empty((count, *x.shape[1:]), x.dtype) for x in some))
 
 
-@eqx.filter_jit
+@compile_async
 def _linearised(
     likelihood: AbstractLikelihood,
     prior: AbstractPrior,

@@ -11,6 +11,7 @@ misfit in it: that makes intervals rather too wide than too narrow.
 from dataclasses import replace
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
@@ -80,32 +81,30 @@ def corrected_windows(start: AtZero) -> CorrectedFit:
     pulls = pulls_of_rows(rows, start.group)
     T, groups = _identifiable(pulls, own, system.parameters.groups)
     k = T.shape[1]
-    prior = Gaussian(jnp.zeros(k), jnp.eye(k))
+    prior = Gaussian(np.zeros(k), np.eye(k))
     at = np.zeros(k)
-    at[:p] = np.asarray(whole.prior.whitened(whole.posterior.mean))[own]
+    at[:p] = whole.prior.on_host().whitened(np.asarray(whole.posterior.mean))[own]
     onto, before = _Onto(mean, scale @ T), at
     for _ in range(ROUNDS):
-        now = Gaussian(jnp.asarray(at), prior.scale)
         here = pulls.onto(T)
-        found = correct_posterior(prior, now, here, groups)
+        found = correct_posterior(prior, Gaussian(at, prior.scale), here, groups)
         if not found.enough:
             return replace(found, posterior=start.alone.posterior)
-        to, settled = _next(found.posterior, before, at)
+        posterior = found.posterior.on_host()
+        to, settled = _next(posterior, before, at)
         before = at
         if groups and settled:  # a linearisation of all forces is saved
             at = to
             break
         at, rows = _trusted(start, rows, here, onto, at, to, found.inflation)
-        moved = np.abs(at - before) / np.asarray(found.posterior.sd())
+        moved = np.abs(at - before) / posterior.sd()
         if not groups or np.max(moved) <= SETTLED:
             break
         pulls = pulls_of_rows(rows, start.group)
-    both = Gaussian(
-        jnp.asarray(onto(at)), jnp.asarray(onto.scale) @ found.posterior.scale
-    )
+    both = Gaussian(onto(at), onto.scale @ posterior.scale)
     return replace(
         found,
-        posterior=both.marginal(own),
+        posterior=jax.device_put(both.marginal(own)),
         curves=curves_of(system, start.forces, start.box, both),
     )
 
@@ -117,8 +116,8 @@ def _next(
 
     Halfway to the posterior's where that is back: the last step was too long.
     """
-    to, sd = np.asarray(posterior.mean), np.asarray(posterior.sd())
-    last, here, there = (np.asarray(posterior.whitened(x)) for x in (before, at, to))
+    to, sd = posterior.mean, posterior.sd()
+    last, here, there = (posterior.whitened(x) for x in (before, at, to))
     back = (there - here) @ (here - last) < 0.0
     settled = np.max(np.abs(to - at) / sd) <= (SETTLED_BACK if back else SETTLED)
     return 0.5 * (at + to) if back else to, bool(settled)

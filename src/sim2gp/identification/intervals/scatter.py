@@ -53,6 +53,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
@@ -149,7 +150,7 @@ def correct_posterior(
     root, rest = weight @ columns, weight @ known
     alone = _without_forces(z, pulls, own) if groups else None
     centre, scale, each = averaged(root, rest, groups or {}, alone)
-    found = Gaussian(jnp.asarray(mu0 + L0 @ centre), jnp.asarray(L0 @ scale))
+    found = jax.device_put(Gaussian(mu0 + L0 @ centre, L0 @ scale))
     return CorrectedFit(found, kappa2, b, nu, True, each)
 
 
@@ -260,7 +261,7 @@ def _at_the_map(
 ]:
     """The MAP of what is linear, whitened, and the pulls there: the same where ``at``
     is it; the factor of the data's information, and R, that of the posterior's."""
-    z = np.asarray(prior.whitened(jnp.asarray(at)))
+    z = prior.on_host().whitened(np.asarray(at))
     data = np.asarray(np.linalg.qr(pulls.rows, mode="r"))
     R = np.asarray(np.linalg.qr(np.concatenate([data, np.eye(len(z))]), mode="r"))
     step = -np.linalg.solve(R, np.linalg.solve(R.T, z + pulls.scores.sum(axis=0)))
@@ -331,10 +332,11 @@ def _without_forces(
     """
     p, k = len(z), len(own)
     onto = np.eye(p)[:, own]
-    unit = jnp.eye(k)
+    unit = np.eye(k)
     still = pulls.at(onto @ z[own] - z).onto(onto)
-    here = Gaussian(jnp.asarray(z[own]), unit)
-    found = correct_posterior(Gaussian(jnp.zeros(k), unit), here, still)
+    found = correct_posterior(
+        Gaussian(np.zeros(k), unit), Gaussian(z[own], unit), still
+    )
     if not found.enough:
         return None
     mean, scale = np.asarray(found.posterior.mean), np.asarray(found.posterior.scale)

@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
@@ -101,12 +100,12 @@ def forces_at_zero(
     names, prior = system.parameters.names, system.parameters.prior()
     own = np.asarray([names.index(name) for name in machine.parameters.names])
     about = prior.with_block(own, fitted.prior)
-    mean, scale = prior.mean.at[own].set(fitted.posterior.mean), about.scale
+    mean, scale = prior.with_block(own, fitted.posterior).mean, about.scale
     whole = replace(
         fitted,
         prior=about,
         posterior=Gaussian(mean, scale),
-        information=jnp.zeros_like(scale),  # of another machine
+        information=np.zeros(scale.shape),  # of another machine
         scores=np.broadcast_to(0.0, (len(fitted.scores), len(scale))),
     )
     return system, whole, own

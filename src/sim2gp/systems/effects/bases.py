@@ -19,10 +19,9 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import register_static
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from sim2gp.inference.linalg import library
 from sim2gp.systems.effects.friction_laws import dead_zone
@@ -262,10 +261,10 @@ class Gap:
         w = x[1]
         return (dead_zone(z, w, x[2] * w) - z) * (x[0] / w)
 
-    def features(self, z: Float[AnyArray, "*b"]) -> Float[Array, "*b 1"]:
+    def features(self, z: Float[AnyArray, "*b"]) -> Float[AnyArray, "*b 1"]:
         """What it takes away for ``x[0] = 1``, at the medians of its shapes."""
-        x = jnp.asarray([1.0, self.width, self.softness])
-        return jnp.asarray(self.value(x, jnp.asarray(z)))[..., None]
+        x = np.asarray([1.0, self.width, self.softness])
+        return self.value(library(z).asarray(x, z.dtype), z)[..., None]
 
 
 StateBasis = AbstractHarmonics | Sign

@@ -13,9 +13,10 @@ of 800/s, where RK4 needs substeps of 2.5 ms.
 import math
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from sim2gp.types import Scalar
+from sim2gp.inference.linalg import library
+from sim2gp.types import AnyArray, AnyScalar, Scalar
 
 #: Longest RK4 substep that is stable and accurate with smoothed Coulomb friction, s.
 COULOMB_SUBSTEP = 0.0025
@@ -38,11 +39,12 @@ def coulomb_arctangent(v: Scalar, level: Scalar, width: float) -> Scalar:
 
 
 def dead_zone(
-    u: Float[Array, "*b"], width: Scalar, smoothing: float | Scalar
-) -> Float[Array, "*b"]:
+    u: Float[AnyArray, "*b"], width: AnyScalar, smoothing: AnyScalar
+) -> Float[AnyArray, "*b"]:
     """An input without effect below ``width``: ``u sigmoid((|u| - width) / eps)``."""
-    z = jnp.clip((jnp.abs(u) - width) / smoothing, -40.0, 40.0)
-    return u / (1.0 + jnp.exp(-z))
+    xp = library(u, width, smoothing)
+    z = xp.clip((xp.abs(u) - width) / smoothing, -40.0, 40.0)
+    return u / (1.0 + xp.exp(-z))
 
 
 def quadratic_drag(v: Scalar, coefficient: Scalar) -> Scalar:

@@ -50,7 +50,7 @@ def drives(plant: AbstractPlant) -> dict[str, Drive]:
     most = np.max(found, axis=0)
     forces = accelerations = np.where((most > 0.0) & np.isfinite(most), most, 1.0)
     if isinstance(plant, AbstractMechanism):
-        first, _, second = plant.inertia(plant.nominal(), jnp.zeros(2))
+        first, _, second = eqx.filter_jit(plant.inertia)(plant.nominal(), jnp.zeros(2))
         accelerations = forces / np.asarray([first, second])
     if isinstance(plant, AbstractForcedPlant):
         forces = accelerations * plant.joint_inertias
