@@ -183,7 +183,7 @@ def test_reaches_grow_until_functions_hold_the_data():
 
 def test_a_spring_is_found_far_beyond_the_reach(with_spring):
     """By the same program; once the data are near again, as the narrower function."""
-    compiled = estimate_forces._cached._cache_size()
+    compiled = estimate_forces._jitted._cached._cache_size()
     data = recorded([Spring("theta", 0.1 * STIFFNESS)], arm=20.0)
     belief = MODEL.fit(MODEL.init(KEY), data, key=KEY)
     assert on(belief) == ["theta.position_force"]
@@ -196,7 +196,7 @@ def test_a_spring_is_found_far_beyond_the_reach(with_spring):
     assert on(near) == ["theta.position_force"]
     np.testing.assert_allclose(near.noise, NOISE, rtol=0.3)
     assert near.system.effects[0].basis.span == MODEL.forces[0].basis.span
-    assert estimate_forces._cached._cache_size() == compiled
+    assert estimate_forces._jitted._cached._cache_size() == compiled
 
 
 def test_a_draw_is_the_same_with_all_forces(with_spring):

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from sim2gp.compilation import compile_async
 from sim2gp.data.transitions import Transitions
 from sim2gp.inference import linearized
 from sim2gp.inference.arrowhead import Blocks, Noise
@@ -89,7 +90,7 @@ class OneStepLikelihood(AbstractLikelihood):
         return Noise(_rms_change(self.data, d), jnp.ones(1))
 
 
-@eqx.filter_jit
+@compile_async
 def compiled_rows(
     likelihood: OneStepLikelihood, tt: Float[Array, " p"], scale: Float[Array, "p q"]
 ) -> tuple[Float[Array, "N d"], Float[Array, "N d q"]]:
@@ -97,7 +98,7 @@ def compiled_rows(
     return likelihood.rows(tt, scale)
 
 
-@eqx.filter_jit
+@compile_async
 def estimate_forces(
     system: AbstractSystem,
     data: Transitions,

@@ -10,12 +10,12 @@ there with all groups on.
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from sim2gp.compilation import compile_async
 from sim2gp.inference.arrowhead import Noise
 from sim2gp.inference.convergence import CONVERGED, NOT_FINITE
 from sim2gp.inference.estimate import Estimate, estimate
@@ -43,7 +43,7 @@ class Start(NamedTuple):
     project: bool | Bool[Array, "*s"] = False
 
 
-@eqx.filter_jit
+@compile_async
 def estimate_groups(
     likelihood: AbstractLikelihood,
     prior: ParameterPrior,

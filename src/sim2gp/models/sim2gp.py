@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from sim2gp import checks
 from sim2gp.belief import AbstractBelief, AbstractModel
+from sim2gp.compilation import compile_async
 from sim2gp.data.one_step import OneStepLikelihood
 from sim2gp.data.transitions import Transitions
 from sim2gp.inference import linearized
@@ -219,7 +220,7 @@ def _predict(belief: Sim2GPBelief, s: Array, a: Array) -> Gaussian:
     return _latent(belief, s, a).plus(noise)
 
 
-@eqx.filter_jit
+@compile_async
 def _fit(
     model: Sim2GP, data: Transitions, starts: Float[Array, "starts p"]
 ) -> Estimate:
