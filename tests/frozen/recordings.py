@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from sim2gp.identification.intervals.discrepancy import SETTLED
+
 EXAMPLES = ("double_pendulum", "qube")
-SHARE = 0.01  # of a posterior's sd, of an interval's width, of an error; nats
-WIDE = 2.0 * 1.96  # sd, of an interval at 95 %
+SHARE = 0.01  # of a posterior's sd, of an error; nats
 
 
 def figures(run: Any) -> dict[str, np.ndarray]:
@@ -43,10 +44,11 @@ def check_same(
     assert np.max(np.abs(ratio - 1.0)) < width
     assert abs(now["log_evidence"] - was["log_evidence"]) < SHARE
     assert np.max(np.abs(now["belief_sd"] / was["belief_sd"] - 1.0)) < SHARE
-    for name, unit in (("belief", 1.0), ("intervals", WIDE)):
-        sd = unit * was[f"{name}_sd"]
-        moved = np.abs(now[f"{name}_mean"] - was[f"{name}_mean"]) / sd
-        assert np.max(moved) < share
+    # A corrected centre rests where it moves by less than `SETTLED`: the same source
+    # ends .055 sd away on another processor, with a posterior that is equal to 1e-12.
+    for name, most in (("belief", share), ("intervals", max(share, SETTLED))):
+        moved = np.abs(now[f"{name}_mean"] - was[f"{name}_mean"]) / was[f"{name}_sd"]
+        assert np.max(moved) < most
     np.testing.assert_allclose(now["held_out"], was["held_out"], rtol=SHARE)
 
 
