@@ -6,8 +6,9 @@ Medians of calls whose programs are compiled already. *Rows*: a fit of a two-lin
 windows of half a second. *Constants*: a fit of two six-axis arms in one MuJoCo model,
 five seconds of log at 200 Hz, with the first so many of 96 constants open. *Sequences*
 and *steps* of one plan of MPPI on the cart-pole. *Features* of the last layer of a
-neural linear model of the Furuta, fitted again to an episode. An exponent is the slope
-of time against size, both as logarithms, over the last three sizes.
+neural linear model of the Furuta, fitted again to an episode. Times of `identify` are
+those of `many_rows.py`. An exponent is the slope of time against size, both as
+logarithms, over the last three sizes.
 """
 
 import argparse
@@ -132,21 +133,36 @@ def exponent(sizes: list[int], times: list[float]) -> float:
     return float(np.polyfit(x, y, 1)[0])
 
 
+def of_identify() -> dict[str, Any]:
+    """The whole command, by `many_rows.py`: programs are compiled, too."""
+    found = json.loads((ROOT / "results" / "many_rows.json").read_text())
+    sizes = sorted(int(name) for name in found if name.isdigit())
+    times = [found[str(size)]["seconds"] for size in sizes]
+    power = exponent(sizes, times)
+    return {"sizes": sizes, "seconds": times, "exponent": power}
+
+
 def draw(curves: dict[str, Any], out: Path) -> None:
     """A panel for each curve, both axes logarithmic."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
+    from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
-    figure, axes = plt.subplots(1, len(curves), figsize=(2.6 * len(curves), 2.6))
-    for axis, (name, curve) in zip(np.atleast_1d(axes), curves.items(), strict=True):
-        axis.loglog(curve["sizes"], curve["seconds"], "o-", color="#1f77b4")
+    figure, axes = plt.subplots(2, 3, figsize=(8.0, 5.0), layout="constrained")
+    for axis, (name, curve) in zip(axes.flat, curves.items(), strict=True):
+        sizes = curve["sizes"]
+        axis.loglog(sizes, curve["seconds"], "o-", color="#1f77b4")
         axis.set_title(f"{name}: exponent {curve['exponent']:.2f}", fontsize=9)
-        axis.set_xlabel(name)
+        axis.set_xticks(sizes, [f"{n:,}" for n in sizes], fontsize=7, rotation=30)
+        axis.xaxis.set_minor_formatter(NullFormatter())
+        axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.yaxis.set_major_formatter(FormatStrFormatter("%g"))
+        axis.yaxis.set_minor_formatter(NullFormatter())
+        axis.tick_params(axis="y", labelsize=7)
+        axis.set_ylabel("s")
         axis.grid(alpha=0.3)
-    np.atleast_1d(axes)[0].set_ylabel("s")
-    figure.tight_layout()
     figure.savefig(out, dpi=150)
 
 
@@ -171,6 +187,8 @@ def main() -> None:
         power = exponent(sizes, times)
         curves[name] = {"sizes": sizes, "seconds": times, "exponent": power}
         target.write_text(json.dumps(curves, indent=1) + "\n")
+    curves["rows of identify"] = of_identify()
+    target.write_text(json.dumps(curves, indent=1) + "\n")
     draw(curves, given.out / "cost.png")
 
 

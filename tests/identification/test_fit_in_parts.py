@@ -24,7 +24,10 @@ from sim2gp.identification.intervals import pulls
 from sim2gp.identification.misfit.residuals import misfit_of_windows
 from sim2gp.identification.missing_physics import reach
 from sim2gp.inference import in_parts
-from sim2gp.inference.estimate import Estimate
+from sim2gp.inference.estimate import Estimate, about_point
+from sim2gp.inference.laplace import laplace
+from sim2gp.inference.levenberg_marquardt import evaluate
+from sim2gp.inference.prior import ParameterPrior
 from sim2gp.project import training_windows
 from sim2gp.systems import CartPole, UniformRodArm
 from sim2gp.systems.simulate import HeldInputs, simulate
@@ -109,6 +112,27 @@ def same_posterior(one: Estimate, other: Estimate) -> None:
     noise = (np.asarray(x.noise.sd) for x in (one, other))
     np.testing.assert_allclose(*noise, rtol=1e-6)
     assert float(one.log_evidence) == pytest.approx(float(other.log_evidence), abs=1e-5)
+
+
+@in_float64
+def test_where_passes_rest_so_does_the_fit_of_all(cuts: Cuts) -> None:
+    """At their noise all windows at once have this posterior, and no step is left.
+
+    To 1e-9; a fit at once ends where its own noise rests, at a change of 1e-6.
+    """
+    system, found = cuts.system, fit_windows(cuts.system, cuts, key=KEY)
+    whole = likelihood_of(system, cuts.whole())
+    about = ParameterPrior(system.parameters.prior(), system.parameters)
+    noise = found.noise
+    at = evaluate(whole, about, found.z(), jnp.asarray(found.nuisances), noise)
+    here = laplace(at, noise)
+    assert float(here.newton_step_sd()) < 1e-9
+    once = about_point(here, noise, about, whole.counts, 0)
+    sd, same = (np.asarray(x.posterior.sd()) for x in (found, once))
+    np.testing.assert_allclose(same, sd, rtol=1e-9)
+    pair = (np.asarray(x.information) for x in (found, once))
+    grams = [A.T @ A for A in pair]
+    np.testing.assert_allclose(*grams, rtol=1e-9, atol=1e-9 * np.abs(grams[0]).max())
 
 
 def test_a_warm_start_and_masked_windows(cuts: Cuts) -> None:
