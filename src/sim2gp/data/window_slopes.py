@@ -7,12 +7,12 @@ derivatives would take longer than a fit asks for them.
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from sim2gp.compilation import compile_async
 from sim2gp.data.windows import Pieces, Windows
 from sim2gp.inference.linearized import value_and_jacobian
 from sim2gp.systems.base import AbstractSystem
@@ -135,7 +135,7 @@ def _delayed_inputs(
     return u, np.stack([inputs_by_delay(*pair, blur) for pair in pairs])
 
 
-@eqx.filter_jit
+@compile_async
 def _altered(
     machine: Machine,
     constants: Float[AnyArray, "W r"],
