@@ -61,7 +61,8 @@ class Estimate(eqx.Module):
 
     def z(self) -> Float[Array, " p"]:
         """The MAP, whitened by the prior; call it under `in_float64`."""
-        return self.prior.whitened(self.posterior.mean)
+        z = self.prior.on_host().whitened(np.asarray(self.posterior.mean))
+        return jnp.asarray(z)
 
     def some(self, which: Int[np.ndarray, " w"]) -> "Estimate":
         """What it says of some of its windows, by number."""

@@ -183,7 +183,7 @@ def _helpful(fit: AtZero, recording: Int[np.ndarray, " W"]) -> dict[str, float]:
     factors, part = rows.factors[seen], recordings_or_parts(recording[rows.first][seen])
     k = factors.shape[-1]
     each = [factors[part == one].reshape(-1, k) for one in np.unique(part)]
-    at = whole.prior.on_host().whitened(np.asarray(whole.posterior.mean))[own]
+    at = np.asarray(whole.z())[own]
     kinds = kinds_of(fit.likelihood.system.parameters.groups)
     return helpful_kinds(LeaveOneOut(each, own, at, kinds))
 

@@ -83,7 +83,7 @@ def corrected_windows(start: AtZero) -> CorrectedFit:
     k = T.shape[1]
     prior = Gaussian(np.zeros(k), np.eye(k))
     at = np.zeros(k)
-    at[:p] = whole.prior.on_host().whitened(np.asarray(whole.posterior.mean))[own]
+    at[:p] = np.asarray(whole.z())[own]
     onto, before = _Onto(mean, scale @ T), at
     for _ in range(ROUNDS):
         here = pulls.onto(T)
