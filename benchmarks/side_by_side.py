@@ -260,7 +260,7 @@ def arm_recordings(seed: int) -> tuple[Recordings, np.ndarray]:
 
 
 def arm_windows(data: Recordings, at_rest: bool, window: float = SECONDS) -> Windows:
-    """All ten seconds as one window; mujoco.sysid is given that it begins at rest."""
+    """Ten seconds, as one window or several; mujoco.sysid knows that it is at rest."""
     system = UniformRodArm()
     known = {channel.name: REST for channel in system.states} if at_rest else None
     windows, _ = cut([data.log(0)], system, window=window, start_sd=known)

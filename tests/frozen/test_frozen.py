@@ -17,9 +17,8 @@ BY_DAY = (
     "density/arm",
 )
 #: Relative to the largest number of an array: of what is computed in one sweep, of
-#: what a descent finds (its noise rests at a change of 1e-6), of what float32 training
-#: finds.
-EXACT, DESCENT, TRAINED = 1e-9, 1e-6, 1e-3
+#: what a descent finds, of what float32 training finds.
+EXACT, DESCENT, TRAINED = 1e-9, 1e-7, 1e-3
 WIDTH = 0.01  # of a corrected interval's, which effects of a library widen
 
 
