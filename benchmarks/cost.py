@@ -35,7 +35,7 @@ from sim2gp.models import NLM  # noqa: E402
 from sim2gp.planning.episode import oracle_world  # noqa: E402
 from sim2gp.planning.tasks import cartpole_swingup, furuta_swingup  # noqa: E402
 from sim2gp.project import load_project  # noqa: E402
-from sim2gp.project.training_windows import cut_places  # noqa: E402
+from sim2gp.project.training_windows import cut_logs  # noqa: E402
 from sim2gp.systems import Furuta, UniformRodArm  # noqa: E402
 
 Job = tuple[int, Callable[[], object]]
@@ -70,7 +70,7 @@ def constants() -> Iterator[Job]:
         for count in (5, 10, 20, 40, 80, 96):
             (folder / "arm.toml").write_text(_project(compiled, paths[:count]))
             project = load_project(folder / "arm.toml")
-            windows, _ = cut_places(project, project.load_logs())
+            windows, _ = cut_logs(project, project.load_logs())
             yield count, lambda s=project.system, w=windows: _fit(s, w)
 
 

@@ -49,6 +49,7 @@ CONDITIONS = {
     "white": Condition("white noise"),
     "ar80": Condition("AR(1) noise, .8", rho=0.8),
     "ar95": Condition("AR(1) noise, .95", rho=0.95),
+    "friction1": Condition("dry friction, 1 mN m", friction=0.001),
     "friction5": Condition("dry friction, 5 mN m", friction=0.005),
     "friction20": Condition("dry friction, 20 mN m", friction=0.02),
     "sharp20": Condition(

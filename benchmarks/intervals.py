@@ -8,10 +8,10 @@ of `sim2gp identify`; masses and dampings are unknown. Next to the plain interva
 (Laplace) and the library's stand those without the effects that the simulator may lack
 (the windows' scatter alone), what they were chosen from (`interval_candidates.py`), and
 an oracle that knows what is wrong: the noise's true covariance, or a simulator with the
-missing term. `--also longer` adds the library's on windows of 1 s instead of .2 s, and
-what comes of those where the misfit tests of both fits are silent, as `sim2gp identify
---longer` advises; `--also sysid` those of mujoco.sysid (`interval_sysid.py`, extra
-`bench`), which takes all ten seconds in one piece and is given their start. Coverage
+missing term. These have windows of .2 s. `--also chosen` adds the library's on windows
+as long as `sim2gp identify` chooses them, `--also longer` those of 1 s in any case;
+`--also sysid` those of mujoco.sysid (`interval_sysid.py`, extra `bench`), which takes
+all ten seconds in one piece and is given their start. Coverage
 with its 95 % interval (Clopper-Pearson), the mean interval score (Gneiting and Raftery
 2007; lower is better) over the oracle's, and the median width over the plain one's.
 Finished cells are not computed again.
@@ -25,7 +25,6 @@ from typing import Any, NamedTuple, cast
 
 import jax
 import numpy as np
-from scipy.stats import norm
 
 import interval_candidates as candidates
 from coverage95 import Z, binomial_interval
@@ -38,6 +37,7 @@ from interval_arms import (
     with_what_is_missing,
 )
 from interval_sysid import intervals
+from sim2gp.commands.window_length import WindowFit, choose_window
 from sim2gp.data.logs import Log
 from sim2gp.data.split_log import cut
 from sim2gp.data.windows import Windows
@@ -50,12 +50,14 @@ from sim2gp.identification.intervals.scatter import NOTHING, CorrectedFit
 from sim2gp.identification.misfit.residuals import misfit_of_windows
 from sim2gp.identification.missing_physics.at_zero import at_zero
 from sim2gp.inference.estimate import Estimate
+from sim2gp.project.in_memory import project_of_machine
+from sim2gp.project.training_windows import cut_for_fit
 from sim2gp.runs.cells import Cells, add_options
 from sim2gp.runs.executors import Processes, cores
 from sim2gp.systems import AbstractSystem, UniformRodArm
 from sim2gp.types import in_float64
 
-WINDOW, LONGER = 0.2, 1.0  # s; the first is the default of a project file
+WINDOW, LONGER = 0.2, 1.0  # s
 CHUNK = 20  # sets of a cell
 METHODS = {
     "plain": "plain (Laplace)",
@@ -68,14 +70,14 @@ METHODS = {
 }
 ALSO = {
     "longer": f"sim2gp, windows of {LONGER:g} s",
-    "advised": "sim2gp, longer where silent",  # of "corrected" and "longer"
+    "chosen": "sim2gp, chosen windows",
     "sysid": "mujoco.sysid",
 }
-WITH_CELLS = ("longer", "sysid")  # of these, the ones with cells
 #: Entry of a cell: of which sets the misfit tests speak, in windows of a length.
 SPEAK = {WINDOW: "speak", LONGER: "speak_longer"}
-#: Of a cell, too: the probability that something is missing.
-MISSING = "missing"
+#: Of a cell, too: the probability that something is missing; the length of windows that
+#: was chosen, s.
+MISSING, SECONDS = "missing", "seconds"
 ASKED = {"white": (0.92, 0.98), "mujoco": (0.92, 0.98)}  # of the others:
 ASKED_ELSE, ASKED_SCORE = (0.90, 0.99), 1.5
 
@@ -95,7 +97,8 @@ class Job(NamedTuple):
     def arguments(self) -> dict[str, Any]:
         """What its cell rests on."""
         ours = {} if self.also == "sysid" else {"longer": LONGER, "effects": True}
-        return {"window": WINDOW, "sets": CHUNK, **ours}
+        own = {"chosen": True} if self.also == "chosen" else {}
+        return {"window": WINDOW, "sets": CHUNK, **ours, **own}
 
 
 @in_float64
@@ -150,12 +153,15 @@ def _also(
         if job.also == "sysid":
             centre, sd = intervals(data, s, UniformRodArm().parameters)
         else:
-            likelihood, belief, group = _fitted(system, data.log(s), LONGER, key)
-            alarm = misfit_of_windows(likelihood, belief).alarm
-            found.setdefault(SPEAK[LONGER], []).append(alarm)
-            centre, sd = _units(
-                corrected_windows(at_zero(likelihood, belief, group)), prior_sd
-            )
+            log = data.log(s)
+            if job.also == "chosen":
+                seconds, *fit = _chosen(system, log, key)
+                found.setdefault(SECONDS, []).append(seconds)
+            else:
+                fit = _fitted(system, log, LONGER, key)
+                alarm = misfit_of_windows(*fit[:2]).alarm
+                found.setdefault(SPEAK[LONGER], []).append(alarm)
+            centre, sd = _units(corrected_windows(at_zero(*fit)), prior_sd)
         error = centre - data.truth[s] / prior_sd
         found[job.also].append([_rounded(error), _rounded(sd)])
     return found
@@ -168,6 +174,16 @@ def _fitted(
     windows, of = cut([log], system, window=window)
     belief = fit_windows(system, windows, key=key)
     return WindowsLikelihood(system, windows), belief, np.asarray([k for k, _ in of])
+
+
+def _chosen(system: AbstractSystem, log: Log, key: Any) -> tuple[Any, ...]:
+    """The length of windows that `identify` chooses, and what `_fitted` returns."""
+    project = project_of_machine(system)
+    windows, places = cut_for_fit(project, [log])
+    short = WindowFit(project, windows, places, fit_windows(system, windows, key=key))
+    fit = choose_window(short, [log], key=key).fit
+    likelihood = WindowsLikelihood(system, fit.windows)
+    return fit.project.window, likelihood, fit.fitted, fit.places[:, 0]
 
 
 def _nearest(system: AbstractSystem, windows: Windows, key: Any) -> Estimate:
@@ -189,23 +205,17 @@ def _rounded(x: np.ndarray) -> list[float]:
 
 
 def figures(joined: dict[str, list[Any]]) -> dict[str, Any]:
-    """Of one condition: its table, and what the misfit tests of both fits say.
-
-    ``apart`` is the share of sets where the two fits lie further apart in some constant
-    than the short windows' intervals say, at 5 % for all constants together.
-    """
+    """Of one condition: its table, how often misfit tests speak, and which windows."""
     found = {name: np.asarray(v) for name, v in joined.items()}
-    missing = {"missing": float(np.mean(found.pop(MISSING) > NOTHING))}
-    speak = {w: found.pop(key) for w, key in SPEAK.items() if key in found}
-    if "longer" not in found:
-        return {"methods": table(found), **missing}
-    silent = ~(speak[WINDOW] | speak[LONGER])[:, None, None]
-    found["advised"] = np.where(silent, found["longer"], found["corrected"])
-    (short, sd), long = np.moveaxis(found["corrected"], 1, 0), found["longer"][:, 0]
-    far = np.max(np.abs(long - short) / sd, axis=1) > norm.isf(0.025 / len(NAMES))
-    about = {"apart": far.mean(), "advised": silent.mean(), **missing}
-    about |= {key: speak[w].mean() for w, key in SPEAK.items()}
-    return {"methods": table(found), **{k: float(v) for k, v in about.items()}}
+    about = {"missing": float(np.mean(found.pop(MISSING) > NOTHING))}
+    for key in SPEAK.values():
+        if key in found:
+            about[key] = float(found.pop(key).mean())
+    if SECONDS in found:
+        lengths, counts = np.unique(found.pop(SECONDS), return_counts=True)
+        shares = (counts / counts.sum()).tolist()
+        about[SECONDS] = {f"{x:g}": n for x, n in zip(lengths, shares, strict=True)}
+    return {"methods": table(found), **about}
 
 
 def table(found: dict[str, np.ndarray]) -> dict[str, Any]:
@@ -258,12 +268,12 @@ def lines(summary: dict[str, Any]) -> list[str]:
             out.append(row)
         out.append(_goal(name, entry["methods"]["corrected"]))
         out.append(f"something is missing, it says: {entry['missing']:.3f}")
-        if "advised" in entry:
-            out.append(
-                f"misfit tests speak: windows of {WINDOW:g} s {entry['speak']:.3f}, of "
-                f"{LONGER:g} s {entry['speak_longer']:.3f}; longer advised: "
-                f"{entry['advised']:.3f}; fits apart: {entry['apart']:.3f}"
-            )
+        for w, key in SPEAK.items():
+            if key in entry:
+                out.append(f"misfit tests speak in {w:g} s: {entry[key]:.3f}")
+        if SECONDS in entry:
+            shares = (f"{n:.3f} of {x} s" for x, n in entry[SECONDS].items())
+            out.append(f"chosen windows: {', '.join(shares)}")
     return out
 
 
@@ -286,7 +296,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sets", type=int, default=200)
     parser.add_argument("--workers", type=int, default=cores())
-    parser.add_argument("--also", nargs="+", choices=WITH_CELLS, default=[])
+    parser.add_argument("--also", nargs="+", choices=list(ALSO), default=[])
     parser.add_argument("--out", type=Path, default=Path("results/intervals"))
     add_options(parser)
     options = parser.parse_args()
@@ -295,11 +305,11 @@ def main() -> None:
     cells.check(
         (job.name, job.arguments)
         for name in CONDITIONS
-        for also in ("", *WITH_CELLS)
+        for also in ("", *ALSO)
         for job in (Job(name, k, options.out, also) for k in range(chunks))
     )
     for name in CONDITIONS:
-        for also in ("", *WITH_CELLS):
+        for also in ("", *ALSO):
             jobs = [Job(name, k, options.out, also) for k in range(chunks)]
             done = {j: cells.load(j.name, j.arguments) for j in jobs}
             missing = [j for j in jobs if done[j] is None]

@@ -35,7 +35,6 @@ def identify(
     progress: Progress,
     check: bool = False,
     nuts: bool = False,
-    longer: bool = False,
     held_out: bool = True,
     first: Callable[[Any], str] | None = None,
 ) -> Returned:
@@ -53,7 +52,6 @@ def identify(
             "asked": {
                 "check": check,
                 "nuts": nuts,
-                "longer": longer,
                 "held_out": held_out,
             },
             "warnings": note_lines(logs),

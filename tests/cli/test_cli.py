@@ -211,11 +211,11 @@ def test_identify_of_a_small_project(
     assert main(words) == 0
     said = json.loads(capsys.readouterr().out)["asked"]
     assert (said["check"], said["held_out"]) == (True, True)
-    words = ["identify", "arm.toml", "--quick", "--longer", "--nuts", "--json"]
+    words = ["identify", "arm.toml", "--quick", "--nuts", "--json"]
     assert main([*words, "--quiet", "--out", "three"]) == 0
     said = json.loads(capsys.readouterr().out)["asked"]
-    asked = [said[key] for key in ("held_out", "longer", "nuts", "check")]
-    assert asked == [False, True, True, False]
+    asked = [said[key] for key in ("held_out", "nuts", "check")]
+    assert asked == [False, True, False]
 
 
 @pytest.mark.parametrize("unbuffered", ["", "1"])

@@ -9,11 +9,9 @@ import numpy as np
 import pytest
 
 from sim2gp.cli import main
-from sim2gp.commands import longer
 from sim2gp.commands.evaluate import evaluate
 from sim2gp.commands.identification import restore_identification
 from sim2gp.commands.identify import identify
-from sim2gp.commands.longer import Longer
 from sim2gp.data.logs import Log
 from sim2gp.errors import InputError
 from sim2gp.identification.missing_physics.at_zero import forces_of
@@ -71,11 +69,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def run(folder: Path) -> Path:
     path, out = project_in(folder), folder / "run"
-    words = ["identify", str(path), "--check", "--longer", "--quiet"]
-    with pytest.MonkeyPatch.context() as patch:  # that fit is test_longer's
-        found = Longer(1.0, {"viscous": 0.25})
-        patch.setattr(longer, "fit_longer_windows", lambda *given, **how: found)
-        assert main([*words, "--out", str(out)]) == 0
+    words = ["identify", str(path), "--check", "--quiet", "--out", str(out)]
+    assert main(words) == 0
     return out
 
 
@@ -124,7 +119,7 @@ def test_identify_checks_laplace_against_the_exact_posterior(run: Path) -> None:
     for entry in check["constants"].values():
         assert abs(entry["shift"]) < 0.2
         assert entry["sd_ratio"] == pytest.approx(1.0, abs=0.15)
-    assert "--check --longer" in summary["command_line"]
+    assert "--check --quiet" in summary["command_line"]
 
 
 def test_belief_and_intervals_are_both_kept(run: Path) -> None:
@@ -145,7 +140,7 @@ def test_identify_writes_a_report_with_traces(run: Path) -> None:
     assert 'id="traces"' in text
     assert text.count('<span class="why">plain: ') == len(FREE)
     assert "Gaussian is fine (Pareto k" in text
-    assert "likelihood.window = 1 makes them the run" in text
+    assert "Without likelihood.window in the project file" in text
     assert "white noise would" in text
     assert "nan" not in text.lower().replace("nanos", "")
     arrays = load_run(run).arrays
@@ -180,8 +175,7 @@ def test_identify_forecasts_a_log_that_it_left_out(run: Path) -> None:
         assert words in text
     command = stored.summary["command_line"]
     assert command == (
-        f"sim2gp identify {run.parent / 'machine.toml'} --check --longer --quiet "
-        f"--out {run}"
+        f"sim2gp identify {run.parent / 'machine.toml'} --check --quiet --out {run}"
     )
     assert {"python", "sim2gp", "jax", "numpy"} <= set(stored.summary["versions"])
 

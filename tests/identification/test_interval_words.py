@@ -1,13 +1,28 @@
 """What is said of corrected intervals."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 
-from sim2gp.identification.intervals import scatter as intervals
+from sim2gp.identification.intervals import words as intervals
 from sim2gp.identification.intervals.averaging import NONE
 from sim2gp.identification.intervals.scatter import CorrectedFit
 from sim2gp.inference.gaussian import Gaussian
 from tests.identification.test_intervals import gaussian
+
+
+def test_the_words_say_which_intervals_these_are() -> None:
+    found = CorrectedFit(gaussian(np.zeros(1), np.eye(1)), 9.0, 2, 30.0, True)
+    text = intervals.describe_intervals(found, [1.0, 2.96, 3.31], 40)
+    assert text.startswith("Intervals are 1 to 3.3 times as wide")
+    assert "40 windows are coloured and pull the parameters 3 times" in text
+    assert "are 3 times as wide" in intervals.describe_intervals(found, [3.0, 3.0], 40)
+    white = dataclasses.replace(found, inflation=1.0)
+    text = intervals.describe_intervals(white, [1.02, 1.1], 40)
+    assert "at most 1.1 times those of independent samples" in text
+    few = dataclasses.replace(found, enough=False)
+    assert "3 windows are too few" in intervals.describe_intervals(few, [1.0], 3)
 
 
 def test_the_words_say_whether_physics_is_missing() -> None:

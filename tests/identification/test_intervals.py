@@ -111,8 +111,7 @@ def test_the_scatter_of_pulls_has_fishers_information_for_its_mean(b: int) -> No
         y = model.J @ source[8 * L :] + source[: 8 * L].reshape(8, L)
         _, pulls = model.fit(y)
         # The prior's mean is zero, its spread that of the truth.
-        v, C = intervals._whitened(pulls, R)
-        rows = intervals._scatter(v, C, model.group, b) @ R
+        rows = intervals._scatter(*intervals._whitened(pulls, R), b) @ R
         total += rows.T @ rows
     np.testing.assert_allclose(total, model.F, rtol=1e-9)
 
@@ -193,14 +192,16 @@ def test_a_scatter_as_expected_is_the_plain_posterior() -> None:
 def test_recordings_are_not_joined() -> None:
     rng = np.random.default_rng(9)
     v, C = rng.standard_normal((6, 2)), 1e-3 * np.tile(np.eye(2), (6, 1, 1))
-    apart = intervals._scatter(v, C, np.array([0, 0, 0, 1, 1, 1]), 2)
-    each = [
-        intervals._scatter(v[i : i + 3], C[:3], np.zeros(3, int), 2) for i in (0, 3)
-    ]
+
+    def scatter(v: np.ndarray, *group: int) -> np.ndarray:
+        pulls = Pulls(np.zeros((len(v), 1, 2)), v, np.array(group))
+        return intervals._scatter(pulls, C[: len(v)], 2)
+
+    apart = scatter(v, 0, 0, 0, 1, 1, 1)
+    each = [scatter(v[i : i + 3], 0, 0, 0) for i in (0, 3)]
     np.testing.assert_allclose(apart, np.concatenate(each))
     assert len(apart) == 8
-    whole = intervals._scatter(v, C, np.zeros(6, int), 2)
-    assert len(whole) == 7
+    assert len(scatter(v, 0, 0, 0, 0, 0, 0)) == 7
 
 
 def test_a_lag_follows_the_likeness_of_successive_pulls() -> None:
@@ -269,19 +270,6 @@ def test_a_corrected_posterior_changes_spreads_and_not_the_structure() -> None:
     open_now = json.dumps(study(*belief, corrected=other)["directions"])
     assert "The data determine c" in json.dumps(plain["directions"])
     assert "The data hardly determine c: 80 % of the prior" in open_now
-
-
-def test_the_words_say_which_intervals_these_are() -> None:
-    found = intervals.CorrectedFit(gaussian(np.zeros(1), np.eye(1)), 9.0, 2, 30.0, True)
-    text = intervals.describe_intervals(found, [1.0, 2.96, 3.31], 40)
-    assert text.startswith("Intervals are 1 to 3.3 times as wide")
-    assert "40 windows are coloured and pull the parameters 3 times" in text
-    assert "are 3 times as wide" in intervals.describe_intervals(found, [3.0, 3.0], 40)
-    white = dataclasses.replace(found, inflation=1.0)
-    text = intervals.describe_intervals(white, [1.02, 1.1], 40)
-    assert "at most 1.1 times those of independent samples" in text
-    few = dataclasses.replace(found, enough=False)
-    assert "3 windows are too few" in intervals.describe_intervals(few, [1.0], 3)
 
 
 def recorded(system: Machine, rows: int, rate: list[float], error: np.ndarray) -> Log:

@@ -52,7 +52,6 @@ def test_each_question_has_its_answer() -> None:
             {"parameters": {"mass": ENTRY | {"verdict": "weak"}}},
             "sim2gp design RUN: an experiment that tells more of mass.",
         ),
-        ({"longer": {"advised": True, "text": "window = 1"}}, "window = 1"),
         ({"parameters": {"mass": PRESSED}}, "Write a wider range of mass"),
         ({"parameters": {"lag": PRESSED | {"mean": 0.0, "low": 0.0}}}, "evaluate RUN"),
     ],

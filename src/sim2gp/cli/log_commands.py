@@ -107,8 +107,6 @@ class Identify(Reads, Spread):
     """Compare the posterior with the exact one (Pareto k); takes as long again."""
     nuts: Flag = False
     """Compare it with draws by NUTS, too (extra mcmc); half an hour and more."""
-    longer: Flag = False
-    """Fit windows five times as long, too: are intervals narrower?"""
     quick: Flag = False
     """No second fit, which forecasts data that it has not seen."""
     each: Name = None
@@ -128,7 +126,6 @@ class Identify(Reads, Spread):
                 seed=self.seed,
                 check=self.check,
                 nuts=self.nuts,
-                longer=self.longer,
                 held_out=not self.quick,
                 first=first,
                 progress=call.progress,
@@ -138,7 +135,7 @@ class Identify(Reads, Spread):
         return summary
 
     def _fleet(self, call: Call, out: Path, each: str) -> dict[str, Any]:
-        without = "check", "nuts", "longer", "quick"
+        without = "check", "nuts", "quick"
         refuse(self, without, "--each alone", "or leave --each out")
         read = read_machines(self.project, self, each)
         identify = function("commands.fleet", "identify_fleet")

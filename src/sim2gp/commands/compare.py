@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import numpy as np
 
 from sim2gp.commands.compare_folds import (
@@ -24,9 +25,12 @@ from sim2gp.commands.compare_folds import (
     prepared,
     trivial_errors,
 )
+from sim2gp.commands.compare_setup import check_measured
 from sim2gp.commands.compare_summary import FoldForecasts, summarise
+from sim2gp.commands.evaluation import check_horizon
 from sim2gp.commands.recordings import AbstractFolds, Recordings
 from sim2gp.commands.result import AbstractResult
+from sim2gp.commands.window_length import chosen_window
 from sim2gp.data.logs import Log, note_lines
 from sim2gp.identification.forecasts.prediction import channels, recording_names
 from sim2gp.project import Project
@@ -87,7 +91,7 @@ def compare(
 class CompareWork(AbstractFolds[Comparison]):
     """A cell for each model without each group of logs; a comparison, of their values.
 
-    Raises what `prepare_comparison` raises.
+    Raises what `prepare_comparison` raises, E103, and E160 for a horizon.
     """
 
     title, after = "compare", 1
@@ -102,6 +106,10 @@ class CompareWork(AbstractFolds[Comparison]):
         seed: int = 0,
     ) -> None:
         self.started, self.models, self.seed = time.perf_counter(), models, seed
+        for horizon in horizons:
+            check_horizon(horizon)
+        check_measured(logs, project)
+        project = chosen_window(project, logs, key=jax.random.key(seed))
         self.recordings = Recordings(project, logs)
         self.setup, self.folds = prepared(self.recordings, horizons)
         self.alone = models is not MODELS

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sim2gp.commands.evaluation import check_horizon, windows_for
+from sim2gp.commands.evaluation import windows_for
 from sim2gp.data.grid import CURVE, PERIOD, Grid
 from sim2gp.data.logs import Log
 from sim2gp.data.one_step_log import (
@@ -51,11 +51,8 @@ def prepare_comparison(
     project: Project, logs: Sequence[Log], horizons: Sequence[float]
 ) -> tuple[Setup, list[list[int]]]:
     """Windows, one-step data and folds (each the indices of the logs left out)."""
-    for horizon in horizons:
-        check_horizon(horizon)
     system = project.system
     logs, folds = _folds(logs)
-    _check_measured(logs, system, project)
     recorded = float(np.median([log.period for log in logs]))
     period = PERIOD * stride_of(max(recorded, STEP))
     horizons = [period * max(1, round(h / period)) for h in sorted(set(horizons))]
@@ -131,10 +128,9 @@ def _piece(log: Log, rows: np.ndarray, word: str) -> Log:
     )
 
 
-def _check_measured(
-    logs: Sequence[Log], system: AbstractSystem, project: Project
-) -> None:
+def check_measured(logs: Sequence[Log], project: Project) -> None:
     """One-step models need every state, or the position whose rate it is (E103)."""
+    system = project.system
     measured = measured_states(logs, system)
     names = [channel.name for channel in system.physical_states]
     missing = [

@@ -49,6 +49,7 @@ from sim2gp.inference.prior import ParameterPrior
 from sim2gp.models.features import Encoding
 from sim2gp.models.sim2gp import PRIOR_NOISE
 from sim2gp.project import Project
+from sim2gp.project.project import SHORT
 from sim2gp.runs import Progress
 from sim2gp.runs.provenance import provenance
 from sim2gp.systems import one_variant
@@ -57,7 +58,6 @@ from sim2gp.types import in_float64
 
 FILE = "trajectory.csv"
 PERIOD = 0.01  # s, of commands and samples, where no log says otherwise
-WINDOW = 0.2  # s, where the likelihood has windows of one step
 LOOSE = 1.0  # rad, m, rad/s or m/s: the sd of a window's start where none is stated
 
 
@@ -200,7 +200,7 @@ def setting(
         got, least = f"{asked.seconds:g} s", f"{period:g}"
         raise error("experiment_too_short", where="--seconds", got=got, period=least)
     stated = project.spec.likelihood
-    window = max(2, round((stated.window or WINDOW) / period))
+    window = max(2, round((project.window or SHORT) / period))
     sd = stated.start_sd
     each = sd if isinstance(sd, dict) else dict.fromkeys(states, sd or LOOSE)
     experiment = Experiment(

@@ -224,7 +224,7 @@ def _refit_of(job: RefitJob) -> tuple[Estimate, float, float, float, float] | No
 def window_data(project: Project, logs: Sequence[Log], seed: int = 0) -> WindowData:
     """A project's logs as windows; those of one second may share an error."""
     windows, log = cut_logs(project, logs)
-    span = max(project.spec.likelihood.window, 1e-9)
+    span = max(project.window, 1e-9)
     first = np.concatenate([[0], np.flatnonzero(np.diff(log)) + 1])
     within = np.arange(len(log)) - first[np.cumsum(np.diff(log, prepend=log[0]) != 0)]
     second = within // max(1, round(SHARED_SECOND / span))

@@ -3,6 +3,7 @@
 It is the same object where it was just made and where `load_run` reads it back.
 """
 
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -236,7 +237,23 @@ def project_of(
     place = recorded_project_path(run, stored.summary)
     found = load_project(run / PROJECT, place.parent, model, system=machine)
     # The copy's folder is the run's: what was moved is the copy alone.
-    return replace(found, path=place, own=model is not None or machine is not None)
+    return replace(
+        found,
+        path=place,
+        own=model is not None or machine is not None,
+        chosen_window=_chosen_window(run, stored.summary),
+    )
+
+
+def _chosen_window(run: Path, summary: dict[str, Any]) -> float | None:
+    """The length of windows that the fit has chosen, s."""
+    about = summary.get("window")
+    if not isinstance(about, dict) or not about.get("chosen"):
+        return None
+    seconds = about.get("seconds")
+    if isinstance(seconds, int | float) and 0.0 < seconds < math.inf:
+        return float(seconds)
+    raise damaged(run, SUMMARY, f"window.seconds is {seconds!r}")
 
 
 @in_float64

@@ -33,7 +33,6 @@ def identify(
     seed: int = 0,
     check: bool = False,
     nuts: bool = False,
-    longer: bool = False,
     held_out: bool = True,
     first: Callable[[Identification], str] | None = None,
     progress: Progress | None = None,
@@ -42,8 +41,8 @@ def identify(
 
     ``seed`` draws the starts of the fit. ``check`` holds Laplace's posterior against
     the exact one by importance sampling, ``nuts`` against draws of it (E135 without the
-    extra ``mcmc``); ``longer`` also fits longer windows; ``held_out`` fits once more
-    without some of the data, and forecasts those. Where a fit takes its time, ``first``
+    extra ``mcmc``); ``held_out`` fits once more without some of the data, and forecasts
+    those. Where a fit takes its time, ``first``
     gets a first answer, and what a failed one knows; it returns what to say.
     Raises `InputError` for logs that do not fit the machine, `NotConverged` E201,
     `DeadParameters` E146.
@@ -60,52 +59,56 @@ def identify(
         task.advance(f"{len(windows)} windows")
         key, robust = jax.random.key(seed), project.spec.likelihood.robust
         grid = evaluation_windows(logs, project.system, longest=CURVE[-1])
-        _compile(project.system, grid, windows)
+        _compile_forecast(project.system, grid)
+        if not project.chooses_window:
+            _compile_intervals(project.system, windows)
         progress.say(_sizes(project, logs, windows))
         watch = FirstAnswer(project, logs, task, first)
         with watch.of_failures():
             fitted = fit_windows(
                 project.system, windows, key=key, robust=robust, report=watch
             )
-        task.advance("posterior")
         # Late: a first answer waits for nothing that comes after it.
         from sim2gp.commands import identify_results as results
-        from sim2gp.commands.longer import advice
+        from sim2gp.commands.window_length import WindowFit, choose_window
 
-        cuts = windows, places
-        found = results.identification_results(
-            project, logs, cuts, grid, fitted, seed, held_out
+        short = WindowFit(project, windows, places, fitted)
+        chosen = choose_window(short, logs, key=key, task=task)
+        if project.chooses_window:
+            _compile_intervals(project.system, chosen.fit.windows)
+        task.advance("posterior")
+        summary, arrays = results.identification_results(
+            chosen, logs, grid, seed, held_out
         )
-        summary, arrays, honest = found
         task.advance("forecasts")
-        asked = fitted, seed, check, nuts
-        summary |= results.held_against(project.system, windows, *asked)
-        if longer:
-            progress.say("fitting longer windows")
-        alarm = summary["misfit"]["alarm"]
-        summary |= advice(project, logs, honest, alarm=alarm, key=key, asked=longer)
+        summary |= results.held_against(chosen.fit, seed, check, nuts)
     summary |= provenance(started)
+    project = chosen.fit.project
     return Identification(summary, arrays, {}, project, logs=tuple(logs))
 
 
 def _sizes(project: Project, logs: Sequence[Log], windows: Windows | Cuts) -> str:
     """What a fit is about, and in which steps it simulates, before it begins."""
     parameters, columns = len(project.system.parameters), len(windows.outputs)
-    length = project.spec.likelihood.window
     sizes = (
-        f"{parameters} parameters, {len(windows)} windows of {length:g} s, "
+        f"{parameters} parameters, {len(windows)} windows of {project.window:g} s, "
         f"{columns} measured columns"
     )
     still = [line for line in note_lines(logs) if line.startswith("W117")]
     return "\n".join([sizes, *clock_lines(logs, project.system), *still])
 
 
-def _compile(system: AbstractSystem, grid: Grid, windows: Windows | Cuts) -> None:
+def _compile_forecast(system: AbstractSystem, grid: Grid) -> None:
     """Begin to compile what follows the fit, where JAX moves the machine."""
-    if simulator_of(system) is not None:
-        return
-    from sim2gp.identification.forecasts.forecast import compile_forecast
-    from sim2gp.identification.intervals.discrepancy import compile_corrected
+    if simulator_of(system) is None:
+        from sim2gp.identification.forecasts.forecast import compile_forecast
 
-    compile_forecast(system, grid)
-    compile_corrected(system, windows)
+        compile_forecast(system, grid)
+
+
+def _compile_intervals(system: AbstractSystem, windows: Windows | Cuts) -> None:
+    """The same, of windows that stay as long as they are."""
+    if simulator_of(system) is None:
+        from sim2gp.identification.intervals.discrepancy import compile_corrected
+
+        compile_corrected(system, windows)

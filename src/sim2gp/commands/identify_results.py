@@ -10,6 +10,7 @@ from jaxtyping import Int
 from sim2gp.commands.folds import recording_of_windows
 from sim2gp.commands.identification import physical_mode
 from sim2gp.commands.unseen import Unseen, forecast_unseen
+from sim2gp.commands.window_length import WindowFit, WindowLength
 from sim2gp.data.clock import clock_warnings
 from sim2gp.data.cuts import Cuts
 from sim2gp.data.grid import CURVE, Grid
@@ -51,7 +52,6 @@ from sim2gp.identification.intervals.words import (
     interval_entry,
     missing_forces_table,
 )
-from sim2gp.identification.misfit.residuals import misfit_of_windows
 from sim2gp.identification.missing_physics.at_zero import at_zero
 from sim2gp.identification.missing_physics.curves import force_arrays
 from sim2gp.identification.words import bound_warnings
@@ -60,7 +60,6 @@ from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.parameters import Parameters
 from sim2gp.project import Project
 from sim2gp.reports.motion import film
-from sim2gp.systems.base import AbstractSystem
 from sim2gp.systems.host import simulator_of
 
 #: Forecasts to draw: of which machine, and what and where they are.
@@ -69,28 +68,26 @@ _SHORTEST = 4  # windows: a film of fewer held-out ones is not worth watching
 
 
 def identification_results(
-    project: Project,
+    chosen: WindowLength,
     logs: Sequence[Log],
-    cuts: tuple[Windows | Cuts, Int[np.ndarray, "W 2"]],
     grid: Grid,
-    fitted: Estimate,
     seed: int,
     held_out: bool,
-) -> tuple[dict[str, Any], dict[str, np.ndarray], CorrectedFit]:
-    """The run's summary and arrays, and the corrected intervals."""
-    table, (windows, places) = project.system.parameters, cuts
-    of = places[:, 0]
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """The run's summary and arrays."""
+    project, windows, places, fitted = chosen.fit
+    table, of = project.system.parameters, places[:, 0]
     known = fitted.with_measurements(table)
     likelihood = likelihood_of(project.system, windows)
     recording, robust = recording_of_windows(logs, of), project.spec.likelihood.robust
     machine, honest = _with_forces(likelihood, known, of, recording, robust)
     band, own = _own_forecasts(machine, grid, logs)
     summary = _identification_summary(
-        project, logs, likelihood, known, honest, band, seed
+        chosen, logs, likelihood, known, honest, band, seed
     )
     arrays = _stored(table, known, honest.posterior, band, seed)
     arrays |= force_arrays(honest.found) | machine.arrays()
-    summary |= machine.entries()
+    summary |= machine.entries() | {"window": chosen.as_dict()}
     summary["trace_note"] += forces_sentence(machine.scales)
     other = (
         forecast_unseen(project, logs, windows, places, grid, known)
@@ -98,7 +95,7 @@ def identification_results(
         else None
     )
     said, drawings = _drawings(project, logs, own, other)
-    return summary | said, arrays | drawings, honest
+    return summary | said, arrays | drawings
 
 
 def _with_forces(
@@ -157,7 +154,7 @@ def _stored(
 
 
 def _identification_summary(
-    project: Project,
+    chosen: WindowLength,
     logs: Sequence[Log],
     likelihood: AnyWindows,
     fitted: Estimate,
@@ -165,7 +162,7 @@ def _identification_summary(
     band: Band,
     seed: int,
 ) -> dict[str, Any]:
-    system, windows = project.system, likelihood.windows
+    system, windows = chosen.fit.project.system, likelihood.windows
     inputs = [channel.name for channel in system.actions]
     names = channels(system, windows)
     found = diagnose.summary(
@@ -182,7 +179,7 @@ def _identification_summary(
     tables = [*missing_forces_table(honest), *listed.get("tables", ())]
     return {
         "command": "identify",
-        "title": f"{project.name}: what {_count_of_logs(logs)}",
+        "title": f"{chosen.fit.project.name}: what {_count_of_logs(logs)}",
         "headline": identified_headline(found["parameters"]),
         "seed": seed,
         "converged": True,
@@ -191,7 +188,7 @@ def _identification_summary(
         "intervals": interval_entry(honest, found["parameters"], len(windows)),
         "forces": force_entries(honest),
         "misfit": {
-            **misfit_of_windows(likelihood, fitted).as_dict(),
+            **chosen.misfit.as_dict(),
             "noise": _noise_words(names, noise, windows, channel_units(system)),
         },
         "log_evidence": float(fitted.log_evidence),
@@ -282,20 +279,14 @@ def _drawings(
     return summary | ({"animation": about} if about else {}), arrays | moves
 
 
-def held_against(
-    system: AbstractSystem,
-    windows: Windows | Cuts,
-    fitted: Estimate,
-    seed: int,
-    check: bool,
-    nuts: bool,
-) -> dict[str, Any]:
+def held_against(fit: WindowFit, seed: int, check: bool, nuts: bool) -> dict[str, Any]:
     """What the exact posterior says of Laplace's, where it is asked."""
     out: dict[str, Any] = {}
     if not check and not nuts:
         return out
+    system, fitted = fit.project.system, fit.fitted
     names, key = system.parameters.names, jax.random.key(seed)
-    likelihood = WindowsLikelihood(system, windows.whole())
+    likelihood = WindowsLikelihood(system, fit.windows.whole())
     if check:
         checked = check_windows(likelihood, fitted, key=jax.random.fold_in(key, 2))
         out["check"] = checked.as_dict(names)

@@ -16,6 +16,7 @@ from sim2gp.commands.evaluation import (
 )
 from sim2gp.commands.folds import fit_fold, leave_out
 from sim2gp.commands.recordings import AbstractFolds, Recordings
+from sim2gp.commands.window_length import chosen_window
 from sim2gp.data.grid import CURVE, Grid
 from sim2gp.data.logs import Log, Note, note_lines, shared_rows
 from sim2gp.data.windows import Windows
@@ -66,6 +67,7 @@ class LeaveOneOut(AbstractFolds[Evaluation]):
         if len(self.files) < 2:
             where, got = project.source.where("logs"), f"{len(self.files)} file"
             raise error("one_recording", where=where, got=got)
+        project = chosen_window(project, logs, key=jax.random.key(0))
         self.recordings = Recordings(project, logs)
         self.cut = _cut_for_folds(self.recordings, horizon)
         self.cells = [

@@ -3,7 +3,7 @@
 import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
@@ -37,6 +37,8 @@ class Recordings:
     def digest(self) -> str:
         """A short name of the project's text, its model's files, and the logs."""
         found = hashlib.sha256(self.project.source.text.encode("utf-8"))
+        if self.project.chosen_window is not None:
+            found.update(f"window {self.project.chosen_window!r} ".encode())
         for name, content in self._contents():
             found.update(f"{name} {len(content)} ".encode())
             found.update(content)
@@ -69,7 +71,8 @@ class Recordings:
         return found
 
     def __reduce__(self) -> tuple[Any, ...]:
-        source = self.project.path, self.project.source.text
+        project = self.project
+        source = project.path, project.source.text, project.chosen_window
         return _read_again, (*source, self.logs, self.digest)
 
 
@@ -109,7 +112,7 @@ _KNOWN: dict[str, Recordings] = {}
 
 
 def _read_again(
-    path: Path, text: str, logs: tuple[Log, ...], digest: str
+    path: Path, text: str, window: float | None, logs: tuple[Log, ...], digest: str
 ) -> Recordings:
     """The same in this process, which keeps the last one with all that it compiled."""
     if digest not in _KNOWN:
@@ -122,5 +125,6 @@ def _read_again(
                 fix="run the command again",
             )
         _KNOWN.clear()
+        project = replace(project, chosen_window=window)
         _KNOWN[digest] = Recordings(project, logs)
     return _KNOWN[digest]

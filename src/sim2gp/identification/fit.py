@@ -104,9 +104,10 @@ def _fit_of_some(system: AbstractSystem, windows: Cuts, **how: Any) -> Estimate:
     W, size = len(windows), max(LEAST, AT_A_TIME // windows.length)
     some = evenly_spread(size, W)
     found = fit_windows(system, windows.some(some), **how)
-    e, scores = (np.zeros((W, x.shape[1])) for x in (found.nuisances, found.scores))
-    e[some], noise = found.nuisances, Noise(found.noise.sd, np.ones(W))
-    return replace(found, nuisances=e, noise=noise, scores=scores)
+    whole = found.of_windows(W)
+    e = np.asarray(whole.nuisances)
+    e[some] = found.nuisances
+    return replace(whole, nuisances=e)
 
 
 def _first_windows(likelihood: WindowsLikelihood) -> Int[np.ndarray, " w"] | None:

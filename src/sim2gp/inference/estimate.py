@@ -64,6 +64,14 @@ class Estimate(eqx.Module):
         z = self.prior.on_host().whitened(np.asarray(self.posterior.mean))
         return jnp.asarray(z)
 
+    def of_windows(self, count: int) -> "Estimate":
+        """To begin a fit of so many other windows, at the starts guessed for them."""
+        e, scores = (
+            np.zeros((count, x.shape[1])) for x in (self.nuisances, self.scores)
+        )
+        noise = Noise(self.noise.sd, np.ones(count))
+        return dataclasses.replace(self, nuisances=e, noise=noise, scores=scores)
+
     def some(self, which: Int[np.ndarray, " w"]) -> "Estimate":
         """What it says of some of its windows, by number."""
         each = self.noise.weights, self.nuisances, self.scores

@@ -57,7 +57,7 @@ def select_constants(
     its own. Raises `TimeoutError` where the logs cannot be linearised ``until`` (of
     `time.monotonic`, s), and `NotFinite` where the model does not follow them.
     """
-    system, length = project.system, project.spec.likelihood.window
+    system, length = project.system, project.window
     plant, table = as_machine(system).plant, system.parameters
     if not isinstance(plant, MuJoCo):
         return Selection({}, {})

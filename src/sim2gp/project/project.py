@@ -49,6 +49,8 @@ SYSTEMS = {
 }
 #: The system's name of a machine that was made in Python.
 IN_MEMORY = "in memory"
+#: Windows where nothing says how long they are, s.
+SHORT = 0.2
 MODEL_FILES = (".xml", ".mjcf", ".urdf")
 #: What other tools write before a model's file.
 _PREFIX = re.compile(r"(?i)^(mujoco|mjcf|mjx|urdf|xml)\s*:\s*")
@@ -65,7 +67,8 @@ class LogFile(NamedTuple):
 class Project:
     """A validated project file; ``budget`` is what reading one of its logs may take.
 
-    ``own`` is one whose machine, model or folder was given from Python.
+    ``own`` is one whose machine, model or folder was given from Python;
+    ``chosen_window`` (s) a length that a fit has chosen, where the file says none.
     """
 
     path: Path
@@ -74,6 +77,22 @@ class Project:
     system: "AbstractSystem"
     budget: Budget = field(default_factory=Budget)
     own: bool = False
+    chosen_window: float | None = None
+
+    @property
+    def window(self) -> float:
+        """Length of its windows in s: as stated, as chosen, or short."""
+        stated = self.spec.likelihood.window
+        return (self.chosen_window or SHORT) if stated is None else stated
+
+    @property
+    def chooses_window(self) -> bool:
+        """Whether a fit has yet to choose their length."""
+        return self.spec.likelihood.window is None and self.chosen_window is None
+
+    def with_window(self, seconds: float) -> "Project":
+        """The same with a length that a fit has chosen."""
+        return replace(self, chosen_window=seconds)
 
     @property
     def can_be_loaded(self) -> bool:

@@ -184,9 +184,10 @@ class ActuatorSpec(Section):
 class LikelihoodSpec(Section):
     """The windows of the fit: their length, their starts, and the noise."""
 
-    window: Annotated[FiniteFloat, Field(ge=0)] = 0.2
+    window: Annotated[FiniteFloat, Field(ge=0)] | None = None
     """Length in s: the simulator starts again after it. 0 predicts each row from the
-    one before, and needs every state measured."""
+    one before, and needs every state measured. Left out: 0.2, and then up to 5 as long
+    as the [misfit tests](misfit.md) find nothing."""
     start: Literal["smoothed", "causal"] = "smoothed"
     """Which samples give the first guess of a window's start: those around it, or only
     past ones, as in a forecast."""

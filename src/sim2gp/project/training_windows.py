@@ -17,42 +17,34 @@ MANY = 100_000
 
 
 def cut_logs(
-    project: Project, logs: Sequence[Log], times: float = 1.0
-) -> tuple[Windows, np.ndarray]:
-    """Training windows as `cut_places` makes them, and the log of each."""
-    windows, places = cut_places(project, logs, times)
-    return windows, places[:, 0]
-
-
-def cut_places(
-    project: Project, logs: Sequence[Log], times: float = 1.0
-) -> tuple[Windows, Int[np.ndarray, "W 2"]]:
-    """Training windows as the project states them, and log and first row of each.
-
-    Or so many ``times`` as long.
-    """
-    cuts = _cuts(project, logs, times)
-    return cuts.whole(), cuts.places
+    project: Project, logs: Sequence[Log]
+) -> tuple[Windows, Int[np.ndarray, " W"]]:
+    """Training windows as the project states them, and the log of each."""
+    cuts = _cuts(project, logs)
+    return cuts.whole(), cuts.places[:, 0]
 
 
 def cut_for_fit(
     project: Project, logs: Sequence[Log]
 ) -> tuple[Windows | Cuts, Int[np.ndarray, "W 2"]]:
-    """As `cut_places`; of so many rows that they are fitted in parts, as `Cuts`."""
+    """Training windows, and log and first row of each.
+
+    Of so many rows that they are fitted in parts, as `Cuts`.
+    """
     cuts = _cuts(project, logs)
     few = len(cuts) * cuts.length <= MANY
     whole = few or simulator_of(project.system) is not None
     return cuts.whole() if whole else cuts, cuts.places
 
 
-def _cuts(project: Project, logs: Sequence[Log], times: float = 1.0) -> Cuts:
+def _cuts(project: Project, logs: Sequence[Log]) -> Cuts:
     stated = project.spec.likelihood
     names = [channel.name for channel in project.system.physical_states]
     measured = [n for n in names if any(n in log.channels for log in logs)]
     return cuts_of(
         logs,
         project.system,
-        window=times * stated.window,
+        window=project.window,
         start_sd=_for_each_channel(stated.start_sd, names),
         floor=_for_each_channel(stated.noise_floor, measured),
         start=stated.start,

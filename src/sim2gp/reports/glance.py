@@ -87,9 +87,6 @@ def _next_command(summary: Summary) -> str:
     if open_:
         names = _first_names(open_)
         return f"sim2gp design RUN: an experiment that tells more of {names}."
-    longer = summary.get("longer") or {}
-    if longer.get("advised") and longer.get("text"):
-        return str(longer["text"])
     return (
         "sim2gp evaluate RUN --logs FILE: does it predict another recording? "
         "sim2gp export RUN writes simulators to train on."

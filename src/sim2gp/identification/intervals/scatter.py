@@ -50,19 +50,18 @@ covariance are those of the parameters alone, with the scatter that windows have
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from sim2gp import checks
 from sim2gp.identification.intervals.averaging import NONE, NOTHING, Groups, averaged
-from sim2gp.identification.intervals.pulls import Pulls
+from sim2gp.identification.intervals.pulls import Pulls, SharedStarts
 from sim2gp.identification.missing_physics.curves import Curve
-from sim2gp.identification.words import digits
 from sim2gp.inference.gaussian import Gaussian
 from sim2gp.inference.least_squares import RANK_TOLERANCE, over
 from sim2gp.types import AnyArray, in_float64
@@ -71,8 +70,8 @@ from sim2gp.types import AnyArray, in_float64
 FEWEST = 4.0
 #: Of Bartlett's weights: ``1.5 W / b`` degrees of freedom (Priestley 1981).
 BARTLETT = 1.5
-LIKE_WHITE = 1.3  # times as wide: small samples alone make so much of white noise
-MUCH = 3.0  # times as wide: a summary says why, wherever it names the interval
+#: Share of its covariance that a block's pull keeps at least in any direction.
+LEFT = 1e-3
 
 
 @dataclass(frozen=True)
@@ -131,16 +130,16 @@ def correct_posterior(
     _, s, Vt = np.linalg.svd(data, full_matrices=False)
     seen = ~(s <= RANK_TOLERANCE * s.max(initial=0.0))
     s, Vt = s[seen], Vt[seen]
-    v, P = _whitened(pulls, R)
+    unit, P = _whitened(pulls, R)
     onto = (Vt @ R.T) / s[:, None]  # from v to the coordinates in which F = I
     W = _effective(P)
-    b = _lag(v @ onto.T, W, pulls.group)
+    b = _lag(unit.scores @ onto.T, W, pulls.group)
     nu = min(W, BARTLETT * W / b)
     if len(s) == 0 or nu < FEWEST:
         return CorrectedFit(plain, math.nan, b, nu, False)
     columns = s[:, None] * Vt
     own = np.setdiff1d(np.arange(p), _places(groups or {}))
-    rows = _scatter(v, P, pulls.group, b) @ onto.T
+    rows = _scatter(unit, P, b) @ onto.T
     root, kappa2 = _shrink_apart(rows, columns[:, own], nu)
     _, size, U = np.linalg.svd(np.linalg.qr(root, mode="r"), full_matrices=False)
     spread = np.maximum(size, 1.0) * math.sqrt(nu / (nu - 2.0))
@@ -162,95 +161,6 @@ def posterior_of(prior: Gaussian, at: Float[AnyArray, " p"], pulls: Pulls) -> Ga
     return Gaussian(prior.at(jnp.asarray(z)), jnp.asarray(scale))
 
 
-def describe_intervals(
-    found: CorrectedFit, widened: Sequence[float], windows: int
-) -> str:
-    """Which intervals these are and why, in some sentences."""
-    if not found.enough:
-        return (
-            f"Intervals count every sample as new: {windows} windows are too few to "
-            "see whether errors are correlated in time, and of a real machine they are."
-        )
-    scatter, most = math.sqrt(found.inflation), max(widened, default=1.0)
-    lacks = found.missing > NOTHING
-    if most < LIKE_WHITE and not lacks:
-        return (
-            "Intervals were checked for errors that are correlated in time: those of "
-            f"{windows} windows pull the parameters {digits(scatter, 2)} times as far "
-            f"as white noise would, and intervals are at most {digits(most, 3)} times "
-            f"those of independent samples. {_missing_physics_remark(found)}"
-        )
-    text = f"Intervals are {_times(widened)} times as wide as if every sample were new"
-    if not lacks or scatter > LIKE_WHITE:
-        text += f": {_coloured(found, windows)}"
-    return f"{text}. {_missing_physics_remark(found)}"
-
-
-def explain_widening(
-    found: CorrectedFit, widened: Sequence[float], windows: int
-) -> str | None:
-    """In one sentence, where corrected and plain sd differ by more than `MUCH`.
-
-    The reasons are those that the correction has: samples that repeat each other, and
-    physics that is missing. None of them is a sum of the others.
-    """
-    if not found.enough or max(widened, default=1.0) <= MUCH:
-        return None
-    reasons = []
-    if math.sqrt(found.inflation) > LIKE_WHITE:
-        reasons.append(_coloured(found, windows))
-    if found.missing > NOTHING:
-        reasons.append(
-            "the simulator is missing physics with a probability of "
-            f"{_missing_percent(found)}, which the parameters make up for"
-        )
-    reason = ", and ".join(reasons) or "windows are few"
-    return (
-        f"The corrected intervals are {_times(widened)} times as wide as the plain "
-        f"ones: {reason}."
-    )
-
-
-def _times(widened: Sequence[float]) -> str:
-    ends = [digits(f(widened, default=1.0), 2) for f in (min, max)]
-    return ends[0] if ends[0] == ends[1] else " to ".join(ends)
-
-
-def _coloured(found: CorrectedFit, windows: int) -> str:
-    return (
-        f"the errors of {windows} windows are coloured and pull the parameters "
-        f"{digits(math.sqrt(found.inflation), 2)} times as far as white noise would"
-    )
-
-
-def _missing_percent(found: CorrectedFit) -> str:
-    if found.missing >= 0.995:
-        return "more than 99 %"
-    return (
-        f"{100.0 * found.missing:.0f} %" if found.missing >= 0.005 else "less than 1 %"
-    )
-
-
-def _missing_physics_remark(found: CorrectedFit) -> str:
-    """Whether physics that is missing is in the intervals."""
-    if not found.kinds:
-        return (
-            "This covers errors that come and go, not physics that the model lacks "
-            "(sim2gp explain)."
-        )
-    if found.missing > NOTHING:
-        return (
-            f"The model lacks physics with a probability of {_missing_percent(found)}: "
-            "intervals allow for forces on its joints and changes of its inputs, and "
-            "parameters lie where they would with them. sim2gp explain names them."
-        )
-    return (
-        "Intervals allow for forces that the model may be missing, which has a "
-        f"probability of {_missing_percent(found)}; they do not allow for other "
-        "physics."
-    )
-
-
 def _at_the_map(
     prior: Gaussian, at: Float[AnyArray, " p"], pulls: Pulls
 ) -> tuple[
@@ -270,11 +180,10 @@ def _at_the_map(
 
 def _whitened(
     pulls: Pulls, R: Float[np.ndarray, "p p"]
-) -> tuple[Float[np.ndarray, "W p"], Float[np.ndarray, "W p p"]]:
-    """``v_w`` and ``P_w``."""
-    v = np.linalg.solve(R.T, pulls.scores.T).T
-    C = np.linalg.solve(R.T, np.swapaxes(pulls.factors, 1, 2))
-    return v, C @ np.swapaxes(C, 1, 2)
+) -> tuple[Pulls, Float[np.ndarray, "W p p"]]:
+    """The pulls ``v_w``, whitened by the posterior, and their ``P_w``."""
+    whole = pulls.onto(over(np.eye(len(R)), R))
+    return whole, np.swapaxes(whole.factors, 1, 2) @ whole.factors
 
 
 def _effective(P: Float[np.ndarray, "W p p"]) -> float:
@@ -293,21 +202,58 @@ def _lag(y: Float[np.ndarray, "W q"], W: float, group: Int[np.ndarray, " W"]) ->
     return max(1, min(round(1.1447 * (alpha * W) ** (1 / 3)), int(W) // 4))
 
 
-def _scatter(
-    v: Float[np.ndarray, "W p"],
-    P: Float[np.ndarray, "W p p"],
-    group: Int[np.ndarray, " W"],
-    b: int,
-) -> Float[np.ndarray, "S p"]:
-    """Rows ``q_s / sqrt(b)`` of all runs of ``b`` windows, ends of recordings too."""
+def _scatter(pulls: Pulls, P: Float[np.ndarray, "W p p"], b: int) -> AnyArray:
+    """Rows ``q_s / sqrt(b)`` (S, p) of all runs of ``b`` pulls, ends of recordings too.
+
+    ``pulls`` are whitened (`_whitened`).
+    """
     found = []
-    for k in dict.fromkeys(group.tolist()):
-        own = group == k
-        runs = _running(v[own], b), _running(P[own], b)
-        left, Q = np.linalg.eigh(np.eye(v.shape[1]) - runs[1])
-        inner = np.einsum("sij,si->sj", Q, runs[0]) / np.sqrt(np.maximum(left, 1e-12))
+    for k in dict.fromkeys(pulls.group.tolist()):
+        own = pulls.group == k
+        size, Q = np.linalg.eigh(_running(P[own], b))
+        v = np.einsum("sij,si->sj", Q, _running(pulls.scores[own], b))
+        lost = _lost(pulls.starts, own, b)
+        inner = _as_wide(v, size, lost if lost is None else _turned(lost, Q))
         found.append(np.einsum("sij,sj->si", Q, inner) / math.sqrt(b))
     return np.concatenate(found)
+
+
+def _as_wide(
+    v: Float[np.ndarray, "S p"],
+    size: Float[np.ndarray, "S p"],
+    lost: Float[np.ndarray, "S p p"] | None,
+) -> Float[np.ndarray, "S p"]:
+    """``q_s`` where ``P_s`` is diagonal: with its covariance in place of ``K_s``."""
+    if lost is None:
+        return v / np.sqrt(np.maximum(1.0 - size, 1e-12))
+    seen = size > RANK_TOLERANCE
+    root = np.sqrt(np.where(seen, size, 1.0))
+    left = np.where(seen, 1.0 - size, 1.0)[..., None] * np.eye(size.shape[1])
+    both = root[:, :, None] * root[:, None, :]
+    left -= np.where(seen[:, :, None] & seen[:, None, :], lost / both, 0.0)
+    share, Q = np.linalg.eigh(left)
+    inner = np.einsum("sij,si->sj", Q, np.where(seen, v / root, 0.0))
+    inner /= np.sqrt(np.maximum(share, LEFT))
+    return root * np.einsum("sij,sj->si", Q, inner)
+
+
+def _lost(
+    starts: SharedStarts | None, own: Bool[np.ndarray, " W"], b: int
+) -> Float[np.ndarray, "S p p"] | None:
+    """``C_s`` of runs of ``b`` blocks: sums of ``D^T D``, a window's blocks as one."""
+    if starts is None:
+        return None
+    window, total = starts.window[own], 0.0
+    for w in np.unique(window):
+        D = _running(np.where((window == w)[:, None, None], starts.onto[own], 0.0), b)
+        total = total + np.swapaxes(D, 1, 2) @ D
+    return np.asarray(total)
+
+
+def _turned(
+    x: Float[np.ndarray, "S p p"], Q: Float[np.ndarray, "S p p"]
+) -> Float[np.ndarray, "S p p"]:
+    return np.asarray(np.swapaxes(Q, 1, 2) @ x @ Q)
 
 
 def _running(x: Float[np.ndarray, "W *p"], b: int) -> Float[np.ndarray, "S *p"]:

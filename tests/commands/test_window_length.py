@@ -1,0 +1,152 @@
+"""The length of windows: as long as no misfit test contradicts, and never at a loss."""
+
+import dataclasses
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from linear_system import linear
+from sim2gp.commands import window_length
+from sim2gp.commands.window_length import WindowFit, choose_window, lengths
+from sim2gp.data.logs import Log
+from sim2gp.errors import NotConverged
+from sim2gp.identification.fit import fit_windows
+from sim2gp.project import Project, load_project
+from sim2gp.project.training_windows import cut_for_fit
+
+RATE, NOISE = 10.0, 0.02  # Hz, m
+ROWS, KEY = 400, jax.random.key(0)
+PROJECT = """system = "two_link"
+[[logs]]
+files = ["x.csv"]
+columns = {q1 = "q", torque1 = 0.0, torque2 = 0.0}
+[likelihood]
+start_sd = 1.0
+"""
+
+
+def recording(drift: float = 0.0, rows: int = ROWS) -> Log:
+    """``x' = .7 a0 - .4 a1 + drift`` under held inputs, with white noise."""
+    rng = np.random.default_rng(7)
+    a = np.repeat(rng.standard_normal((rows // 4 + 1, 2)), 4, axis=0)[:rows]
+    x = np.cumsum(np.concatenate([[0.0], (a[:-1] @ [0.7, -0.4] + drift) / RATE]))
+    return Log(
+        name="log",
+        source="log.csv",
+        time=np.arange(rows) / RATE,
+        channels={"x0": x + NOISE * rng.standard_normal(rows)},
+        inputs={"a0": a[:, 0], "a1": a[:, 1]},
+        mask={"x0": np.ones(rows, bool)},
+    )
+
+
+def project_of(folder: Path, window: float | None = None) -> Project:
+    """A linear machine, whose file states the length of windows or does not."""
+    path = folder / "project.toml"
+    stated = "" if window is None else f"window = {window}\n"
+    path.write_text(PROJECT + stated)
+    return dataclasses.replace(load_project(path), system=linear(2, 1))
+
+
+def short_fit(project: Project, log: Log) -> WindowFit:
+    windows, places = cut_for_fit(project, [log])
+    fitted = fit_windows(project.system, windows, key=KEY)
+    return WindowFit(project, windows, places, fitted)
+
+
+def sd_of(fit: WindowFit) -> np.ndarray:
+    with jax.enable_x64(True):
+        return np.asarray(fit.fitted.posterior.sd())
+
+
+def dense_sd(log: Log, window: float) -> np.ndarray:
+    """Of the two constants by regression on them and on a start of each window."""
+    moved = np.stack([log.inputs["a0"], log.inputs["a1"]], axis=1)[:-1] / RATE
+    moved = np.concatenate([np.zeros((1, 2)), np.cumsum(moved, axis=0)])
+    which = (np.arange(len(moved)) / RATE / window + 1e-9).astype(int)
+    X = np.concatenate([moved, np.eye(which.max() + 1)[which]], axis=1)
+    precision = X.T @ X / NOISE**2 + np.diag([1.0, 1.0, *np.zeros(which.max() + 1)])
+    return np.sqrt(np.diag(np.linalg.inv(precision))[:2])
+
+
+def test_where_nothing_is_missing_they_are_as_long_as_they_may(tmp_path: Path) -> None:
+    log = recording()
+    short = short_fit(project_of(tmp_path), log)
+    found = choose_window(short, [log], key=KEY)
+    assert found.fit.project.window == 5.0
+    assert not found.misfit.alarm
+    entry = found.as_dict()
+    assert (entry["seconds"], entry["chosen"]) == (5.0, True)
+    sd = sd_of(found.fit)
+    # The noise is estimated, so to some percent.
+    np.testing.assert_allclose(sd, dense_sd(log, 5.0), rtol=0.1)
+    assert np.max(sd / sd_of(short)) < 0.4
+    # The fit is that of a project which states the length.
+    stated = short_fit(project_of(tmp_path, 5.0), log)
+    means = (x.fitted.posterior.mean for x in (found.fit, stated))
+    np.testing.assert_allclose(*means, rtol=0.0, atol=1e-4 * sd.min())
+
+
+def test_physics_too_slow_for_short_ones_keeps_them_shorter(tmp_path: Path) -> None:
+    log = recording(drift=0.02)
+    found = choose_window(short_fit(project_of(tmp_path), log), [log], key=KEY)
+    assert found.fit.project.window < 5.0
+    assert not found.misfit.alarm
+    longer = short_fit(project_of(tmp_path, 5.0), log)
+    assert longer.misfit().alarm
+
+
+def test_what_contradicts_the_simulator_already_stays(tmp_path: Path) -> None:
+    log = recording(drift=0.5)
+    short = short_fit(project_of(tmp_path), log)
+    assert short.misfit().alarm
+    found = choose_window(short, [log], key=KEY)
+    assert found.fit.fitted is short.fitted
+    assert found.as_dict()["chosen"]
+    assert "already" in found.why
+
+
+@pytest.mark.parametrize(("window", "said"), [(0.2, True), (20.0, False)])
+def test_a_stated_length_stays(tmp_path: Path, window: float, said: bool) -> None:
+    log = recording()
+    short = short_fit(project_of(tmp_path, window), log)
+    found = choose_window(short, [log], key=KEY)
+    assert found.fit is short
+    assert found.as_dict()["chosen"] is False
+    assert bool(found.why) is said
+
+
+def test_longer_windows_that_cannot_be_fitted_are_not_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = recording()
+    short = short_fit(project_of(tmp_path), log)
+
+    def fails(*given: object, **how: object) -> None:
+        raise NotConverged("E201", where="here", what="lost", got="", expected="")
+
+    monkeypatch.setattr(window_length, "fit_windows", fails)
+    found = choose_window(short, [log], key=KEY)
+    assert found.fit.fitted is short.fitted
+    assert "E201" in found.why
+
+
+@pytest.mark.parametrize(
+    ("seconds", "expected"),
+    [
+        (0.3, []),
+        (1.0, [0.5]),
+        (1.6, [0.8]),
+        (3.0, [1.0, 1.5]),
+        (10.0, [1.0, 5.0]),
+        (12.0, [1.0, 4.0]),
+        (60.0, [1.0, 5.0]),
+    ],
+)
+def test_lengths_are_even_parts_of_the_longest_log(
+    seconds: float, expected: list[float]
+) -> None:
+    logs = [recording(rows=round(x * RATE)) for x in (0.5 * seconds, seconds)]
+    assert lengths(logs) == expected
