@@ -38,6 +38,7 @@ class Condition(NamedTuple):
     friction: float = 0.0  # N m of dry friction in both joints
     width: float = WIDTH  # rad/s, of its tanh; the library's effect has that of WIDTH
     cogging: float = 0.0  # N m in both joints: no library has it
+    noise: float = NOISE  # rad
     mujoco: bool = False  # whether the arm is a MuJoCo model (`interval_mujoco.py`)
 
     def system(self) -> AbstractSystem:
@@ -47,6 +48,7 @@ class Condition(NamedTuple):
 
 CONDITIONS = {
     "white": Condition("white noise"),
+    "noisy": Condition("white noise of 20 mrad", noise=0.02),
     "ar80": Condition("AR(1) noise, .8", rho=0.8),
     "ar95": Condition("AR(1) noise, .95", rho=0.95),
     "friction1": Condition("dry friction, 1 mN m", friction=0.001),
@@ -102,7 +104,7 @@ def recordings(condition: Condition, sets: int, chunk: int) -> Recordings:
         states = motion_of(values, torque, condition)
     white = rng.standard_normal((len(torque), sets, 2))
     noise = coloured(white, condition.rho)
-    return Recordings(truth, torque, states[..., :2] + NOISE * noise)
+    return Recordings(truth, torque, states[..., :2] + condition.noise * noise)
 
 
 def physical(truth: np.ndarray) -> np.ndarray:

@@ -31,7 +31,6 @@ from coverage95 import Z, binomial_interval
 from interval_arms import (
     CONDITIONS,
     NAMES,
-    NOISE,
     Recordings,
     recordings,
     with_what_is_missing,
@@ -137,7 +136,7 @@ def work(job: Job) -> dict[str, Any]:
                 np.asarray(v)[: len(NAMES)] / prior_sd for v in (best.mean, best.sd())
             )
         else:
-            each["oracle"] = candidates.oracle(x, condition.rho, NOISE)
+            each["oracle"] = candidates.oracle(x, condition.rho, condition.noise)
         for name, (centre, sd) in each.items():
             error = np.asarray(centre) - data.truth[s] / prior_sd
             found[name].append([_rounded(error), _rounded(np.asarray(sd))])

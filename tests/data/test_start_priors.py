@@ -6,7 +6,9 @@ import jax
 import numpy as np
 import pytest
 
-from sim2gp.data.split_log import cut
+from linear_system import linear
+from sim2gp.data.logs import Log
+from sim2gp.data.split_log import cut, roughness
 from sim2gp.identification.fit import fit_windows
 from sim2gp.project import load_project
 from sim2gp.types import in_float64
@@ -91,3 +93,23 @@ def test_guessed_starts_do_not_pull_at_the_parameters(tmp_path: Path) -> None:
     moved = np.asarray(guessed.mean - free.mean) / np.asarray(free.sd())
     assert np.abs(moved).max() < 0.15
     np.testing.assert_allclose(guessed.sd(), free.sd(), rtol=0.02)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_the_start_of_a_noisy_sensor_is_as_uncertain_as_its_rows(noise: float) -> None:
+    """Of white noise its sd, to some percent; a step of 1e-3 alone counts 100 times."""
+    rng, rows = np.random.default_rng(5), 4000
+    x = np.sin(0.02 * np.arange(rows)) + noise * rng.standard_normal(rows)
+    log = Log(
+        name="log",
+        source="log.csv",
+        time=0.01 * np.arange(rows),
+        channels={"x0": 1e-3 * np.round(1e3 * x)},
+        inputs={"a0": np.zeros(rows), "a1": np.zeros(rows)},
+        mask={"x0": rng.random(rows) < 0.9},
+    )
+    assert roughness([log], "x0") == pytest.approx(noise, rel=0.05, abs=5e-4)
+    windows, _ = cut([log], linear(2, 1), window=1.0)
+    sd = np.unique(np.asarray(windows.start_sd))
+    expected = max(100.0 * 1e-3 / np.sqrt(12.0), 3.0 * noise)
+    np.testing.assert_allclose(sd, expected, rtol=0.05)

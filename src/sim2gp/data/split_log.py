@@ -31,6 +31,7 @@ SPACING = 0.1  # s, between the starts of forecasts
 #: prior pulls at the parameters: of shorter windows, as there are more of them, it is
 #: wider, and a second of log has the same share of pulls.
 FAR, LONG = 3.0, 2.0
+NOISES = 3.0  # of a measured state's start: so many times the noise of a row
 SORTED = 10**6  # values of a channel whose distances are looked at
 Start = Literal["smoothed", "causal"]
 
@@ -177,7 +178,9 @@ def _guessed_starts(
     far = FAR * math.sqrt(max(LONG / window, 1.0))
     spread = far * np.minimum(np.sqrt(np.mean(x0**2, axis=0)), doubt)
     for name, step in zip(measured, quantum, strict=True):
-        spread[names.index(name)] = 100.0 * step
+        # Of a noisy sensor the guess is as wrong as a row is.
+        noise = NOISES * roughness(logs, name)
+        spread[names.index(name)] = max(100.0 * step, noise)
     spread = np.where(spread > 0.0, spread, 1.0)
     return x0, np.broadcast_to(spread, x0.shape)
 
@@ -268,6 +271,23 @@ def start_of(
     known = dict(zip(measured, value, strict=True))
     rates = {f"{name}.velocity": s for name, s in zip(measured, slope, strict=True)}
     return np.asarray([known.get(name, rates.get(name, 0.0)) for name in names])
+
+
+def roughness(logs: Sequence[Log], name: str) -> float:
+    """An upper bound of a channel's noise: the rms of its second differences / sqrt(6).
+
+    Of white noise it is the sd; what bends within two periods adds to it.
+    """
+    found = [np.zeros(0)]
+    for log in logs:
+        if name in log.channels:
+            i = np.arange(1, len(log) - 1, max(1, len(log) // SORTED))
+            y, seen = log.channels[name], log.mask[name]
+            valid = seen[i - 1] & seen[i] & seen[i + 1]
+            i = i[valid]
+            found.append(y[i - 1] - 2.0 * y[i] + y[i + 1])
+    bent = np.concatenate(found)
+    return float(np.sqrt(np.mean(bent**2) / 6.0)) if len(bent) else 0.0
 
 
 def resolution(logs: Sequence[Log], name: str) -> float:
