@@ -36,7 +36,7 @@ from interval_arms import (
     with_what_is_missing,
 )
 from interval_sysid import intervals
-from sim2gp.commands.window_length import WindowFit, choose_window
+from sim2gp.commands.window_length import fit_chosen_windows
 from sim2gp.data.logs import Log
 from sim2gp.data.split_log import cut
 from sim2gp.data.windows import Windows
@@ -50,7 +50,6 @@ from sim2gp.identification.misfit.residuals import misfit_of_windows
 from sim2gp.identification.missing_physics.at_zero import at_zero
 from sim2gp.inference.estimate import Estimate
 from sim2gp.project.in_memory import project_of_machine
-from sim2gp.project.training_windows import cut_for_fit
 from sim2gp.runs.cells import Cells, add_options
 from sim2gp.runs.executors import Processes, cores
 from sim2gp.systems import AbstractSystem, UniformRodArm
@@ -177,10 +176,7 @@ def _fitted(
 
 def _chosen(system: AbstractSystem, log: Log, key: Any) -> tuple[Any, ...]:
     """The length of windows that `identify` chooses, and what `_fitted` returns."""
-    project = project_of_machine(system)
-    windows, places = cut_for_fit(project, [log])
-    short = WindowFit(project, windows, places, fit_windows(system, windows, key=key))
-    fit = choose_window(short, [log], key=key).fit
+    fit = fit_chosen_windows(project_of_machine(system), [log], key=key)
     likelihood = WindowsLikelihood(system, fit.windows)
     return fit.project.window, likelihood, fit.fitted, fit.places[:, 0]
 

@@ -38,14 +38,8 @@ from interval_arms import (
 )
 from sim2gp.commands import bench
 from sim2gp.commands.bench import Job
-from sim2gp.commands.bench_jobs import (
-    HORIZON,
-    ROWS,
-    SAMPLES,
-    Pair,
-    plan,
-    random_rows,
-)
+from sim2gp.commands.bench_jobs import HORIZON, ROWS, SAMPLES, Pair, plan, random_rows
+from sim2gp.commands.window_length import fit_chosen_windows
 from sim2gp.data.split_log import cut
 from sim2gp.data.transitions import Transitions
 from sim2gp.data.windows import Windows
@@ -54,6 +48,7 @@ from sim2gp.models import Sim2GP
 from sim2gp.planning import SAC
 from sim2gp.planning.episode import oracle_world
 from sim2gp.planning.tasks import Task, cartpole_swingup, furuta_swingup
+from sim2gp.project.in_memory import project_of_machine
 from sim2gp.systems import CartPole, Furuta, UniformRodArm
 from sim2gp.types import in_float64
 
@@ -259,11 +254,11 @@ def arm_recordings(seed: int) -> tuple[Recordings, np.ndarray]:
     return Recordings(virtual, torque, angles + noise), angles
 
 
-def arm_windows(data: Recordings, at_rest: bool, window: float = SECONDS) -> Windows:
-    """Ten seconds, as one window or several; mujoco.sysid knows that it is at rest."""
+def arm_windows(data: Recordings, at_rest: bool) -> Windows:
+    """Ten seconds in one window; mujoco.sysid knows that it begins at rest."""
     system = UniformRodArm()
     known = {channel.name: REST for channel in system.states} if at_rest else None
-    windows, _ = cut([data.log(0)], system, window=window, start_sd=known)
+    windows, _ = cut([data.log(0)], system, window=SECONDS, start_sd=known)
     if at_rest:
         start = np.zeros_like(windows.start)
         windows = eqx.tree_at(lambda w: w.start, windows, start)
@@ -275,7 +270,7 @@ def arm_errors() -> dict[str, float]:
     """Root mean square error of the motion that each fit predicts; median of arms, rad.
 
     ``start_unknown`` is this library where it is not given that the arm begins at rest,
-    ``short_windows`` the same in windows of .2 s, the default.
+    ``default`` the same in the windows that `identify` chooses.
     """
     from interval_sysid import intervals
 
@@ -283,12 +278,12 @@ def arm_errors() -> dict[str, float]:
     errors: dict[str, list[float]] = {}
     for seed in range(ARMS):
         data, truth = arm_recordings(seed)
-        found = {}
-        lengths = {"ours": SECONDS, "start_unknown": SECONDS, "short_windows": 0.2}
-        for name, window in lengths.items():
-            windows = arm_windows(data, at_rest=name == "ours", window=window)
-            fitted = fit_windows(system, windows, key=jax.random.key(0))
-            found[name] = np.asarray(fitted.posterior.mean)
+        project, key = project_of_machine(system), jax.random.key(0)
+        fits = {"default": fit_chosen_windows(project, [data.log(0)], key=key).fitted}
+        for name in ("ours", "start_unknown"):
+            windows = arm_windows(data, at_rest=name == "ours")
+            fits[name] = fit_windows(system, windows, key=key)
+        found = {name: np.asarray(x.posterior.mean) for name, x in fits.items()}
         with contextlib.redirect_stdout(None):
             found["theirs"] = intervals(data, 0, system.parameters)[0] * sd
         for name, virtual in found.items():

@@ -106,15 +106,20 @@ def choose_window(
     return WindowLength(best, misfit, _words(best, "the misfit tests find nothing"))
 
 
-def chosen_window(project: Project, logs: Sequence[Log], *, key: Key) -> Project:
-    """The project with windows as `identify` chooses them for these logs."""
-    if not project.chooses_window:
-        return project
+def fit_chosen_windows(project: Project, logs: Sequence[Log], *, key: Key) -> WindowFit:
+    """The fit of `identify`: of windows as the project states or as it chooses them."""
     windows, places = cut_for_fit(project, logs)
     robust = project.spec.likelihood.robust
     fitted = fit_windows(project.system, windows, key=key, robust=robust)
     short = WindowFit(project, windows, places, fitted)
-    return choose_window(short, logs, key=key).fit.project
+    return choose_window(short, logs, key=key).fit
+
+
+def chosen_window(project: Project, logs: Sequence[Log], *, key: Key) -> Project:
+    """The project with windows as `identify` chooses them for these logs."""
+    if not project.chooses_window:
+        return project
+    return fit_chosen_windows(project, logs, key=key).project
 
 
 def lengths(logs: Sequence[Log]) -> list[float]:

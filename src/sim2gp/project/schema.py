@@ -195,9 +195,9 @@ class LikelihoodSpec(Section):
     """Windows that do not fit count less (Student-t, 4 degrees of freedom): for pushes
     and collisions."""
     start_sd: Positive | dict[str, Positive] | None = None
-    """Sd of the start about that guess, by channel or for all. By default, of a measured
-    state, 100 sensor steps, or 3 times the noise if that is more; of others 3 times the
-    error of the guess, more in windows below 2 s."""
+    """Sd of the start about that guess, by channel or for all. By default 100 sensor
+    steps of a measured state, or 3 times its noise if that is more; of others 3 times
+    the error of the guess, more in windows below 2 s."""
     noise_floor: Positive | dict[str, Positive] | None = None
     """The smallest noise sd, by channel or for all; by default the sensor's step, which
     is read from the log."""
