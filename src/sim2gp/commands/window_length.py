@@ -1,10 +1,11 @@
-"""How long windows are, where a project does not say: as long as nothing contradicts.
+"""How long windows are, where a project does not say: until the misfit tests speak.
 
 Each window begins at an unknown start, which uses up much of the information of a short
-window. A longer window leaves more for the parameters, but the simulator must be right
-for longer, and an unstable one must not leave its recording. So the first fit has short
-windows. While the misfit tests find nothing, longer ones are fitted from there
-(`benchmarks/intervals.py`, docs/intervals.md).
+window. A longer window leaves more for the parameters, and shows physics that is
+missing: where it shows, intervals allow for it. But an unstable simulator leaves its
+recording, and then tells nothing. So the first fit has short windows. While the misfit
+tests find nothing, longer ones are fitted from there, as long as the simulator follows
+its recordings (`benchmarks/intervals.py`, docs/intervals.md).
 """
 
 import math
@@ -31,6 +32,8 @@ from sim2gp.types import Key, in_float64
 
 #: Lengths that are tried after the short one, s; none is more than half a log.
 LENGTHS = (1.0, 5.0)
+#: Times the noise of shorter windows: a simulator with more does not follow for longer.
+LOST = 2.0
 _STATED = (
     "The misfit tests find nothing. Without likelihood.window in the project file, "
     "identify also tries longer windows, which may narrow the intervals."
@@ -73,10 +76,10 @@ def choose_window(
     key: Key,
     task: Task | None = None,
 ) -> WindowLength:
-    """The longest windows that no misfit test contradicts, from a fit of short ones.
+    """From a fit of short windows the first length at which misfit tests speak.
 
-    Windows of a stated length stay as they are, and so do those that contradict the
-    simulator, and very many.
+    The longest where they never do, or where the simulator cannot follow for longer.
+    Windows of a stated length stay as they are, and so do very many.
     """
     project, misfit = short.project, short.misfit()
     if not project.chooses_window:
@@ -85,25 +88,25 @@ def choose_window(
             short, misfit, _STATED if could and not misfit.alarm else ""
         )
     best = short._replace(project=project.with_window(project.window))
-    if misfit.alarm:
-        return WindowLength(
-            best, misfit, _words(best, "contradict the simulator already")
-        )
     if isinstance(short.windows, Cuts):
-        return WindowLength(best, misfit, _words(best, "of so many rows know enough"))
+        return WindowLength(best, misfit, _words(best, "so many rows know enough"))
     for seconds in lengths(logs):
+        if misfit.alarm:
+            break
         if task is not None:
             task.advance(f"windows of {seconds:g} s", 0)
         try:
             longer = _fit_longer(best, logs, seconds, key)
             found = longer.misfit()
         except (InputError, NotConverged, NotFinite, DeadParameters) as error:
-            why = f"longer ones, of {seconds:g} s, cannot be fitted ({error})"
+            why = f"those of {seconds:g} s cannot be fitted ({error})"
             return WindowLength(best, misfit, _words(best, why))
-        if found.alarm:
-            return WindowLength(best, misfit, _words(best, _too_slow(seconds)))
+        if not _follows(longer.fitted, best.fitted):
+            why = f"for {seconds:g} s the simulator does not follow its recordings"
+            return WindowLength(best, misfit, _words(best, why))
         best, misfit = longer, found
-    return WindowLength(best, misfit, _words(best, "the misfit tests find nothing"))
+    why = "find something in these" if misfit.alarm else "find nothing"
+    return WindowLength(best, misfit, _words(best, f"the misfit tests {why}"))
 
 
 def fit_chosen_windows(project: Project, logs: Sequence[Log], *, key: Key) -> WindowFit:
@@ -150,9 +153,6 @@ def _words(best: WindowFit, why: str) -> str:
     return f"Windows are {best.project.window:g} s long: {why}."
 
 
-def _too_slow(seconds: float) -> str:
-    return (
-        f"in those of {seconds:g} s the misfit tests find something, physics that is "
-        "missing or coloured noise, too slow to show in these. To look for it write "
-        f"likelihood.window = {seconds:g}, run identify, and sim2gp explain on its run"
-    )
+def _follows(longer: Estimate, shorter: Estimate) -> bool:
+    noise = (np.asarray(fit.noise.sd) for fit in (longer, shorter))
+    return bool(np.all(next(noise) <= LOST * next(noise)))

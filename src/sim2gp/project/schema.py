@@ -186,8 +186,8 @@ class LikelihoodSpec(Section):
 
     window: Annotated[FiniteFloat, Field(ge=0)] | None = None
     """Length in s: the simulator starts again after it. 0 predicts each row from the
-    one before, and needs every state measured. Left out: 0.2, and then up to 5 as long
-    as the [misfit tests](misfit.md) find nothing."""
+    one before, and needs every state measured. Left out: 0.2, and then up to 5 while
+    the [misfit tests](misfit.md) find nothing."""
     start: Literal["smoothed", "causal"] = "smoothed"
     """Which samples give the first guess of a window's start: those around it, or only
     past ones, as in a forecast."""
