@@ -16,10 +16,16 @@ windows,
     G = 1/b sum_s R^T q_s q_s^T R,       q_s = (I - P_s)^-1/2 v_s,       E G = F,
 
 exactly: it is the Bartlett (Newey-West) estimate of the covariance of the whole score,
-without its bias of small samples. ``b`` follows from how alike successive pulls are
-(Andrews 1991, with one correlation for all directions). In the coordinates in which
-``F = I`` the eigenvalues ``lambda`` of G say how many samples count as one. A window
-more or less matters to a matrix, so G is drawn towards one number for all directions,
+without its bias of small samples. Blocks of a window share the start that was
+eliminated (`SharedStarts`). With ``D_w`` of a window added up over its blocks in ``s``
+and ``C_s`` the sum of ``R^-T D_w^T D_w R^-1``, theirs has ``P_s - P_s^2 - C_s``, and
+
+    q_s = P_s^1/2 (I - P_s - P_s^-1/2 C_s P_s^-1/2)^-1/2 P_s^-1/2 v_s.
+
+``b`` follows from how alike successive pulls are (Andrews 1991, with one correlation
+for all directions). In the coordinates in which ``F = I`` the eigenvalues ``lambda`` of
+G say how many samples count as one. A window more or less matters to a matrix, so G is
+drawn towards one number for all directions,
 
     G <- (nu G + k kappa^2 F) / (nu + k),   kappa^2 = tr(F^-1 G) / p,   k = p (p + 1),
 
@@ -223,7 +229,7 @@ def _as_wide(
     size: Float[np.ndarray, "S p"],
     lost: Float[np.ndarray, "S p p"] | None,
 ) -> Float[np.ndarray, "S p"]:
-    """``q_s`` where ``P_s`` is diagonal: with its covariance in place of ``K_s``."""
+    """``q_s`` in coordinates in which ``P_s`` is diagonal, ``lost`` being ``C_s``."""
     if lost is None:
         return v / np.sqrt(np.maximum(1.0 - size, 1e-12))
     seen = size > RANK_TOLERANCE
