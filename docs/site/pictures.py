@@ -33,7 +33,7 @@ GRID = {"color": "#d0d7de", "lw": 0.6}
 METHODS = [
     ("plain", "plain", "#8b949e"),
     ("scatter", "corrected for noise alone", "#56b4e9"),
-    ("corrected", "corrected (reported)", "#0072b2"),
+    ("chosen", "corrected (reported)", "#0072b2"),
     ("oracle", "oracle", "#1b1f24"),
     ("sysid", "mujoco.sysid", "#d55e00"),
 ]
