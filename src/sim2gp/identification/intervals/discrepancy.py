@@ -45,7 +45,7 @@ from sim2gp.types import in_float64
 
 #: Sine of the angle to the parameters' span below which a force is one of them in
 #: another shape; and of what has no effect at all, next to the largest of its group.
-DISGUISE, NO_EFFECT = 0.03, 1e-6
+DISGUISE, NO_EFFECT = 0.05, 1e-6
 TRUSTED = 1.0  # nats that a centre may cost beyond what the linear misfit says
 GAIN = 0.5  # of a gain that the linear misfit predicts: what may fail to come
 HALVINGS = 6
