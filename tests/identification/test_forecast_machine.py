@@ -64,9 +64,8 @@ def arm(condition: str) -> Arm:
     recording = np.zeros(len(windows), int)
     fit = at_zero(WindowsLikelihood(system, windows), fitted, recording)
     machine = fit_forecast_machine(fit, recording)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(interval_arms, "NOISE", 1e-5)
-        clean = interval_arms.recordings(CONDITIONS[condition], 2, 0).log(0)
+    exact = CONDITIONS[condition]._replace(noise=1e-5)
+    clean = interval_arms.recordings(exact, 2, 0).log(0)
     grid = evaluation_windows([clean], system, longest=1.0)
     plain = ForecastMachine(system, fitted.posterior)
     return Arm(plain, machine, subset(grid, grid.since > UNTIL))
