@@ -34,6 +34,10 @@ from sim2gp.types import Key, in_float64
 LENGTHS = (1.0, 5.0)
 #: Times the noise of shorter windows: a simulator with more does not follow for longer.
 LOST = 2.0
+_MANY = (
+    "of so many rows longer ones are not tried; write likelihood.window = 1 or 5 in "
+    "the project file if the simulator follows its recordings for so long"
+)
 _STATED = (
     "The misfit tests find nothing. Without likelihood.window in the project file, "
     "identify also tries longer windows, which may narrow the intervals."
@@ -89,7 +93,7 @@ def choose_window(
         )
     best = short._replace(project=project.with_window(project.window))
     if isinstance(short.windows, Cuts):
-        return WindowLength(best, misfit, _words(best, "so many rows know enough"))
+        return WindowLength(best, misfit, _words(best, _MANY))
     for seconds in lengths(logs):
         if misfit.alarm:
             break
