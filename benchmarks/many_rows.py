@@ -4,10 +4,10 @@
 
 Recordings of 20 s at 100 Hz of one two-link arm, each under its own torques
 (`interval_arms.py`), in memory, in windows of .2 s; forecasts and intervals are the
-defaults, without a held-out fit. Each size is a process of its own that finds nothing compiled.
-Memory is the largest that it had, where glibc gives back what is free (`GIVE_BACK`).
-Of ``--compare`` rows the posterior is also computed with all windows at once, and the
-largest difference reported: of means in sd, of sd as a share.
+defaults, without a held-out fit. Each size is a process of its own that finds nothing
+compiled. Memory is the largest that it had, where glibc gives back what is free
+(`GIVE_BACK`). Of ``--compare`` rows the posterior is also computed with all windows at
+once, and the largest difference reported: of means in sd, of sd as a share.
 """
 
 import argparse
