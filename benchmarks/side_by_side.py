@@ -254,8 +254,8 @@ def arm_recordings(seed: int) -> tuple[Recordings, np.ndarray]:
     return Recordings(virtual, torque, angles + noise), angles
 
 
-def arm_windows(data: Recordings, at_rest: bool) -> Windows:
-    """Ten seconds in one window; mujoco.sysid knows that it begins at rest."""
+def arm_windows(data: Recordings, *, at_rest: bool) -> Windows:
+    """All ten seconds as one window; mujoco.sysid is given that it begins at rest."""
     system = UniformRodArm()
     known = {channel.name: REST for channel in system.states} if at_rest else None
     windows, _ = cut([data.log(0)], system, window=SECONDS, start_sd=known)

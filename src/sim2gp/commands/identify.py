@@ -42,10 +42,9 @@ def identify(
     ``seed`` draws the starts of the fit. ``check`` holds Laplace's posterior against
     the exact one by importance sampling, ``nuts`` against draws of it (E135 without the
     extra ``mcmc``); ``held_out`` fits once more without some of the data, and forecasts
-    those. Where a fit takes its time, ``first``
-    gets a first answer, and what a failed one knows; it returns what to say.
-    Raises `InputError` for logs that do not fit the machine, `NotConverged` E201,
-    `DeadParameters` E146.
+    those. Where a fit takes its time, ``first`` gets a first answer, and what a failed
+    one knows; it returns what to say. Raises `InputError` for logs that do not fit the
+    machine, `NotConverged` E201, `DeadParameters` E146.
     """
     started = time.perf_counter()
     progress = progress or Progress()
@@ -59,9 +58,7 @@ def identify(
         task.advance(f"{len(windows)} windows")
         key, robust = jax.random.key(seed), project.spec.likelihood.robust
         grid = evaluation_windows(logs, project.system, longest=CURVE[-1])
-        _compile_forecast(project.system, grid)
-        if not project.chooses_window:
-            _compile_intervals(project.system, windows)
+        _compile(project, grid, windows)
         progress.say(_sizes(project, logs, windows))
         watch = FirstAnswer(project, logs, task, first)
         with watch.of_failures():
@@ -74,8 +71,6 @@ def identify(
 
         short = WindowFit(project, windows, places, fitted)
         chosen = choose_window(short, logs, key=key, task=task)
-        if project.chooses_window:
-            _compile_intervals(project.system, chosen.fit.windows)
         task.advance("posterior")
         summary, arrays = results.identification_results(
             chosen, logs, grid, seed, held_out
@@ -98,17 +93,17 @@ def _sizes(project: Project, logs: Sequence[Log], windows: Windows | Cuts) -> st
     return "\n".join([sizes, *clock_lines(logs, project.system), *still])
 
 
-def _compile_forecast(system: AbstractSystem, grid: Grid) -> None:
-    """Begin to compile what follows the fit, where JAX moves the machine."""
-    if simulator_of(system) is None:
-        from sim2gp.identification.forecasts.forecast import compile_forecast
+def _compile(project: Project, grid: Grid, windows: Windows | Cuts) -> None:
+    """Begin to compile what follows the fit, where JAX moves the machine.
 
-        compile_forecast(system, grid)
+    What asks for windows only if they stay as long as they are.
+    """
+    system = project.system
+    if simulator_of(system) is not None:
+        return
+    from sim2gp.identification.forecasts.forecast import compile_forecast
+    from sim2gp.identification.intervals.discrepancy import compile_corrected
 
-
-def _compile_intervals(system: AbstractSystem, windows: Windows | Cuts) -> None:
-    """The same, of windows that stay as long as they are."""
-    if simulator_of(system) is None:
-        from sim2gp.identification.intervals.discrepancy import compile_corrected
-
+    compile_forecast(system, grid)
+    if not project.chooses_window:
         compile_corrected(system, windows)

@@ -91,8 +91,7 @@ def parameter_section(summary: Summary) -> Section:
     columns = ["parameter", "unit", "prior", "posterior", "95 % interval"]
     columns += ["spread left", *(["truth"] if truth else []), "verdict"]
     rows = [_parameter_row(name, entry, truth) for name, entry in entries.items()]
-    # Which intervals these are; how long windows are; what --check and
-    # --nuts found.
+    # Which intervals these are; how long windows are; what --check and --nuts found.
     about = [summary.get(key) for key in ("intervals", "window", "check", "nuts")]
     return {
         "said": [x.get("text") for x in about if isinstance(x, Mapping)],

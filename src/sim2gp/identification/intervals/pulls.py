@@ -211,7 +211,10 @@ def _whitened_rows(
 def _whole(
     rows: Float[np.ndarray, "w r k"], n: int, first: Int[np.ndarray, " w"]
 ) -> WindowRows:
-    """Windows without their starts, the first ``n`` columns."""
+    """Windows without their starts, the first ``n`` columns.
+
+    A triangle has ``n`` rows fewer than a window: of very many short ones it matters.
+    """
     if not np.isfinite(rows).all():
         return _nothing(rows, n, first)
     factors = np.asarray(np.linalg.qr(rows, mode="r"))[:, n:, n:]
