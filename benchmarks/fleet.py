@@ -69,7 +69,7 @@ class FleetCell(AbstractCell):
         project, logs = project_and_logs(system, [data.log(r) for r in range(ARMS)])
         machines = {f"arm{r:02d}": (log,) for r, log in enumerate(logs)}
         quiet = Progress(quiet=True)
-        fleet, alone, moved = fit_machines(project, machines, progress=quiet)
+        used, fleet, alone, moved = fit_machines(project, machines, progress=quiet)
         low, high = np.quantile(fleet.spread, (0.025, 0.975), axis=0)
         pairs = zip(fleet.machines, arms, strict=False)
         widths = [
@@ -83,6 +83,7 @@ class FleetCell(AbstractCell):
             "spread": ((low <= SPREAD) & (high >= SPREAD)).tolist(),
             "spread_high": high.tolist(),
             "widths": np.median(widths, axis=0).tolist(),
+            "window": used.window,
             "agreement": fleet.agreement,
             "moved": moved,
         }

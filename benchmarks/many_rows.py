@@ -3,7 +3,7 @@
     python benchmarks/many_rows.py [--rows N ...] [--compare N] [--out DIR]
 
 Recordings of 20 s at 100 Hz of one two-link arm, each under its own torques
-(`interval_arms.py`), in memory, in windows of .2 s; forecasts and intervals are the
+(`interval_arms.py`), in memory; the windows' length, forecasts and intervals are the
 defaults, without a held-out fit. Each size is a process of its own that finds nothing
 compiled. Memory is the largest that it had, where glibc gives back what is free
 (`GIVE_BACK`). Of ``--compare`` rows the posterior is also computed with all windows at
@@ -33,7 +33,6 @@ from interval_arms import (
 )
 from sim2gp.data.logs import Log
 
-WINDOW = 0.2  # s
 ROOT = Path(__file__).resolve().parents[1]
 #: Of glibc: large arrays are given back when they are freed, not kept for others.
 GIVE_BACK = {"MALLOC_MMAP_THRESHOLD_": "131072", "MALLOC_ARENA_MAX": "2"}
@@ -69,14 +68,12 @@ def identified(rows: int, *, at_once: bool = False) -> dict[str, Any]:
     """Seconds, memory in MiB, and the posterior; ``at_once``: never in parts."""
     import sim2gp as sg
     from sim2gp.project import training_windows
-    from sim2gp.project.in_memory import project_of_machine
 
     if at_once:
         training_windows.MANY = sys.maxsize
     truth, logs = logs_of(rows)
     arm, started = sg.systems.UniformRodArm(), time.perf_counter()
-    project = project_of_machine(arm, likelihood={"window": WINDOW})
-    found = sg.identify(project, logs, held_out=False)
+    found = sg.identify(arm, logs, held_out=False)
     seconds = time.perf_counter() - started
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     plain = {name: np.asarray(found.arrays[f"belief/{name}"]) for name in _KEPT}
@@ -85,6 +82,7 @@ def identified(rows: int, *, at_once: bool = False) -> dict[str, Any]:
     return {
         "rows": rows,
         "windows": found.summary["n_windows"],
+        "window": found.summary["window"],
         "seconds": seconds,
         "memory": memory,
         "steps": found.summary["convergence"]["steps"],

@@ -26,13 +26,12 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from sim2gp.data.windows_likelihood import WindowsLikelihood
+from sim2gp.commands.window_length import fit_chosen_windows
+from sim2gp.data.windows_likelihood import likelihood_of
 from sim2gp.errors import InputError, NotConverged, NotFinite
-from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.intervals.discrepancy import corrected_windows
 from sim2gp.identification.missing_physics.at_zero import at_zero
 from sim2gp.project import Project, load_project
-from sim2gp.project.training_windows import cut_logs
 from sim2gp.runs.cells import Cells, add_options
 from sim2gp.runs.executors import Processes, cores
 from sim2gp.systems import plant_of
@@ -156,18 +155,20 @@ def work(job: Job) -> dict[str, Any]:
             record(robot, project.system, truth, rng, Path(folder, f"{k}.csv"))
         started = time.perf_counter()
         logs = project.read_logs(sorted(Path(folder).iterdir()))
-        windows, of = cut_logs(project, logs)
-        robust, key = project.spec.likelihood.robust, jax.random.key(job.draw)
+        key = jax.random.key(job.draw)
         try:
-            belief = fit_windows(project.system, windows, key=key, robust=robust)
+            used, (windows, places, _), belief = fit_chosen_windows(
+                project, logs, key=key
+            )
         except (NotConverged, NotFinite) as error:
             return {"failed": str(error)}
-        likelihood = WindowsLikelihood(project.system, windows)
-        mine = corrected_windows(at_zero(likelihood, belief, of)).posterior
+        likelihood = likelihood_of(project.system, windows)
+        mine = corrected_windows(at_zero(likelihood, belief, places[:, 0])).posterior
         seconds = time.perf_counter() - started
     found = table.values(mine.mean)
     return {
         "names": list(table.names),
+        "window": used.window,
         "seconds": seconds,
         "prior_sd": np.asarray(prior.sd()).tolist(),
         "error": (np.asarray(belief.posterior.mean) - tt).tolist(),
@@ -250,7 +251,13 @@ def table(cells: list[dict[str, Any]]) -> dict[str, Any]:
             "median_error": float(np.median(error[known])) if known.any() else None,
         }
     seconds = float(np.median(get["seconds"]))
-    return {"constants": out, "seconds": seconds, "failed": len(cells) - len(fitted)}
+    lengths, counts = np.unique(get["window"], return_counts=True)
+    return {
+        "constants": out,
+        "windows": dict(zip(map(str, lengths), counts.tolist(), strict=True)),
+        "seconds": seconds,
+        "failed": len(cells) - len(fitted),
+    }
 
 
 def _inside(get: dict[str, np.ndarray], which: str, j: int) -> float:
@@ -271,9 +278,11 @@ def lines(summary: dict[str, Any]) -> list[str]:
     """The table of docs/mujoco.md."""
     out = []
     for robot, entry in summary["robots"].items():
+        lengths = entry["windows"].items()
         out += [
             "",
-            f"{robot}: {summary['draws']} draws, {entry['seconds']:.0f} s a fit",
+            f"{robot}: {summary['draws']} draws, {entry['seconds']:.0f} s a fit; "
+            + ", ".join(f"{n} with windows of {s} s" for s, n in lengths),
         ]
         head = f"{'':32s}{'coverage':>9s}{'plain':>7s}{'identified':>11s}{'error':>8s}"
         out.append(head)

@@ -2,16 +2,20 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, cast
 
 import jax
 import numpy as np
 import pytest
 
 from sim2gp.cli import main
-from sim2gp.commands.fleet import IdentifiedFleet, _cells, identify_fleet
+from sim2gp.commands import fleet
+from sim2gp.commands.fleet import FittedFleet, IdentifiedFleet, _cells, identify_fleet
 from sim2gp.commands.load_run import load_run
-from sim2gp.errors import InputError
+from sim2gp.commands.window_length import chosen_window
+from sim2gp.errors import InputError, NotConverged
 from sim2gp.project import Project, load_project
+from sim2gp.project.project import SHORT
 from sim2gp.runs import Progress
 from sim2gp.runs.executors import Processes
 from sim2gp.runs.plain import from_exact
@@ -37,7 +41,8 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Project:
             )
             write(log, folder / "logs" / name / f"run{run}.csv")
     path = project_in(folder)
-    path.write_text(path.read_text().replace("logs/*.csv", "logs/{robot}/*.csv"))
+    text = path.read_text().replace("logs/*.csv", "logs/{robot}/*.csv")
+    path.write_text(text.replace("window = 0.2\n", ""))
     return load_project(path)
 
 
@@ -65,6 +70,41 @@ def test_machines_and_their_kind_are_found(
         j = table.names.index("arm_damping")
         wider, kind = found.another.sd()[j], found.kind.sd()[j]
         assert wider > kind > found.machines["b"].sd()[j]
+
+
+def test_one_machine_chooses_how_long_windows_are(
+    project: Project, found: IdentifiedFleet
+) -> None:
+    """The one with most samples, as `identify` does with its logs."""
+    most = project.load_each("robot")["a"]
+    alone = chosen_window(project, most, key=jax.random.key(0))
+    assert found.project.window == alone.window > SHORT
+    about = found.summary["window"]
+    assert (about["seconds"], about["chosen"]) == (alone.window, True)
+    assert about["text"] in (table.get("note") for table in found.summary["tables"])
+
+
+def test_where_one_machine_cannot_be_fitted_windows_are_short(
+    project: Project, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machines, fitted = project.load_each("robot"), []
+
+    def fails(project: Project, *given: object, **how: object) -> FittedFleet:
+        fitted.append(project.window)
+        if project.window > SHORT:
+            raise NotConverged("E201", where="c", what="lost", got="", expected="")
+        return FittedFleet(project, cast(Any, None), [], [])
+
+    def long(project: Project, *given: object, **how: object) -> Project:
+        return project.with_window(0.6)
+
+    monkeypatch.setattr(fleet, "_fit_machines", fails)
+    monkeypatch.setattr(fleet, "chosen_window", long)
+    assert fleet.fit_machines(project, machines).project.window == SHORT
+    assert fitted == [0.6, SHORT]
+    monkeypatch.setattr(fleet, "chosen_window", lambda project, *_, **__: project)
+    with pytest.raises(NotConverged):  # a stated length stays
+        fleet.fit_machines(project.with_window(0.6), machines)
 
 
 def test_the_run_is_read_back(found: IdentifiedFleet, tmp_path: Path) -> None:

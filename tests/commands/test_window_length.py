@@ -9,11 +9,19 @@ import pytest
 
 from linear_system import linear
 from sim2gp.commands import window_length
-from sim2gp.commands.window_length import WindowFit, choose_window, lengths
+from sim2gp.commands.window_length import (
+    WindowFit,
+    choose_window,
+    fit_all,
+    lengths,
+)
+from sim2gp.data.cuts import Cuts
 from sim2gp.data.logs import Log
+from sim2gp.data.windows import Windows
 from sim2gp.errors import NotConverged
 from sim2gp.identification.fit import fit_windows
-from sim2gp.project import Project, load_project
+from sim2gp.project import Project, load_project, training_windows
+from sim2gp.project.project import SHORT
 from sim2gp.project.training_windows import cut_for_fit
 
 RATE, NOISE = 10.0, 0.02  # Hz, m
@@ -51,9 +59,8 @@ def project_of(folder: Path, window: float | None = None) -> Project:
 
 
 def short_fit(project: Project, log: Log) -> WindowFit:
-    windows, places = cut_for_fit(project, [log])
-    fitted = fit_windows(project.system, windows, key=KEY)
-    return WindowFit(project, windows, places, fitted)
+    cut = cut_for_fit(project, [log], some=True)
+    return WindowFit(project, cut, fit_windows(project.system, cut.windows, key=KEY))
 
 
 def sd_of(fit: WindowFit) -> np.ndarray:
@@ -144,6 +151,54 @@ def test_longer_windows_that_cannot_be_fitted_are_not_taken(
     found = choose_window(short, [log], key=KEY)
     assert found.fit.fitted is short.fitted
     assert "E201" in found.why
+
+
+@pytest.fixture
+def few(monkeypatch: pytest.MonkeyPatch) -> int:
+    """Steps that are fitted all at once; of more, some choose. There are 20,000."""
+    steps = 12_000
+    monkeypatch.setattr(training_windows, "MANY", steps)
+    return steps
+
+
+def test_some_of_very_many_choose_and_all_are_fitted(
+    tmp_path: Path, few: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = recording()
+    short = short_fit(project_of(tmp_path), log)
+    assert len(short.cut.windows) * short.cut.windows.length <= few
+    assert short.cut.total == ROWS // 2
+    some = choose_window(short, [log], key=KEY)
+    assert (len(some.fit.cut.windows), some.fit.cut.total) == (4, 8)
+    found = fit_all(some, [log], key=KEY)
+    assert isinstance(found.fit.cut.windows, Cuts)
+    assert found.fit.cut.is_whole()
+    assert found.why == some.why
+    assert "a fit of 4 of 8" in found.why
+    assert found.as_dict()["seconds"] == 5.0
+    # As a project that states the length has them, all at once.
+    with monkeypatch.context() as patch:
+        patch.setattr(training_windows, "MANY", 10 * few)
+        stated = short_fit(project_of(tmp_path, 5.0), log)
+    assert isinstance(stated.cut.windows, Windows)
+    means = (x.fitted.posterior.mean for x in (found.fit, stated))
+    np.testing.assert_allclose(*means, rtol=0.0, atol=1e-4 * sd_of(stated).min())
+    np.testing.assert_allclose(sd_of(found.fit), sd_of(stated), rtol=1e-4)
+
+
+def test_all_are_short_if_some_recordings_lose_the_simulator(
+    tmp_path: Path, few: int
+) -> None:
+    log = recording()
+    some = choose_window(short_fit(project_of(tmp_path), log), [log], key=KEY)
+    wild = dataclasses.replace(
+        log, channels={"x0": log.channels["x0"] + 0.5 * log.time**2}
+    )
+    found = fit_all(some, [wild], key=KEY)
+    assert found.as_dict()["seconds"] == SHORT
+    assert found.fit.cut.is_whole()
+    assert "does not follow" in found.why
+    assert "chosen by" not in found.why
 
 
 @pytest.mark.parametrize(

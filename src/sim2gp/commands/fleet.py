@@ -6,12 +6,10 @@ the others say, and a fit is linear about its end. So each is fitted again with 
 known of the kind as its prior, and all are joined again, until that moves no machine.
 """
 
-import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from statistics import NormalDist
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -20,23 +18,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
+from sim2gp.commands.fleet_summary import fleet_summary
 from sim2gp.commands.folds import recording_of_windows
 from sim2gp.commands.recordings import Recordings
 from sim2gp.commands.result import AbstractResult
-from sim2gp.data.logs import Log, note_lines
+from sim2gp.commands.window_length import chosen_window
+from sim2gp.data.logs import Log
 from sim2gp.data.windows import Windows
 from sim2gp.data.windows_likelihood import WindowsLikelihood
-from sim2gp.errors import error
+from sim2gp.errors import DeadParameters, NotConverged, NotFinite, error
 from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.fleet import Fleet, fit_fleet
 from sim2gp.identification.intervals.discrepancy import corrected_windows
 from sim2gp.identification.missing_physics.at_zero import at_zero, forces_of
 from sim2gp.identification.missing_physics.reach import box_of
-from sim2gp.identification.words import digits
 from sim2gp.inference.gaussian import Gaussian
-from sim2gp.inference.parameters import Parameter, Parameters
 from sim2gp.inference.prior import ParameterPrior
 from sim2gp.project import Project
+from sim2gp.project.project import SHORT
 from sim2gp.project.training_windows import cut_logs
 from sim2gp.runs.cell_work import AbstractCell, Values, compute_cells
 from sim2gp.runs.executors import Workers, executor_of
@@ -46,11 +45,8 @@ from sim2gp.runs.provenance import provenance
 from sim2gp.systems.effects.forces import AbstractUnknownFunction
 from sim2gp.types import AnyArray, in_float64
 
-NORMAL95 = NormalDist().inv_cdf(0.975)
-AGREE = 1.1  # R-hat of halves of the draws
 SETTLED = 0.1  # sd: rounds end when none moves a machine's parameter further
 ROUNDS = 7  # at most
-MOVED = 0.5  # sd: a fleet that still moves so far is not settled
 
 
 @dataclass(frozen=True, repr=False)
@@ -99,17 +95,21 @@ def identify_fleet(
     found = fit_machines(
         project, machines, seed=seed, workers=workers, progress=progress
     )
-    summary = _summary(project, machines, found) | {"seed": seed}
+    project = found.project
+    summary = fleet_summary(project, machines, found.fleet, found.moved)
     arrays = _arrays(found.fleet)
-    return IdentifiedFleet(summary | provenance(started), arrays, {}, project)
+    summary |= {"seed": seed} | provenance(started)
+    return IdentifiedFleet(summary, arrays, {}, project)
 
 
 class FittedFleet(NamedTuple):
     """A fleet, each machine ``alone``, and by how much each further round moved it.
 
-    ``moved`` has the largest change of a machine's parameter, in its sd.
+    ``project`` has windows as they were fitted; ``moved`` the largest change of a
+    machine's parameter, in its sd.
     """
 
+    project: Project
     fleet: Fleet
     alone: list[Gaussian]
     moved: list[float]
@@ -125,8 +125,29 @@ def fit_machines(
 ) -> FittedFleet:
     """Machines alone, joined, then each again with the kind as its prior and joined.
 
-    The prior of a fit is divided out again: rounds move where fits are linearised.
+    The prior of a fit is divided out again: rounds move where fits are linearised. The
+    machine with most samples chooses how long windows are, if the project does not say
+    it; they are short if another machine cannot be fitted with such.
     """
+    how: dict[str, Any] = {"seed": seed, "workers": workers, "progress": progress}
+    most = max(machines.values(), key=lambda logs: sum(map(len, logs)))
+    chosen = chosen_window(project, most, key=jax.random.key(seed))
+    try:
+        return _fit_machines(chosen, machines, **how)
+    except (NotConverged, NotFinite, DeadParameters):
+        if chosen is project or chosen.window == SHORT:
+            raise
+    return _fit_machines(project.with_window(SHORT), machines, **how)
+
+
+def _fit_machines(
+    project: Project,
+    machines: Mapping[str, Sequence[Log]],
+    seed: int,
+    workers: Workers | None,
+    progress: Progress | None,
+) -> FittedFleet:
+    """With windows of the project's length."""
     cells, shown = _cells(project, machines, seed), progress or Progress()
     executor = executor_of((workers or 1) if project.can_be_loaded else 1)
 
@@ -151,7 +172,7 @@ def fit_machines(
         moved.append(_moved(before, fleet))
         if moved[-1] <= SETTLED:
             break
-    return FittedFleet(fleet, alone, moved)
+    return FittedFleet(project, fleet, alone, moved)
 
 
 def _cells(
@@ -279,103 +300,6 @@ def _moved(before: Fleet, fleet: Fleet) -> float:
         float(np.max(np.abs(np.asarray(b.mean - a.mean)) / np.asarray(b.sd())))
         for a, b in pairs
     )
-
-
-@in_float64
-def _summary(
-    project: Project, machines: Mapping[str, Sequence[Log]], found: FittedFleet
-) -> dict[str, Any]:
-    table, fleet, moved = project.system.parameters, found.fleet, found.moved[-1]
-    entries = {
-        p.name: _entry(p, j, fleet, list(machines)) for j, p in enumerate(table.free)
-    }
-    logs = [log for own in machines.values() for log in own]
-    warnings = note_lines(logs)
-    if fleet.agreement > AGREE:
-        warnings.append(
-            f"draws of the spreads have not settled (R-hat {fleet.agreement:.2f}): "
-            "their intervals are rough"
-        )
-    if moved > MOVED:
-        warnings.append(
-            f"the last of {len(found.moved) + 1} rounds of fits has still moved a "
-            f"parameter by {digits(moved, 2)} sd: intervals are rough"
-        )
-    return {
-        "command": "identify each",
-        "title": f"{project.name}: {len(machines)} machines of a kind",
-        "machines": list(machines),
-        "logs": {name: len(own) for name, own in machines.items()},
-        "kind": entries,
-        "agreement": fleet.agreement,
-        "moved": found.moved,
-        "warnings": warnings,
-        "tables": [_kind_table(entries), _machine_table(entries, list(machines))],
-    }
-
-
-def _entry(
-    p: Parameter, j: int, fleet: Fleet, machines: Sequence[str]
-) -> dict[str, Any]:
-    """One parameter in its unit: of the kind, its spread, another one, each one."""
-
-    def physical(x: Any) -> np.ndarray:
-        return np.asarray(Parameters((p,)).constrain(np.asarray(x)[..., None]))[..., 0]
-
-    def of(known: Gaussian) -> dict[str, float]:
-        mean, sd = float(known.mean[j]), float(known.sd()[j])
-        ends = mean + NORMAL95 * sd * np.asarray([-1.0, 0.0, 1.0])
-        return dict(zip(("low", "value", "high"), physical(ends).tolist(), strict=True))
-
-    middle, spread = float(fleet.kind.mean[j]), fleet.spread[:, j]
-    half = 0.5 * (physical(middle + spread) - physical(middle - spread))
-    low, value, high = np.quantile(half, (0.025, 0.5, 0.975)).tolist()
-    return {
-        "unit": p.unit,
-        "kind": of(fleet.kind),
-        "spread": {"low": low, "value": value, "high": high},
-        "another": of(fleet.another),
-        "machines": {
-            name: of(known)
-            for name, known in zip(machines, fleet.machines, strict=True)
-        },
-    }
-
-
-def _in_words(x: Mapping[str, float], unit: str = "") -> str:
-    """With so many digits that the ends differ in two."""
-    half = 0.5 * abs(x["high"] - x["low"])
-    large = max(abs(x["value"]), half, 1e-300)
-    count = 2 + max(math.ceil(math.log10(large / half)), 0) if half > 0.0 else 3
-    low, value, high = (digits(x[k], count) for k in ("low", "value", "high"))
-    return f"{value} ({low} to {high}) {unit}".strip()
-
-
-def _kind_table(entries: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    return {
-        "title": "The kind: its middle, how much machines differ, and another machine",
-        "columns": ["parameter", "kind", "machines differ by", "another machine"],
-        "rows": [
-            [name, *(_in_words(x[k], x["unit"]) for k in ("kind", "spread", "another"))]
-            for name, x in entries.items()
-        ],
-        "note": "With 95 % intervals. Machines differ by one standard deviation; a "
-        "machine without logs of its own is as the last column says.",
-    }
-
-
-def _machine_table(
-    entries: Mapping[str, Mapping[str, Any]], machines: Sequence[str]
-) -> dict[str, Any]:
-    heads = [f"{name}, {x['unit']}".removesuffix(", ") for name, x in entries.items()]
-    return {
-        "title": "Each machine, from its own logs and from those of the others",
-        "columns": ["machine", *heads],
-        "rows": [
-            [one, *(_in_words(x["machines"][one]) for x in entries.values())]
-            for one in machines
-        ],
-    }
 
 
 def _arrays(fleet: Fleet) -> dict[str, np.ndarray]:

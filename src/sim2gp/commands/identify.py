@@ -12,14 +12,12 @@ import jax
 from sim2gp.commands.first_answer import FirstAnswer
 from sim2gp.commands.identification import Identification
 from sim2gp.data.clock import clock_lines
-from sim2gp.data.cuts import Cuts
 from sim2gp.data.grid import CURVE, Grid, evaluation_windows
 from sim2gp.data.logs import Log, note_lines
-from sim2gp.data.windows import Windows
 from sim2gp.identification.fit import fit_windows
 from sim2gp.project import Project
 from sim2gp.project.in_memory import Logs, project_and_logs
-from sim2gp.project.training_windows import cut_for_fit
+from sim2gp.project.training_windows import Cut, cut_for_fit
 from sim2gp.runs import Progress
 from sim2gp.runs.provenance import provenance
 from sim2gp.systems.base import AbstractSystem
@@ -54,23 +52,24 @@ def identify(
         sampler()  # before the work
     project, logs = project_and_logs(machine, logs)
     with progress.task("identify", 3, alike=False) as task:
-        windows, places = cut_for_fit(project, logs)
-        task.advance(f"{len(windows)} windows")
+        cut = cut_for_fit(project, logs, some=project.chooses_window)
+        task.advance(f"{len(cut.windows)} windows")
         key, robust = jax.random.key(seed), project.spec.likelihood.robust
         grid = evaluation_windows(logs, project.system, longest=CURVE[-1])
-        _compile(project, grid, windows)
-        progress.say(_sizes(project, logs, windows))
+        _compile(project, grid, cut)
+        progress.say(_sizes(project, logs, cut))
         watch = FirstAnswer(project, logs, task, first)
         with watch.of_failures():
             fitted = fit_windows(
-                project.system, windows, key=key, robust=robust, report=watch
+                project.system, cut.windows, key=key, robust=robust, report=watch
             )
         # Late: a first answer waits for nothing that comes after it.
         from sim2gp.commands import identify_results as results
-        from sim2gp.commands.window_length import WindowFit, choose_window
+        from sim2gp.commands.window_length import WindowFit, choose_window, fit_all
 
-        short = WindowFit(project, windows, places, fitted)
+        short = WindowFit(project, cut, fitted)
         chosen = choose_window(short, logs, key=key, task=task)
+        chosen = fit_all(chosen, logs, key=key, task=task)
         task.advance("posterior")
         summary, arrays = results.identification_results(
             chosen, logs, grid, seed, held_out
@@ -82,18 +81,19 @@ def identify(
     return Identification(summary, arrays, {}, project, logs=tuple(logs))
 
 
-def _sizes(project: Project, logs: Sequence[Log], windows: Windows | Cuts) -> str:
+def _sizes(project: Project, logs: Sequence[Log], cut: Cut) -> str:
     """What a fit is about, and in which steps it simulates, before it begins."""
-    parameters, columns = len(project.system.parameters), len(windows.outputs)
+    parameters, columns = len(project.system.parameters), len(cut.windows.outputs)
+    some = "" if cut.is_whole() else f"{len(cut.windows)} of "
     sizes = (
-        f"{parameters} parameters, {len(windows)} windows of {project.window:g} s, "
+        f"{parameters} parameters, {some}{cut.total} windows of {project.window:g} s, "
         f"{columns} measured columns"
     )
     still = [line for line in note_lines(logs) if line.startswith("W117")]
     return "\n".join([sizes, *clock_lines(logs, project.system), *still])
 
 
-def _compile(project: Project, grid: Grid, windows: Windows | Cuts) -> None:
+def _compile(project: Project, grid: Grid, cut: Cut) -> None:
     """Begin to compile what follows the fit, where JAX moves the machine.
 
     What asks for windows only if they stay as long as they are.
@@ -106,4 +106,4 @@ def _compile(project: Project, grid: Grid, windows: Windows | Cuts) -> None:
 
     compile_forecast(system, grid)
     if not project.chooses_window:
-        compile_corrected(system, windows)
+        compile_corrected(system, cut.windows)

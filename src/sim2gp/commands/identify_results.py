@@ -75,7 +75,7 @@ def identification_results(
     held_out: bool,
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """The run's summary and arrays."""
-    project, windows, places, fitted = chosen.fit
+    project, (windows, places, _), fitted = chosen.fit
     table, of = project.system.parameters, places[:, 0]
     known = fitted.with_measurements(table)
     likelihood = likelihood_of(project.system, windows)
@@ -286,7 +286,7 @@ def held_against(fit: WindowFit, seed: int, check: bool, nuts: bool) -> dict[str
         return out
     system, fitted = fit.project.system, fit.fitted
     names, key = system.parameters.names, jax.random.key(seed)
-    likelihood = WindowsLikelihood(system, fit.windows.whole())
+    likelihood = WindowsLikelihood(system, fit.cut.windows.whole())
     if check:
         checked = check_windows(likelihood, fitted, key=jax.random.fold_in(key, 2))
         out["check"] = checked.as_dict(names)

@@ -5,7 +5,8 @@ window. A longer window leaves more for the parameters, and shows physics that i
 missing: where it shows, intervals allow for it. But an unstable simulator leaves its
 recording, and then tells nothing. So the first fit has short windows. While the misfit
 tests find nothing, longer ones are fitted from there, as long as the simulator follows
-its recordings (`benchmarks/intervals.py`, docs/intervals.md).
+its recordings (`benchmarks/intervals.py`, docs/intervals.md). Of very many windows some
+choose the length, and all are then fitted with it.
 """
 
 import math
@@ -13,11 +14,8 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Int
 
-from sim2gp.data.cuts import Cuts
 from sim2gp.data.logs import Log
-from sim2gp.data.windows import Windows
 from sim2gp.data.windows_likelihood import likelihood_of
 from sim2gp.errors import DeadParameters, InputError, NotConverged, NotFinite
 from sim2gp.identification.fit import fit_windows
@@ -26,7 +24,7 @@ from sim2gp.identification.misfit.tests import Misfit
 from sim2gp.inference.estimate import Estimate
 from sim2gp.project import Project
 from sim2gp.project.project import SHORT
-from sim2gp.project.training_windows import cut_for_fit
+from sim2gp.project.training_windows import Cut, cut_for_fit
 from sim2gp.runs.progress import Task
 from sim2gp.types import Key, in_float64
 
@@ -34,10 +32,6 @@ from sim2gp.types import Key, in_float64
 LENGTHS = (1.0, 5.0)
 #: Times the noise of shorter windows: a simulator with more does not follow for longer.
 LOST = 2.0
-_MANY = (
-    "of so many rows longer ones are not tried; write likelihood.window = 1 or 5 in "
-    "the project file if the simulator follows its recordings for so long"
-)
 _STATED = (
     "The misfit tests find nothing. Without likelihood.window in the project file, "
     "identify also tries longer windows, which may narrow the intervals."
@@ -45,16 +39,15 @@ _STATED = (
 
 
 class WindowFit(NamedTuple):
-    """Windows of a project's length, the log and first row of each, and their fit."""
+    """Windows of a project's length, and their fit."""
 
     project: Project
-    windows: Windows | Cuts
-    places: Int[np.ndarray, "W 2"]
+    cut: Cut
     fitted: Estimate
 
     def misfit(self) -> Misfit:
         """What the residuals say of the simulator."""
-        likelihood = likelihood_of(self.project.system, self.windows)
+        likelihood = likelihood_of(self.project.system, self.cut.windows)
         return misfit_of_windows(likelihood, self.fitted)
 
 
@@ -67,9 +60,13 @@ class WindowLength(NamedTuple):
 
     def as_dict(self) -> dict[str, Any]:
         """For summary.json."""
-        project = self.fit.project
-        chosen = project.chosen_window is not None
-        return {"seconds": project.window, "chosen": chosen, "text": self.why}
+        return window_entry(self.fit.project, self.why)
+
+
+def window_entry(project: Project, text: str) -> dict[str, Any]:
+    """For summary.json: how long windows are, and why."""
+    chosen = project.chosen_window is not None
+    return {"seconds": project.window, "chosen": chosen, "text": text}
 
 
 @in_float64
@@ -83,7 +80,8 @@ def choose_window(
     """From a fit of short windows the first length at which misfit tests speak.
 
     The longest where they never do, or where the simulator cannot follow for longer.
-    Windows of a stated length stay as they are, and so do very many.
+    Windows of a stated length stay as they are. If ``short`` has some of very many
+    windows, so has what is returned (`fit_all`).
     """
     project, misfit = short.project, short.misfit()
     if not project.chooses_window:
@@ -91,42 +89,56 @@ def choose_window(
         return WindowLength(
             short, misfit, _STATED if could and not misfit.alarm else ""
         )
-    best = short._replace(project=project.with_window(project.window))
-    if isinstance(short.windows, Cuts):
-        return WindowLength(best, misfit, _words(best, _MANY))
+    best, why = short._replace(project=project.with_window(project.window)), ""
     for seconds in lengths(logs):
         if misfit.alarm:
             break
         if task is not None:
             task.advance(f"windows of {seconds:g} s", 0)
-        try:
-            longer = _fit_longer(best, logs, seconds, key)
-            found = longer.misfit()
-        except (InputError, NotConverged, NotFinite, DeadParameters) as error:
-            why = f"those of {seconds:g} s cannot be fitted ({error})"
-            return WindowLength(best, misfit, _words(best, why))
-        if not _follows(longer.fitted, best.fitted):
-            why = f"for {seconds:g} s the simulator does not follow its recordings"
-            return WindowLength(best, misfit, _words(best, why))
-        best, misfit = longer, found
+        found = _followed(best, logs, seconds, key, some=True)
+        if isinstance(found, str):
+            return WindowLength(best, misfit, _words(best, found))
+        best, misfit = found
     why = "find something in these" if misfit.alarm else "find nothing"
     return WindowLength(best, misfit, _words(best, f"the misfit tests {why}"))
 
 
+@in_float64
+def fit_all(
+    chosen: WindowLength,
+    logs: Sequence[Log],
+    *,
+    key: Key,
+    task: Task | None = None,
+) -> WindowLength:
+    """A fit of all windows, where some of them have chosen the length.
+
+    Short ones, if the simulator does not follow all recordings for so long.
+    """
+    fit, why = chosen.fit, chosen.why
+    if fit.cut.is_whole():
+        return chosen
+    if task is not None:
+        task.advance(f"all {fit.cut.total} windows", 0)
+    if fit.project.window > SHORT:
+        found = _followed(fit, logs, fit.project.window, key, some=False)
+        if not isinstance(found, str):
+            return WindowLength(*found, why)
+        why = f"Windows are {SHORT:g} s long: {found}."
+    fit = _fit_from(fit, logs, SHORT, key, some=False)
+    return WindowLength(fit, fit.misfit(), why)
+
+
 def fit_chosen_windows(project: Project, logs: Sequence[Log], *, key: Key) -> WindowFit:
     """The fit of `identify`: of windows as the project states or as it chooses them."""
-    windows, places = cut_for_fit(project, logs)
-    robust = project.spec.likelihood.robust
-    fitted = fit_windows(project.system, windows, key=key, robust=robust)
-    short = WindowFit(project, windows, places, fitted)
-    return choose_window(short, logs, key=key).fit
+    return fit_all(_choice(project, logs, key), logs, key=key).fit
 
 
 def chosen_window(project: Project, logs: Sequence[Log], *, key: Key) -> Project:
     """The project with windows as `identify` chooses them for these logs."""
     if not project.chooses_window:
         return project
-    return fit_chosen_windows(project, logs, key=key).project
+    return _choice(project, logs, key).fit.project
 
 
 def lengths(logs: Sequence[Log]) -> list[float]:
@@ -137,26 +149,46 @@ def lengths(logs: Sequence[Log]) -> list[float]:
     return sorted({x for x in each if x > SHORT})
 
 
-def _fit_longer(
-    known: WindowFit, logs: Sequence[Log], seconds: float, key: Key
+def _choice(project: Project, logs: Sequence[Log], key: Key) -> WindowLength:
+    cut = cut_for_fit(project, logs, some=project.chooses_window)
+    robust = project.spec.likelihood.robust
+    fitted = fit_windows(project.system, cut.windows, key=key, robust=robust)
+    return choose_window(WindowFit(project, cut, fitted), logs, key=key)
+
+
+def _followed(
+    known: WindowFit, logs: Sequence[Log], seconds: float, key: Key, *, some: bool
+) -> tuple[WindowFit, Misfit] | str:
+    """A fit of longer windows, or why the simulator does not follow for so long."""
+    try:
+        longer = _fit_from(known, logs, seconds, key, some=some)
+        found = longer.misfit()
+    except (InputError, NotConverged, NotFinite, DeadParameters) as error:
+        return f"those of {seconds:g} s cannot be fitted ({error})"
+    noise, before = (np.asarray(x.fitted.noise.sd) for x in (longer, known))
+    if np.any(noise > LOST * before):
+        return f"for {seconds:g} s the simulator does not follow its recordings"
+    return longer, found
+
+
+def _fit_from(
+    known: WindowFit, logs: Sequence[Log], seconds: float, key: Key, *, some: bool
 ) -> WindowFit:
-    """A fit of longer windows, from where shorter ones have led."""
+    """A fit of windows of another length, from where a known one has led."""
     project = known.project.with_window(seconds)
-    windows, places = cut_for_fit(project, logs)
+    cut = cut_for_fit(project, logs, some=some)
     fitted = fit_windows(
         project.system,
-        windows,
+        cut.windows,
         key=key,
         robust=project.spec.likelihood.robust,
-        warm_start=known.fitted.of_windows(len(windows)),
+        warm_start=known.fitted.of_windows(len(cut.windows)),
     )
-    return WindowFit(project, windows, places, fitted)
+    return WindowFit(project, cut, fitted)
 
 
 def _words(best: WindowFit, why: str) -> str:
-    return f"Windows are {best.project.window:g} s long: {why}."
-
-
-def _follows(longer: Estimate, shorter: Estimate) -> bool:
-    noise = (np.asarray(fit.noise.sd) for fit in (longer, shorter))
-    return bool(np.all(next(noise) <= LOST * next(noise)))
+    cut, by = best.cut, ""
+    if not cut.is_whole():
+        by = f", chosen by a fit of {len(cut.windows)} of {cut.total}"
+    return f"Windows are {best.project.window:g} s long{by}: {why}."

@@ -1,6 +1,7 @@
 """The windows of a project's logs that its machine is fitted to."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Int
@@ -8,7 +9,7 @@ from jaxtyping import Int
 from sim2gp.data.cuts import Cuts
 from sim2gp.data.logs import Log
 from sim2gp.data.split_log import cuts_of
-from sim2gp.data.windows import Windows
+from sim2gp.data.windows import Windows, evenly_spread
 from sim2gp.project import Project
 from sim2gp.systems.host import simulator_of
 
@@ -24,17 +25,31 @@ def cut_logs(
     return cuts.whole(), cuts.places[:, 0]
 
 
-def cut_for_fit(
-    project: Project, logs: Sequence[Log]
-) -> tuple[Windows | Cuts, Int[np.ndarray, "W 2"]]:
-    """Training windows, and log and first row of each.
+class Cut(NamedTuple):
+    """Windows to fit, the log and first row of each, and how many there are in all."""
 
-    Of so many rows that they are fitted in parts, as `Cuts`.
+    windows: Windows | Cuts
+    places: Int[np.ndarray, "W 2"]
+    total: int
+
+    def is_whole(self) -> bool:
+        """Whether these are all."""
+        return len(self.windows) == self.total
+
+
+def cut_for_fit(project: Project, logs: Sequence[Log], *, some: bool = False) -> Cut:
+    """Training windows; of so many rows that they are fitted in parts, as `Cuts`.
+
+    With ``some``, instead of those, as many as are fitted all at once, spread over all.
     """
     cuts = _cuts(project, logs)
-    few = len(cuts) * cuts.length <= MANY
-    whole = few or simulator_of(project.system) is not None
-    return cuts.whole() if whole else cuts, cuts.places
+    most, places, total = MANY // cuts.length, cuts.places, len(cuts)
+    if total <= most or simulator_of(project.system) is not None:
+        return Cut(cuts.whole(), places, total)
+    if not some:
+        return Cut(cuts, places, total)
+    which = evenly_spread(max(1, most), total)
+    return Cut(cuts.some(which), places[which], total)
 
 
 def _cuts(project: Project, logs: Sequence[Log]) -> Cuts:
