@@ -177,8 +177,8 @@ def _fitted(
 def _chosen(system: AbstractSystem, log: Log, key: Any) -> tuple[Any, ...]:
     """The length of windows that `identify` chooses, and what `_fitted` returns."""
     fit = fit_chosen_windows(project_of_machine(system), [log], key=key)
-    likelihood = WindowsLikelihood(system, fit.windows)
-    return fit.project.window, likelihood, fit.fitted, fit.places[:, 0]
+    likelihood = WindowsLikelihood(system, fit.cut.windows)
+    return fit.project.window, likelihood, fit.fitted, fit.cut.places[:, 0]
 
 
 def _nearest(system: AbstractSystem, windows: Windows, key: Any) -> Estimate:

@@ -20,10 +20,14 @@ from sim2gp.systems import AbstractODE, Channel
 
 
 class Linear(AbstractODE):
-    """``d`` outputs; as many constants as the table has, of whatever map."""
+    """``d`` outputs; as many constants as the table has, of whatever map.
+
+    States grow on their own at a ``rate``, 1/s.
+    """
 
     parameters: Parameters = eqx.field(static=True)
     d: int = eqx.field(static=True)
+    rate: float = eqx.field(static=True, default=0.0)
 
     max_substep: ClassVar[float] = 1.0
 
@@ -40,7 +44,7 @@ class Linear(AbstractODE):
         return jnp.stack([values[name] for name in self.parameters.names])
 
     def ode(self, params: Array, s: Array, a: Array) -> Array:
-        return a.reshape(self.d, -1) @ params
+        return a.reshape(self.d, -1) @ params + self.rate * s
 
 
 def linear(p: int, d: int, kind: str = "identity", **spec: float) -> Linear:

@@ -14,6 +14,7 @@ from sim2gp.commands.window_length import (
     choose_window,
     fit_all,
     lengths,
+    start_growth,
 )
 from sim2gp.data.cuts import Cuts
 from sim2gp.data.logs import Log
@@ -35,11 +36,18 @@ start_sd = 1.0
 """
 
 
-def recording(drift: float = 0.0, rows: int = ROWS) -> Log:
-    """``x' = .7 a0 - .4 a1 + drift`` under held inputs, with white noise."""
+def recording(drift: float = 0.0, rows: int = ROWS, rate: float = 0.0) -> Log:
+    """``x' = .7 a0 - .4 a1 + drift + rate x``, white noise; inputs are held.
+
+    What grows is held back by the first input.
+    """
     rng = np.random.default_rng(7)
     a = np.repeat(rng.standard_normal((rows // 4 + 1, 2)), 4, axis=0)[:rows]
-    x = np.cumsum(np.concatenate([[0.0], (a[:-1] @ [0.7, -0.4] + drift) / RATE]))
+    x, grown = np.zeros(rows), np.exp(rate / RATE)
+    for k in range(rows - 1):
+        a[k, 0] -= 2.0 * rate / 0.7 * x[k]
+        step = (grown - 1.0) / rate if rate else 1.0 / RATE
+        x[k + 1] = grown * x[k] + (a[k] @ [0.7, -0.4] + drift) * step
     return Log(
         name="log",
         source="log.csv",
@@ -50,12 +58,13 @@ def recording(drift: float = 0.0, rows: int = ROWS) -> Log:
     )
 
 
-def project_of(folder: Path, window: float | None = None) -> Project:
+def project_of(folder: Path, window: float | None = None, rate: float = 0.0) -> Project:
     """A linear machine, whose file states the length of windows or does not."""
     path = folder / "project.toml"
     stated = "" if window is None else f"window = {window}\n"
     path.write_text(PROJECT + stated)
-    return dataclasses.replace(load_project(path), system=linear(2, 1))
+    machine = dataclasses.replace(linear(2, 1), rate=rate)
+    return dataclasses.replace(load_project(path), system=machine)
 
 
 def short_fit(project: Project, log: Log) -> WindowFit:
@@ -118,14 +127,41 @@ def test_a_simulator_that_loses_its_recordings_is_not_taken(tmp_path: Path) -> N
     assert float(longer.fitted.noise.sd[0]) > 2.0 * sd
 
 
-def test_where_the_tests_speak_of_short_windows_they_stay(tmp_path: Path) -> None:
+def test_where_the_tests_speak_a_stable_machine_has_windows_of_a_second(
+    tmp_path: Path,
+) -> None:
     log = recording(drift=0.5)
     short = short_fit(project_of(tmp_path), log)
     assert short.misfit().alarm
     found = choose_window(short, [log], key=KEY)
-    assert found.fit.fitted is short.fitted
+    assert found.fit.project.window == 1.0
+    assert start_growth(found.fit) == pytest.approx(1.0, abs=1e-9)
+    # Its noise has grown, which alone does not say that a simulator is lost.
+    noise = (float(x.fitted.noise.sd[0]) for x in (found.fit, short))
+    assert next(noise) > 2.0 * next(noise)
     assert found.as_dict()["chosen"]
     assert "find something" in found.why
+
+
+def test_where_the_tests_speak_windows_of_an_unstable_machine_stay(
+    tmp_path: Path,
+) -> None:
+    log, project = recording(drift=0.5, rate=2.0), project_of(tmp_path, rate=2.0)
+    short = short_fit(project, log)
+    assert short.misfit().alarm
+    found = choose_window(short, [log], key=KEY)
+    assert found.fit.fitted is short.fitted
+    assert "for 1 s" in found.why or "errors of their starts grow" in found.why
+    second = short_fit(project.with_window(1.0), log)
+    assert start_growth(second) == pytest.approx(np.exp(2.0 * 0.9), rel=1e-6)
+
+
+def test_without_a_misfit_an_unstable_machine_may_have_long_windows(
+    tmp_path: Path,
+) -> None:
+    log, project = recording(rate=2.0), project_of(tmp_path, rate=2.0)
+    found = choose_window(short_fit(project, log), [log], key=KEY)
+    assert found.fit.project.window >= 1.0
 
 
 @pytest.mark.parametrize(("window", "said"), [(0.2, True), (20.0, False)])

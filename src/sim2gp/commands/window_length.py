@@ -1,12 +1,14 @@
-"""How long windows are, where a project does not say: until the misfit tests speak.
+"""How long windows are, where a project does not say it.
 
 Each window begins at an unknown start, which uses up much of the information of a short
 window. A longer window leaves more for the parameters, and shows physics that is
 missing: where it shows, intervals allow for it. But an unstable simulator leaves its
-recording, and then tells nothing. So the first fit has short windows. While the misfit
-tests find nothing, longer ones are fitted from there, as long as the simulator follows
-its recordings (`benchmarks/intervals.py`, docs/intervals.md). Of very many windows some
-choose the length, and all are then fitted with it.
+recording, and then tells nothing. So the first fit has short windows, and longer ones
+are fitted from there: of a stable simulator in any case, others as long as the misfit
+tests find nothing and the simulator follows its recordings. Much longer ones are not
+fitted where the tests find something, because these are too few to say how far they err
+(`benchmarks/intervals.py`, docs/intervals.md). Of very many windows some choose the
+length, and all are then fitted with it.
 """
 
 import math
@@ -16,7 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sim2gp.data.logs import Log
-from sim2gp.data.windows_likelihood import likelihood_of
+from sim2gp.data.windows import channel_motion
+from sim2gp.data.windows_likelihood import likelihood_of, linearise_some
 from sim2gp.errors import DeadParameters, InputError, NotConverged, NotFinite
 from sim2gp.identification.fit import fit_windows
 from sim2gp.identification.misfit.residuals import misfit_of_windows
@@ -32,6 +35,8 @@ from sim2gp.types import Key, in_float64
 LENGTHS = (1.0, 5.0)
 #: Times the noise of shorter windows: a simulator with more does not follow for longer.
 LOST = 2.0
+#: Times that errors of starts may grow within a window of a stable simulator (rms).
+STABLE = 3.0
 _STATED = (
     "The misfit tests find nothing. Without likelihood.window in the project file, "
     "identify also tries longer windows, which may narrow the intervals."
@@ -77,11 +82,12 @@ def choose_window(
     key: Key,
     task: Task | None = None,
 ) -> WindowLength:
-    """From a fit of short windows the first length at which misfit tests speak.
+    """From a fit of short windows how long they are.
 
-    The longest where they never do, or where the simulator cannot follow for longer.
-    Windows of a stated length stay as they are. If ``short`` has some of very many
-    windows, so has what is returned (`fit_all`).
+    The first length at which misfit tests speak, but not the short one if the simulator
+    is stable; the longest where they never do, or where the simulator cannot follow for
+    longer. Windows of a stated length stay as they are. If ``short`` has some of very
+    many windows, so has what is returned (`fit_all`).
     """
     project, misfit = short.project, short.misfit()
     if not project.chooses_window:
@@ -89,13 +95,13 @@ def choose_window(
         return WindowLength(
             short, misfit, _STATED if could and not misfit.alarm else ""
         )
-    best, why = short._replace(project=project.with_window(project.window)), ""
+    best = short._replace(project=project.with_window(project.window))
     for seconds in lengths(logs):
-        if misfit.alarm:
+        if misfit.alarm and seconds > LENGTHS[0]:
             break
         if task is not None:
             task.advance(f"windows of {seconds:g} s", 0)
-        found = _followed(best, logs, seconds, key, some=True)
+        found = _followed(best, logs, seconds, key, some=True, alarm=misfit.alarm)
         if isinstance(found, str):
             return WindowLength(best, misfit, _words(best, found))
         best, misfit = found
@@ -121,7 +127,7 @@ def fit_all(
     if task is not None:
         task.advance(f"all {fit.cut.total} windows", 0)
     if fit.project.window > SHORT:
-        found = _followed(fit, logs, fit.project.window, key, some=False)
+        found = _followed(fit, logs, fit.project.window, key)
         if not isinstance(found, str):
             return WindowLength(*found, why)
         why = f"Windows are {SHORT:g} s long: {found}."
@@ -157,18 +163,50 @@ def _choice(project: Project, logs: Sequence[Log], key: Key) -> WindowLength:
 
 
 def _followed(
-    known: WindowFit, logs: Sequence[Log], seconds: float, key: Key, *, some: bool
+    known: WindowFit,
+    logs: Sequence[Log],
+    seconds: float,
+    key: Key,
+    *,
+    some: bool = False,
+    alarm: bool = False,
 ) -> tuple[WindowFit, Misfit] | str:
-    """A fit of longer windows, or why the simulator does not follow for so long."""
+    """A fit of longer windows, or why the simulator does not follow for so long.
+
+    ``alarm``: the misfit tests find something in the shorter ones.
+    """
     try:
         longer = _fit_from(known, logs, seconds, key, some=some)
         found = longer.misfit()
+        noise, before = (np.asarray(x.fitted.noise.sd) for x in (longer, known))
+        lost = bool(np.any(noise > LOST * before))
+        if not (alarm or lost):
+            return longer, found
+        grown = start_growth(longer) if seconds <= LENGTHS[0] else math.inf
     except (InputError, NotConverged, NotFinite, DeadParameters) as error:
         return f"those of {seconds:g} s cannot be fitted ({error})"
-    noise, before = (np.asarray(x.fitted.noise.sd) for x in (longer, known))
-    if np.any(noise > LOST * before):
+    if grown <= STABLE:
+        return longer, found
+    if lost:
         return f"for {seconds:g} s the simulator does not follow its recordings"
-    return longer, found
+    return f"in {seconds:g} s errors of their starts grow {grown:.2g} times"
+
+
+@in_float64
+def start_growth(fit: WindowFit) -> float:
+    """How many times errors of starts grow within windows: the largest, then the rms.
+
+    Of measured channels, each in units of its motion.
+    """
+    likelihood = likelihood_of(fit.project.system, fit.cut.windows)
+    cut, fitted, found = linearise_some(likelihood, fit.fitted)
+    starts, outputs = slice(fitted.prior.mean.size, None), list(cut.outputs)
+    J = np.asarray(found.jacobian)[..., starts][..., outputs]
+    slope = J / np.asarray(cut.start_sd)[:, None, None, outputs]
+    noise = np.asarray(fitted.noise.sd)
+    size = np.sqrt(channel_motion(cut).mean(axis=0) + noise**2)
+    each = np.linalg.norm(slope * size / size[:, None], ord=2, axis=(2, 3))
+    return float(np.sqrt(np.mean(each.max(axis=1) ** 2)))
 
 
 def _fit_from(

@@ -271,6 +271,19 @@ def linearise(
     return _linearise(likelihood, e, tt, fitted.prior.scale)
 
 
+def linearise_some(
+    likelihood: AnyWindows, fitted: Estimate
+) -> tuple[Windows, Estimate, Linearised]:
+    """At the MAP; of very many windows, of some that are evenly spread."""
+    system, W = likelihood.system, len(likelihood.windows)
+    size = together(system, likelihood.windows)
+    if size < W or not isinstance(likelihood, WindowsLikelihood):
+        which = evenly_spread(size, W)
+        likelihood, fitted = likelihood.some(which), fitted.some(which)
+    found = linearise(likelihood, fitted, fitted.posterior.mean)
+    return likelihood.windows, fitted, found
+
+
 @in_float64
 def compile_linearise(system: AbstractSystem, windows: Windows | Cuts) -> None:
     """Start to compile `linearise` for windows like these and a fit to come.

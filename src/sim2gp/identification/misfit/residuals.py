@@ -12,13 +12,8 @@ from jaxtyping import Array, Float, Int
 
 from sim2gp.data.one_step import OneStepLikelihood, compiled_rows
 from sim2gp.data.transitions import earlier_inputs, episode_numbers
-from sim2gp.data.windows import Windows, evenly_spread
-from sim2gp.data.windows_likelihood import (
-    AnyWindows,
-    WindowsLikelihood,
-    linearise,
-    together,
-)
+from sim2gp.data.windows import Windows
+from sim2gp.data.windows_likelihood import AnyWindows, linearise_some
 from sim2gp.identification.misfit.tests import Misfit, misfit
 from sim2gp.inference.estimate import Estimate
 from sim2gp.inference.gaussian import Gaussian
@@ -61,13 +56,8 @@ def misfit_of_windows(likelihood: AnyWindows, fitted: Estimate) -> Misfit:
 
     One-step windows have no start state of their own, and are tested as transitions.
     """
-    system, W = likelihood.system, len(likelihood.windows)
-    size = together(system, likelihood.windows)
-    if size < W or not isinstance(likelihood, WindowsLikelihood):
-        which = evenly_spread(size, W)
-        likelihood, fitted = likelihood.some(which), fitted.some(which)
-    cut = likelihood.windows
-    found = linearise(likelihood, fitted, fitted.posterior.mean)
+    system = likelihood.system
+    cut, fitted, found = linearise_some(likelihood, fitted)
     r, J, s, a = (np.concatenate(np.asarray(x)) for x in found)
     weight = np.sqrt(np.repeat(np.asarray(fitted.noise.weights), cut.mask.shape[1]))
     scale = weight[:, None] / np.asarray(fitted.noise.sd)
