@@ -2,12 +2,16 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import Array
+from scipy.linalg import expm
 
-from linear_system import linear
+from linear_system import Linear, linear
 from sim2gp.commands import window_length
 from sim2gp.commands.window_length import (
     WindowFit,
@@ -21,9 +25,11 @@ from sim2gp.data.logs import Log
 from sim2gp.data.windows import Windows
 from sim2gp.errors import NotConverged
 from sim2gp.identification.fit import fit_windows
+from sim2gp.inference.estimate import Estimate
 from sim2gp.project import Project, load_project, training_windows
 from sim2gp.project.project import SHORT
 from sim2gp.project.training_windows import cut_for_fit
+from sim2gp.systems import Channel
 
 RATE, NOISE = 10.0, 0.02  # Hz, m
 ROWS, KEY = 400, jax.random.key(0)
@@ -128,12 +134,19 @@ def test_a_simulator_that_loses_its_recordings_is_not_taken(tmp_path: Path) -> N
 
 
 def test_where_the_tests_speak_a_stable_machine_has_windows_of_a_second(
-    tmp_path: Path,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    log = recording(drift=0.5)
+    log, fits = recording(drift=0.5), []
     short = short_fit(project_of(tmp_path), log)
     assert short.misfit().alarm
+
+    def fit(*given: Any, **how: Any) -> Estimate:
+        fits.append(given)
+        return fit_windows(*given, **how)
+
+    monkeypatch.setattr(window_length, "fit_windows", fit)
     found = choose_window(short, [log], key=KEY)
+    assert len(fits) == 1  # none of 5 s
     assert found.fit.project.window == 1.0
     assert start_growth(found.fit) == pytest.approx(1.0, abs=1e-9)
     # Its noise has grown, which alone does not say that a simulator is lost.
@@ -154,6 +167,44 @@ def test_where_the_tests_speak_windows_of_an_unstable_machine_stay(
     assert "for 1 s" in found.why or "errors of their starts grow" in found.why
     second = short_fit(project.with_window(1.0), log)
     assert start_growth(second) == pytest.approx(np.exp(2.0 * 0.9), rel=1e-6)
+
+
+class Spring(Linear):
+    """``q'' = k0 a0 + k1 a1 - 30^2 q``: its velocity is 30 times as large."""
+
+    @property
+    def states(self) -> tuple[Channel, ...]:
+        return Channel("q", "m"), Channel("q.velocity", "m/s")
+
+    @property
+    def actions(self) -> tuple[Channel, ...]:
+        return Channel("a0", "m/s^2"), Channel("a1", "m/s^2")
+
+    def ode(self, params: Array, s: Array, a: Array) -> Array:
+        return jnp.stack([s[1], a @ params - 900.0 * s[0]])
+
+
+def test_errors_of_starts_have_the_units_of_the_motion(tmp_path: Path) -> None:
+    """A spring turns them: a norm in its own units says thirty times."""
+    rng, log, period = np.random.default_rng(0), recording(), 0.01
+    A = expm(period * np.asarray([[0.0, 1.0], [-900.0, 0.0]]))
+    a = np.stack([log.inputs["a0"], log.inputs["a1"]], axis=1)
+    push = (np.eye(2) - A) @ [1.0 / 900.0, 0.0]  # of a held acceleration
+    x = np.zeros((ROWS, 2))
+    x[0] = 1.0, 0.0
+    for k in range(ROWS - 1):
+        x[k + 1] = A @ x[k] + push * (a[k] @ [0.7, -0.4])
+    x += [1e-3, 0.03] * rng.standard_normal(x.shape)
+    names = "q", "q.velocity"
+    log = dataclasses.replace(
+        log,
+        time=np.arange(ROWS) * period,
+        channels=dict(zip(names, x.T, strict=True)),
+        mask={name: np.ones(ROWS, bool) for name in names},
+    )
+    machine = Spring(linear(2, 1).parameters, 2)
+    fit = short_fit(dataclasses.replace(project_of(tmp_path), system=machine), log)
+    assert start_growth(fit) == pytest.approx(1.0, abs=0.05)
 
 
 def test_without_a_misfit_an_unstable_machine_may_have_long_windows(
