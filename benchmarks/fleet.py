@@ -146,7 +146,9 @@ def main() -> None:
         print(f"{name:8}", "  ".join(words))
     print("widths  ", summary["widths"])
     asked.out.mkdir(parents=True, exist_ok=True)
-    text = json.dumps(summary | {"fleets": asked.fleets, "arms_of_each": ARMS}, indent=1)
+    text = json.dumps(
+        summary | {"fleets": asked.fleets, "arms_of_each": ARMS}, indent=1
+    )
     (asked.out / "summary.json").write_text(text + "\n")
 
 

@@ -164,9 +164,13 @@ def test_where_the_tests_speak_windows_of_an_unstable_machine_stay(
     assert short.misfit().alarm
     found = choose_window(short, [log], key=KEY)
     assert found.fit.fitted is short.fitted
-    assert "for 1 s" in found.why or "errors of their starts grow" in found.why
+    assert "for 1 s the simulator does not follow" in found.why
     second = short_fit(project.with_window(1.0), log)
     assert start_growth(second) == pytest.approx(np.exp(2.0 * 0.9), rel=1e-6)
+    # So they do if it follows for so long.
+    why = window_length._followed(short, [recording(rate=2.0)], 1.0, KEY, alarm=True)
+    assert isinstance(why, str)
+    assert f"grow {np.exp(1.8):.2g} times" in why
 
 
 class Spring(Linear):
