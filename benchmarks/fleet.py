@@ -69,7 +69,7 @@ class FleetCell(AbstractCell):
         project, logs = project_and_logs(system, [data.log(r) for r in range(ARMS)])
         machines = {f"arm{r:02d}": (log,) for r, log in enumerate(logs)}
         quiet = Progress(quiet=True)
-        used, fleet, alone, moved = fit_machines(project, machines, progress=quiet)
+        used, _, fleet, alone, moved = fit_machines(project, machines, progress=quiet)
         low, high = np.quantile(fleet.spread, (0.025, 0.975), axis=0)
         pairs = zip(fleet.machines, arms, strict=False)
         widths = [
@@ -138,6 +138,8 @@ def main() -> None:
     high = np.median([x["spread_high"] for x in each], axis=0)
     summary["spread_high"] = dict(zip(NAMES, high.tolist(), strict=True))
     summary["true_spread"] = dict(zip(NAMES, SPREAD.tolist(), strict=True))
+    lengths, counts = np.unique([x["window"] for x in each], return_counts=True)
+    summary["windows"] = dict(zip(map(str, lengths), counts.tolist(), strict=True))
     summary["agreement"] = sorted(x["agreement"] for x in each)
     summary["moved"] = sorted(x["moved"][-1] for x in each)
     summary["rounds"] = sorted(1 + len(x["moved"]) for x in each)

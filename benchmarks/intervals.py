@@ -176,7 +176,7 @@ def _fitted(
 
 def _chosen(system: AbstractSystem, log: Log, key: Any) -> tuple[Any, ...]:
     """The length of windows that `identify` chooses, and what `_fitted` returns."""
-    fit = fit_chosen_windows(project_of_machine(system), [log], key=key)
+    fit = fit_chosen_windows(project_of_machine(system), [log], key=key).fit
     likelihood = WindowsLikelihood(system, fit.cut.windows)
     return fit.project.window, likelihood, fit.fitted, fit.cut.places[:, 0]
 

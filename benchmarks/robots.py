@@ -157,11 +157,10 @@ def work(job: Job) -> dict[str, Any]:
         logs = project.read_logs(sorted(Path(folder).iterdir()))
         key = jax.random.key(job.draw)
         try:
-            used, (windows, places, _), belief = fit_chosen_windows(
-                project, logs, key=key
-            )
+            chosen = fit_chosen_windows(project, logs, key=key)
         except (NotConverged, NotFinite) as error:
             return {"failed": str(error)}
+        used, (windows, places, _), belief = chosen.fit
         likelihood = likelihood_of(project.system, windows)
         mine = corrected_windows(at_zero(likelihood, belief, places[:, 0])).posterior
         seconds = time.perf_counter() - started

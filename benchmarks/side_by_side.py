@@ -279,7 +279,9 @@ def arm_errors() -> dict[str, float]:
     for seed in range(ARMS):
         data, truth = arm_recordings(seed)
         project, key = project_of_machine(system), jax.random.key(0)
-        fits = {"default": fit_chosen_windows(project, [data.log(0)], key=key).fitted}
+        fits = {
+            "default": fit_chosen_windows(project, [data.log(0)], key=key).fit.fitted
+        }
         for name in ("ours", "start_unknown"):
             windows = arm_windows(data, at_rest=name == "ours")
             fits[name] = fit_windows(system, windows, key=key)

@@ -1,5 +1,6 @@
 """`sim2gp identify --each`: machines of one kind, from logs in folders of their own."""
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -78,33 +79,72 @@ def test_one_machine_chooses_how_long_windows_are(
     """The one with most samples, as `identify` does with its logs."""
     most = project.load_each("robot")["a"]
     alone = chosen_window(project, most, key=jax.random.key(0))
+    assert found.project is not None
     assert found.project.window == alone.window > SHORT
     about = found.summary["window"]
     assert (about["seconds"], about["chosen"]) == (alone.window, True)
+    assert "a, which has most samples" in about["text"]
     assert about["text"] in (table.get("note") for table in found.summary["tables"])
+
+
+def fitted_with(
+    monkeypatch: pytest.MonkeyPatch, most: float
+) -> Callable[..., tuple[FittedFleet, list[float]]]:
+    """`fit_machines`, and the lengths that were tried; longer than ``most`` fails."""
+
+    def fit(project: Project, machines: Any) -> tuple[FittedFleet, list[float]]:
+        tried = []
+
+        def fails(
+            project: Project, machines: Any, said: str, **how: Any
+        ) -> FittedFleet:
+            tried.append(project.window)
+            if project.window > most:
+                raise NotConverged("E201", where="c", what="lost", got="", expected="")
+            return FittedFleet(project, said, cast(Any, None), [], [])
+
+        monkeypatch.setattr(fleet, "_fit_machines", fails)
+        return fleet.fit_machines(project, machines, progress=QUIET), tried
+
+    return fit
 
 
 def test_where_one_machine_cannot_be_fitted_windows_are_short(
     project: Project, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    machines, fitted = project.load_each("robot"), []
-
-    def fails(project: Project, *given: object, **how: object) -> FittedFleet:
-        fitted.append(project.window)
-        if project.window > SHORT:
-            raise NotConverged("E201", where="c", what="lost", got="", expected="")
-        return FittedFleet(project, cast(Any, None), [], [])
-
-    def long(project: Project, *given: object, **how: object) -> Project:
-        return project.with_window(0.6)
-
-    monkeypatch.setattr(fleet, "_fit_machines", fails)
-    monkeypatch.setattr(fleet, "chosen_window", long)
-    assert fleet.fit_machines(project, machines).project.window == SHORT
-    assert fitted == [0.6, SHORT]
-    monkeypatch.setattr(fleet, "chosen_window", lambda project, *_, **__: project)
+    machines = project.load_each("robot")
+    fit = fitted_with(monkeypatch, SHORT)
+    found, tried = fit(project, machines)
+    assert (found.project.window, len(tried)) == (SHORT, 2)
+    assert tried[0] > SHORT
+    assert "E201" in found.said
     with pytest.raises(NotConverged):  # a stated length stays
-        fleet.fit_machines(project.with_window(0.6), machines)
+        fit(project.with_window(0.6), machines)
+
+
+def test_no_machine_is_left_out_because_its_logs_are_short(
+    project: Project, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machines = project.load_each("robot")
+    rows = slice(0, 100)  # a fifth of a second
+
+    def some(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        return {name: x[rows] for name, x in columns.items()}
+
+    short = tuple(
+        replace(
+            log,
+            time=log.time[rows],
+            channels=some(log.channels),
+            inputs=some(log.inputs),
+            mask=some(log.mask),
+        )
+        for log in machines["c"]
+    )
+    fit = fitted_with(monkeypatch, np.inf)
+    found, tried = fit(project, dict(machines) | {"c": short})
+    assert tried == [SHORT]
+    assert "logs of c are too short" in found.said
 
 
 def test_the_run_is_read_back(found: IdentifiedFleet, tmp_path: Path) -> None:

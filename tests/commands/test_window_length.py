@@ -17,6 +17,7 @@ from sim2gp.commands.window_length import (
     WindowFit,
     choose_window,
     fit_all,
+    keeps_samples,
     lengths,
     start_growth,
 )
@@ -42,12 +43,14 @@ start_sd = 1.0
 """
 
 
-def recording(drift: float = 0.0, rows: int = ROWS, rate: float = 0.0) -> Log:
+def recording(
+    drift: float = 0.0, rows: int = ROWS, rate: float = 0.0, seed: int = 7
+) -> Log:
     """``x' = .7 a0 - .4 a1 + drift + rate x``, white noise; inputs are held.
 
     What grows is held back by the first input.
     """
-    rng = np.random.default_rng(7)
+    rng = np.random.default_rng(seed)
     a = np.repeat(rng.standard_normal((rows // 4 + 1, 2)), 4, axis=0)[:rows]
     x, grown = np.zeros(rows), np.exp(rate / RATE)
     for k in range(rows - 1):
@@ -188,8 +191,14 @@ class Spring(Linear):
         return jnp.stack([s[1], a @ params - 900.0 * s[0]])
 
 
-def test_errors_of_starts_have_the_units_of_the_motion(tmp_path: Path) -> None:
-    """A spring turns them: a norm in its own units says thirty times."""
+@pytest.mark.parametrize("names", [("q", "q.velocity"), ("q",), ("q.velocity",)])
+def test_errors_of_starts_have_the_units_of_the_motion(
+    tmp_path: Path, names: tuple[str, ...]
+) -> None:
+    """A spring turns them: a norm in its own units says thirty times.
+
+    Of one state that is measured the error is a cosine.
+    """
     rng, log, period = np.random.default_rng(0), recording(), 0.01
     A = expm(period * np.asarray([[0.0, 1.0], [-900.0, 0.0]]))
     a = np.stack([log.inputs["a0"], log.inputs["a1"]], axis=1)
@@ -199,11 +208,11 @@ def test_errors_of_starts_have_the_units_of_the_motion(tmp_path: Path) -> None:
     for k in range(ROWS - 1):
         x[k + 1] = A @ x[k] + push * (a[k] @ [0.7, -0.4])
     x += [1e-3, 0.03] * rng.standard_normal(x.shape)
-    names = "q", "q.velocity"
+    both = {"q": x[:, 0], "q.velocity": x[:, 1]}
     log = dataclasses.replace(
         log,
         time=np.arange(ROWS) * period,
-        channels=dict(zip(names, x.T, strict=True)),
+        channels={name: both[name] for name in names},
         mask={name: np.ones(ROWS, bool) for name in names},
     )
     machine = Spring(linear(2, 1).parameters, 2)
@@ -249,6 +258,7 @@ def few(monkeypatch: pytest.MonkeyPatch) -> int:
     """Steps that are fitted all at once; of more, some choose. There are 20,000."""
     steps = 12_000
     monkeypatch.setattr(training_windows, "MANY", steps)
+    monkeypatch.setattr(training_windows, "FEWEST", 2)
     return steps
 
 
@@ -290,6 +300,43 @@ def test_all_are_short_if_some_recordings_lose_the_simulator(
     assert found.fit.cut.is_whole()
     assert "does not follow" in found.why
     assert "chosen by" not in found.why
+
+
+def test_longer_windows_must_have_most_samples(tmp_path: Path) -> None:
+    """Of logs that are shorter than half of them nothing would be left."""
+    project = project_of(tmp_path)
+    logs = [recording(), *(recording(rows=20, seed=k) for k in range(20))]  # 2 s
+    assert not keeps_samples(project.with_window(5.0), logs)
+    assert keeps_samples(project.with_window(1.0), logs)
+    cut = cut_for_fit(project, logs)
+    fitted = fit_windows(project.system, cut.windows, key=KEY)
+    found = choose_window(WindowFit(project, cut, fitted), logs, key=KEY)
+    assert found.fit.project.window == 1.0
+    assert "too short for those of 5 s" in found.why
+
+
+def test_windows_that_take_many_steps_to_fit_are_not_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = recording()
+    short = short_fit(project_of(tmp_path), log)
+    monkeypatch.setattr(window_length, "SLOW", 2)
+    found = choose_window(short, [log], key=KEY)
+    assert found.fit.fitted is short.fitted
+    assert "of 1 s takes" in found.why
+
+
+def test_of_very_many_short_ones_all_are_fitted(
+    tmp_path: Path, few: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An unstable machine whose tests speak."""
+    monkeypatch.setattr(training_windows, "MANY", few // 2)
+    log, project = recording(drift=0.5, rate=2.0), project_of(tmp_path, rate=2.0)
+    some = choose_window(short_fit(project, log), [log], key=KEY)
+    found = fit_all(some, [log], key=KEY)
+    assert len(some.fit.cut.windows) < some.fit.cut.total
+    assert found.fit.cut.is_whole()
+    assert found.fit.project.window == SHORT
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,11 @@ from sim2gp.commands.fleet_summary import fleet_summary
 from sim2gp.commands.folds import recording_of_windows
 from sim2gp.commands.recordings import Recordings
 from sim2gp.commands.result import AbstractResult
-from sim2gp.commands.window_length import chosen_window
+from sim2gp.commands.window_length import (
+    fit_chosen_windows,
+    keeps_samples,
+    window_entry,
+)
 from sim2gp.data.logs import Log
 from sim2gp.data.windows import Windows
 from sim2gp.data.windows_likelihood import WindowsLikelihood
@@ -96,7 +100,8 @@ def identify_fleet(
         project, machines, seed=seed, workers=workers, progress=progress
     )
     project = found.project
-    summary = fleet_summary(project, machines, found.fleet, found.moved)
+    window = window_entry(project, found.said)
+    summary = fleet_summary(project, machines, found.fleet, found.moved, window)
     arrays = _arrays(found.fleet)
     summary |= {"seed": seed} | provenance(started)
     return IdentifiedFleet(summary, arrays, {}, project)
@@ -105,11 +110,12 @@ def identify_fleet(
 class FittedFleet(NamedTuple):
     """A fleet, each machine ``alone``, and by how much each further round moved it.
 
-    ``project`` has windows as they were fitted; ``moved`` the largest change of a
-    machine's parameter, in its sd.
+    ``project`` has windows as they were fitted, ``said`` says why; ``moved`` has the
+    largest change of a machine's parameter, in its sd.
     """
 
     project: Project
+    said: str
     fleet: Fleet
     alone: list[Gaussian]
     moved: list[float]
@@ -129,32 +135,58 @@ def fit_machines(
     machine with most samples chooses how long windows are, if the project does not say
     it; they are short if another machine cannot be fitted with such.
     """
-    how: dict[str, Any] = {"seed": seed, "workers": workers, "progress": progress}
-    most = max(machines.values(), key=lambda logs: sum(map(len, logs)))
-    chosen = chosen_window(project, most, key=jax.random.key(seed))
+    shown = progress or Progress()
+    how: dict[str, Any] = {"seed": seed, "workers": workers, "progress": shown}
+    if not project.chooses_window:
+        said = f"Windows are {project.window:g} s long."
+        return _fit_machines(project, machines, said, **how)
+    chosen, said = _chosen(project, machines, seed, shown)
     try:
-        return _fit_machines(chosen, machines, **how)
-    except (NotConverged, NotFinite, DeadParameters):
-        if chosen is project or chosen.window == SHORT:
+        return _fit_machines(chosen, machines, said, **how)
+    except (NotConverged, NotFinite, DeadParameters) as error:
+        if chosen.window == SHORT:
             raise
-    return _fit_machines(project.with_window(SHORT), machines, **how)
+        why = f"with those of {chosen.window:g} s a machine cannot be fitted ({error})"
+    said = f"Windows are {SHORT:g} s long: {why}."
+    return _fit_machines(project.with_window(SHORT), machines, said, **how)
+
+
+def _chosen(
+    project: Project,
+    machines: Mapping[str, Sequence[Log]],
+    seed: int,
+    progress: Progress,
+) -> tuple[Project, str]:
+    """The project with the length of windows that one machine chooses, and why."""
+    most = max(machines, key=lambda name: sum(map(len, machines[name])))
+    with progress.task("windows", 1, alike=False) as task:
+        key = jax.random.key(seed)
+        chosen = fit_chosen_windows(project, machines[most], key=key, task=task)
+        task.advance("length")
+    found = chosen.fit.project
+    for name, logs in machines.items():
+        if not keeps_samples(found, logs):
+            why = f"logs of {name} are too short for those of {found.window:g} s"
+            return project.with_window(SHORT), f"Windows are {SHORT:g} s long: {why}."
+    return found, f"{chosen.why} {most}, which has most samples, chose the length."
 
 
 def _fit_machines(
     project: Project,
     machines: Mapping[str, Sequence[Log]],
+    said: str,
     seed: int,
     workers: Workers | None,
-    progress: Progress | None,
+    progress: Progress,
 ) -> FittedFleet:
-    """With windows of the project's length."""
-    cells, shown = _cells(project, machines, seed), progress or Progress()
+    """With windows of the project's length, about which something is ``said``."""
+    cells = _cells(project, machines, seed)
     executor = executor_of((workers or 1) if project.can_be_loaded else 1)
 
     def joined(
         cells: Sequence[MachineCell], label: str
     ) -> tuple[Fleet, list[Gaussian]]:
-        with shown.task(label, len(cells)) as task:
+        with progress.task(label, len(cells)) as task:
             found = compute_cells(cells, None, executor, task)
         each = [from_exact(found[cell]) for cell in cells]
         fits, given = (
@@ -172,7 +204,7 @@ def _fit_machines(
         moved.append(_moved(before, fleet))
         if moved[-1] <= SETTLED:
             break
-    return FittedFleet(project, fleet, alone, moved)
+    return FittedFleet(project, said, fleet, alone, moved)
 
 
 def _cells(

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from sim2gp.commands.window_length import window_entry
 from sim2gp.data.logs import Log, note_lines
 from sim2gp.identification.fleet import Fleet
 from sim2gp.identification.words import digits
@@ -27,8 +26,12 @@ def fleet_summary(
     machines: Mapping[str, Sequence[Log]],
     fleet: Fleet,
     moved: Sequence[float],
+    window: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Keys of summary.json; ``moved`` by each round after the first, in sd."""
+    """Keys of summary.json; ``moved`` by each round after the first, in sd.
+
+    ``window`` is the entry of how long windows are.
+    """
     table = project.system.parameters
     entries = {
         p.name: _entry(p, j, fleet, list(machines)) for j, p in enumerate(table.free)
@@ -45,7 +48,6 @@ def fleet_summary(
             f"the last of {len(moved) + 1} rounds of fits has still moved a "
             f"parameter by {digits(moved[-1], 2)} sd: intervals are rough"
         )
-    said = f"Windows are {project.window:g} s long."
     return {
         "command": "identify each",
         "title": f"{project.name}: {len(machines)} machines of a kind",
@@ -54,11 +56,11 @@ def fleet_summary(
         "kind": entries,
         "agreement": fleet.agreement,
         "moved": list(moved),
-        "window": window_entry(project, said),
+        "window": window,
         "warnings": warnings,
         "tables": [
             _kind_table(entries),
-            _machine_table(entries, list(machines), said),
+            _machine_table(entries, list(machines), window["text"]),
         ],
     }
 

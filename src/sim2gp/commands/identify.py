@@ -17,7 +17,7 @@ from sim2gp.data.logs import Log, note_lines
 from sim2gp.identification.fit import fit_windows
 from sim2gp.project import Project
 from sim2gp.project.in_memory import Logs, project_and_logs
-from sim2gp.project.training_windows import Cut, cut_for_fit
+from sim2gp.project.training_windows import TrainingWindows, cut_for_fit
 from sim2gp.runs import Progress
 from sim2gp.runs.provenance import provenance
 from sim2gp.systems.base import AbstractSystem
@@ -81,7 +81,7 @@ def identify(
     return Identification(summary, arrays, {}, project, logs=tuple(logs))
 
 
-def _sizes(project: Project, logs: Sequence[Log], cut: Cut) -> str:
+def _sizes(project: Project, logs: Sequence[Log], cut: TrainingWindows) -> str:
     """What a fit is about, and in which steps it simulates, before it begins."""
     parameters, columns = len(project.system.parameters), len(cut.windows.outputs)
     some = "" if cut.is_whole() else f"{len(cut.windows)} of "
@@ -93,7 +93,7 @@ def _sizes(project: Project, logs: Sequence[Log], cut: Cut) -> str:
     return "\n".join([sizes, *clock_lines(logs, project.system), *still])
 
 
-def _compile(project: Project, grid: Grid, cut: Cut) -> None:
+def _compile(project: Project, grid: Grid, cut: TrainingWindows) -> None:
     """Begin to compile what follows the fit, where JAX moves the machine.
 
     What asks for windows only if they stay as long as they are.

@@ -7,8 +7,9 @@ recording, and then tells nothing. So the first fit has short windows, and longe
 are fitted from there: of a stable simulator in any case, others as long as the misfit
 tests find nothing and the simulator follows its recordings. Much longer ones are not
 fitted where the tests find something, because these are too few to say how far they err
-(`benchmarks/intervals.py`, docs/intervals.md). Of very many windows some choose the
-length, and all are then fitted with it.
+(`benchmarks/intervals.py`, docs/intervals.md). Nor are those taken that are hard to fit,
+or that leave short logs out. Of very many windows some choose the length, and all are
+then fitted with it.
 """
 
 import math
@@ -27,7 +28,7 @@ from sim2gp.identification.misfit.tests import Misfit
 from sim2gp.inference.estimate import Estimate
 from sim2gp.project import Project
 from sim2gp.project.project import SHORT
-from sim2gp.project.training_windows import Cut, cut_for_fit
+from sim2gp.project.training_windows import TrainingWindows, cut_for_fit
 from sim2gp.runs.progress import Task
 from sim2gp.types import Key, in_float64
 
@@ -37,6 +38,11 @@ LENGTHS = (1.0, 5.0)
 LOST = 2.0
 #: Times that errors of starts may grow within a window of a stable simulator (rms).
 STABLE = 3.0
+#: Share of the samples that longer windows must have: logs are shorter than some.
+KEPT = 0.8
+#: Steps of a fit. One that needs more has a cost with kinks, as of sharp friction; of a
+#: part of the data it may not converge at all.
+SLOW = 100
 _STATED = (
     "The misfit tests find nothing. Without likelihood.window in the project file, "
     "identify also tries longer windows, which may narrow the intervals."
@@ -47,7 +53,7 @@ class WindowFit(NamedTuple):
     """Windows of a project's length, and their fit."""
 
     project: Project
-    cut: Cut
+    cut: TrainingWindows
     fitted: Estimate
 
     def misfit(self) -> Misfit:
@@ -82,12 +88,12 @@ def choose_window(
     key: Key,
     task: Task | None = None,
 ) -> WindowLength:
-    """From a fit of short windows how long they are.
+    """How long windows are, from a fit of short ones.
 
-    The first length at which misfit tests speak, but not the short one if the simulator
-    is stable; the longest where they never do, or where the simulator cannot follow for
-    longer. Windows of a stated length stay as they are. If ``short`` has some of very
-    many windows, so has what is returned (`fit_all`).
+    The first length at which misfit tests speak, but at least a second if the simulator
+    is stable; the longest if they never do; no longer than the simulator can follow.
+    Windows of a stated length stay as they are. If ``short`` has some of very many
+    windows, the fit that is returned has, too (`fit_all`).
     """
     project, misfit = short.project, short.misfit()
     if not project.chooses_window:
@@ -105,8 +111,9 @@ def choose_window(
         if isinstance(found, str):
             return WindowLength(best, misfit, _words(best, found))
         best, misfit = found
-    why = "find something in these" if misfit.alarm else "find nothing"
-    return WindowLength(best, misfit, _words(best, f"the misfit tests {why}"))
+    what = "something" if misfit.alarm else "nothing"
+    why = f"the misfit tests find {what} in these"
+    return WindowLength(best, misfit, _words(best, why))
 
 
 @in_float64
@@ -131,20 +138,33 @@ def fit_all(
         if not isinstance(found, str):
             return WindowLength(*found, why)
         why = f"Windows are {SHORT:g} s long: {found}."
-    fit = _fit_from(fit, logs, SHORT, key, some=False)
+    fit = _fit(fit.project.with_window(SHORT), logs, key)
     return WindowLength(fit, fit.misfit(), why)
 
 
-def fit_chosen_windows(project: Project, logs: Sequence[Log], *, key: Key) -> WindowFit:
+def fit_chosen_windows(
+    project: Project, logs: Sequence[Log], *, key: Key, task: Task | None = None
+) -> WindowLength:
     """The fit of `identify`: of windows as the project states or as it chooses them."""
-    return fit_all(_choice(project, logs, key), logs, key=key).fit
+    short = _fit(project, logs, key, some=project.chooses_window)
+    chosen = choose_window(short, logs, key=key, task=task)
+    return fit_all(chosen, logs, key=key, task=task)
 
 
 def chosen_window(project: Project, logs: Sequence[Log], *, key: Key) -> Project:
     """The project with windows as `identify` chooses them for these logs."""
     if not project.chooses_window:
         return project
-    return _choice(project, logs, key).fit.project
+    return fit_chosen_windows(project, logs, key=key).fit.project
+
+
+def keeps_samples(project: Project, logs: Sequence[Log]) -> bool:
+    """Whether windows of its length have most samples of logs that may be short."""
+    short = cut_for_fit(project.with_window(SHORT), logs)
+    try:
+        return _samples(cut_for_fit(project, logs)) >= KEPT * _samples(short)
+    except InputError:  # they have none
+        return False
 
 
 def lengths(logs: Sequence[Log]) -> list[float]:
@@ -155,11 +175,10 @@ def lengths(logs: Sequence[Log]) -> list[float]:
     return sorted({x for x in each if x > SHORT})
 
 
-def _choice(project: Project, logs: Sequence[Log], key: Key) -> WindowLength:
-    cut = cut_for_fit(project, logs, some=project.chooses_window)
-    robust = project.spec.likelihood.robust
-    fitted = fit_windows(project.system, cut.windows, key=key, robust=robust)
-    return choose_window(WindowFit(project, cut, fitted), logs, key=key)
+def _samples(cut: TrainingWindows) -> float:
+    """Of all windows; of very many, as some have them."""
+    each = np.asarray(cut.windows.counts).sum(axis=1)
+    return float(each.mean() * cut.total)
 
 
 def _followed(
@@ -171,15 +190,20 @@ def _followed(
     some: bool = False,
     alarm: bool = False,
 ) -> tuple[WindowFit, Misfit] | str:
-    """A fit of longer windows, or why the simulator does not follow for so long.
+    """A fit of longer windows, or why they are not taken.
 
     ``alarm``: the misfit tests find something in the shorter ones.
     """
+    project = known.project.with_window(seconds)
     try:
-        longer = _fit_from(known, logs, seconds, key, some=some)
+        longer = _fit(project, logs, key, some=some, start=known.fitted)
         found = longer.misfit()
-        noise, before = (np.asarray(x.fitted.noise.sd) for x in (longer, known))
-        lost = bool(np.any(noise > LOST * before))
+        steps = int(longer.fitted.convergence.steps)
+        if steps > SLOW:
+            return f"a fit of those of {seconds:g} s takes {steps} steps"
+        if _samples(longer.cut) < KEPT * _samples(known.cut):
+            return f"logs are too short for those of {seconds:g} s"
+        lost = _noise_grows(longer.fitted, known.fitted)
         if not (alarm or lost):
             return longer, found
         grown = start_growth(longer) if seconds <= LENGTHS[0] else math.inf
@@ -192,9 +216,14 @@ def _followed(
     return f"in {seconds:g} s errors of their starts grow {grown:.2g} times"
 
 
+def _noise_grows(longer: Estimate, shorter: Estimate) -> bool:
+    noise, before = (np.asarray(fit.noise.sd) for fit in (longer, shorter))
+    return not bool(np.all(noise <= LOST * before))
+
+
 @in_float64
 def start_growth(fit: WindowFit) -> float:
-    """How many times errors of starts grow within windows: the largest, then the rms.
+    """How many times errors of starts grow: most within each window, rms over windows.
 
     Of measured channels, each in units of its motion.
     """
@@ -202,25 +231,32 @@ def start_growth(fit: WindowFit) -> float:
     cut, fitted, found = linearise_some(likelihood, fit.fitted)
     starts, outputs = slice(fitted.prior.mean.size, None), list(cut.outputs)
     J = np.asarray(found.jacobian)[..., starts][..., outputs]
+    if not np.isfinite(J).all():
+        return math.inf
     slope = J / np.asarray(cut.start_sd)[:, None, None, outputs]
+    measured = np.maximum(np.asarray(cut.mask).any(axis=1).sum(axis=0), 1)
     noise = np.asarray(fitted.noise.sd)
-    size = np.sqrt(channel_motion(cut).mean(axis=0) + noise**2)
+    size = np.sqrt(channel_motion(cut).sum(axis=0) / measured + noise**2)
     each = np.linalg.norm(slope * size / size[:, None], ord=2, axis=(2, 3))
     return float(np.sqrt(np.mean(each.max(axis=1) ** 2)))
 
 
-def _fit_from(
-    known: WindowFit, logs: Sequence[Log], seconds: float, key: Key, *, some: bool
+def _fit(
+    project: Project,
+    logs: Sequence[Log],
+    key: Key,
+    *,
+    some: bool = False,
+    start: Estimate | None = None,
 ) -> WindowFit:
-    """A fit of windows of another length, from where a known one has led."""
-    project = known.project.with_window(seconds)
+    """A fit of the project's windows, from one of windows of another length."""
     cut = cut_for_fit(project, logs, some=some)
     fitted = fit_windows(
         project.system,
         cut.windows,
         key=key,
         robust=project.spec.likelihood.robust,
-        warm_start=known.fitted.of_windows(len(cut.windows)),
+        warm_start=start and start.of_windows(len(cut.windows)),
     )
     return WindowFit(project, cut, fitted)
 

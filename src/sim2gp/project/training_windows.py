@@ -15,6 +15,8 @@ from sim2gp.systems.host import simulator_of
 
 #: Rows of windows, steps of their simulation included, that are fitted all at once.
 MANY = 100_000
+#: Windows of any length that stand for all.
+FEWEST = 10
 
 
 def cut_logs(
@@ -25,7 +27,7 @@ def cut_logs(
     return cuts.whole(), cuts.places[:, 0]
 
 
-class Cut(NamedTuple):
+class TrainingWindows(NamedTuple):
     """Windows to fit, the log and first row of each, and how many there are in all."""
 
     windows: Windows | Cuts
@@ -37,19 +39,22 @@ class Cut(NamedTuple):
         return len(self.windows) == self.total
 
 
-def cut_for_fit(project: Project, logs: Sequence[Log], *, some: bool = False) -> Cut:
+def cut_for_fit(
+    project: Project, logs: Sequence[Log], *, some: bool = False
+) -> TrainingWindows:
     """Training windows; of so many rows that they are fitted in parts, as `Cuts`.
 
-    With ``some``, instead of those, as many as are fitted all at once, spread over all.
+    With ``some`` never as `Cuts`: of so many rows, windows that are spread over all, as
+    many as are fitted all at once.
     """
     cuts = _cuts(project, logs)
     most, places, total = MANY // cuts.length, cuts.places, len(cuts)
     if total <= most or simulator_of(project.system) is not None:
-        return Cut(cuts.whole(), places, total)
+        return TrainingWindows(cuts.whole(), places, total)
     if not some:
-        return Cut(cuts, places, total)
-    which = evenly_spread(max(1, most), total)
-    return Cut(cuts.some(which), places[which], total)
+        return TrainingWindows(cuts, places, total)
+    which = evenly_spread(max(FEWEST, most), total)
+    return TrainingWindows(cuts.some(which), places[which], total)
 
 
 def _cuts(project: Project, logs: Sequence[Log]) -> Cuts:
