@@ -7,9 +7,9 @@ recording, and then tells nothing. So the first fit has short windows, and longe
 are fitted from there: of a stable simulator in any case, others as long as the misfit
 tests find nothing and the simulator follows its recordings. Much longer ones are not
 fitted where the tests find something, because these are too few to say how far they err
-(`benchmarks/intervals.py`, docs/intervals.md). Nor are those taken that are hard to fit,
-or that leave short logs out. Of very many windows some choose the length, and all are
-then fitted with it.
+(`benchmarks/intervals.py`, docs/intervals.md). Nor are those that are hard to fit, or
+that leave short logs out. Of very many windows some choose the length, and all are then
+fitted with it.
 """
 
 import math
