@@ -269,7 +269,7 @@ def test_a_weighed_sum_is_known_before_the_logs(
     for name in both:
         now, before = answer["parameters"][name], plain["parameters"][name]
         assert abs(now["mean"] - before["mean"]) < 3.0 * before["sd"]
-        assert now["sd"] < before["sd"]
+        assert now["plain"]["sd"] < before["plain"]["sd"]
         assert now["prior_sd"] < 0.95 * before["prior_sd"]
     total = sum(answer["parameters"][name]["mean"] for name in both)
     assert total == pytest.approx(0.9, abs=0.003)
