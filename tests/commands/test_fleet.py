@@ -1,6 +1,6 @@
 """`sim2gp identify --each`: machines of one kind, from logs in folders of their own."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -11,6 +11,7 @@ import pytest
 
 from sim2gp.cli import main
 from sim2gp.commands import fleet
+from sim2gp.commands.compare_setup import _piece
 from sim2gp.commands.fleet import FittedFleet, IdentifiedFleet, _cells, identify_fleet
 from sim2gp.commands.load_run import load_run
 from sim2gp.commands.window_length import chosen_window
@@ -126,21 +127,8 @@ def test_no_machine_is_left_out_because_its_logs_are_short(
     project: Project, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     machines = project.load_each("robot")
-    rows = slice(0, 100)  # a fifth of a second
-
-    def some(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        return {name: x[rows] for name, x in columns.items()}
-
-    short = tuple(
-        replace(
-            log,
-            time=log.time[rows],
-            channels=some(log.channels),
-            inputs=some(log.inputs),
-            mask=some(log.mask),
-        )
-        for log in machines["c"]
-    )
+    # A fifth of a second.
+    short = tuple(_piece(log, log.time < log.time[100], "") for log in machines["c"])
     fit = fitted_with(monkeypatch, np.inf)
     found, tried = fit(project, dict(machines) | {"c": short})
     assert tried == [SHORT]

@@ -138,7 +138,8 @@ def fit_all(
         if not isinstance(found, str):
             return WindowLength(*found, why)
         why = f"Windows are {SHORT:g} s long: {found}."
-    fit = _fit(fit.project.with_window(SHORT), logs, key)
+    project = fit.project.with_window(SHORT)
+    fit = _fit(project, cut_for_fit(project, logs), key)
     return WindowLength(fit, fit.misfit(), why)
 
 
@@ -146,7 +147,8 @@ def fit_chosen_windows(
     project: Project, logs: Sequence[Log], *, key: Key, task: Task | None = None
 ) -> WindowLength:
     """The fit of `identify`: of windows as the project states or as it chooses them."""
-    short = _fit(project, logs, key, some=project.chooses_window)
+    cut = cut_for_fit(project, logs, some=project.chooses_window)
+    short = _fit(project, cut, key)
     chosen = choose_window(short, logs, key=key, task=task)
     return fit_all(chosen, logs, key=key, task=task)
 
@@ -196,13 +198,14 @@ def _followed(
     """
     project = known.project.with_window(seconds)
     try:
-        longer = _fit(project, logs, key, some=some, start=known.fitted)
-        found = longer.misfit()
+        cut = cut_for_fit(project, logs, some=some)
+        if _samples(cut) < KEPT * _samples(known.cut):
+            return f"logs are too short for those of {seconds:g} s"
+        longer = _fit(project, cut, key, start=known.fitted)
         steps = int(longer.fitted.convergence.steps)
         if steps > SLOW:
             return f"a fit of those of {seconds:g} s takes {steps} steps"
-        if _samples(longer.cut) < KEPT * _samples(known.cut):
-            return f"logs are too short for those of {seconds:g} s"
+        found = longer.misfit()
         lost = _noise_grows(longer.fitted, known.fitted)
         if not (alarm or lost):
             return longer, found
@@ -243,14 +246,12 @@ def start_growth(fit: WindowFit) -> float:
 
 def _fit(
     project: Project,
-    logs: Sequence[Log],
+    cut: TrainingWindows,
     key: Key,
     *,
-    some: bool = False,
     start: Estimate | None = None,
 ) -> WindowFit:
     """A fit of the project's windows, from one of windows of another length."""
-    cut = cut_for_fit(project, logs, some=some)
     fitted = fit_windows(
         project.system,
         cut.windows,
